@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from string import Formatter
@@ -19,6 +19,7 @@ from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.documents import SCHEMA_VERSION, file_sha256
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import memory_bytes
+from gsmerge.runtime.record import list_some
 from gsmerge.scene.content_hash import content_hash, digest, fill_template, list_files, scene_name
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
@@ -30,6 +31,8 @@ from gsmerge.version import __version__
 
 FIELDS = ("stem", "parent", "index", "k")
 PLACES = ("cameras", "images", "masks", "protect")  # options that name files and folders beside a scene
+
+DISTINGUISH = "distinguish them with --name, such as '{parent}-{stem}.ply'"
 
 
 @dataclass(frozen=True)
@@ -96,13 +99,16 @@ class CompactCall:
         scene = digest({"scene": content_hash(list_files(files)), **version})
         return f"{scene}.{digest({'settings': settings, 'reading': reading})}"
 
-    def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
-        """Compact the scene; return the report, and the result with its coarser levels."""
+    def run(
+        self, files: SceneFiles, out: Path, cameras: Path | None, threads: int
+    ) -> tuple[dict[str, Any], list[Path]]:
+        """Compact the scene; return the report, and the result with its coarser levels and its ``cameras``."""
         document = compact_files(
-            files, replace(self.settings, threads=threads), Outputs(out, overwrite=True), opacity=self.opacity,
-            hints=self.hints, hashed=True,
+            files, replace(self.settings, threads=threads), Outputs(out, cameras, overwrite=True),
+            opacity=self.opacity, hints=self.hints, hashed=True,
         )  # fmt: skip
-        return document, [out, *(Path(level["path"]) for level in document["levels"])]
+        written = [*(level["path"] for level in document["levels"]), document["viewer_cameras"]]
+        return document, [out, *map(Path, filter(None, written))]
 
 
 @dataclass(frozen=True)
@@ -119,6 +125,7 @@ class Job:
     masks: StrPath | None = None  # None: those beside the photos
     protect: StrPath | None = None  # None: nothing has to stay sharper
     within: Path | None = None  # folder that the user named; cameras and photos are searched up to it
+    clash: str | None = None  # why its result cannot have its name, unless the record says that the name is its own
 
     @property
     def output(self) -> str:
@@ -140,9 +147,9 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
     """Find all scenes, each once, and name their results in the output folder.
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
-    line. ``results`` has the real paths of former results, which are not scenes. SceneError if an argument does not
-    exist or has no scene, if cameras, photos or masks for all scenes do not exist, or if networks cannot be used.
-    UsageError if a result would have the name of another result or of a scene.
+    line. ``results`` has the real paths of former results, which are not scenes. A result that would have the name of
+    another result or of a scene's file is a ``clash`` of its job. SceneError if an argument does not exist or has no
+    scene, if cameras, photos or masks for all scenes do not exist, or if networks cannot be used.
     """
     if options.settings.checkpoint not in CHECKPOINTS:
         load_checkpoint(options.settings.checkpoint)  # fail once, not for each scene
@@ -150,7 +157,7 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
     for name in PLACES:
         _check_place(name, getattr(options, name))
     jobs: list[Job] = []
-    owners: dict[str, str] = {}
+    owners: dict[str, list[str]] = {}  # scenes by the name of a result
     inputs: set[str] = set()
     for scene, within in find_named_scenes(arguments, out):
         real = os.path.realpath(main_file(scene))
@@ -158,19 +165,25 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
             continue
         inputs.add(real)
         outputs = _output_names(options, scene, len(jobs))
-        for name in map(os.path.normcase, outputs):  # on Windows A.ply and a.ply are one file
-            if name in owners:
-                raise UsageError(
-                    f"{out / name}: expected a different name for each result, would be that of {owners[name]} and of"
-                    f" {scene}; distinguish them with --name, such as '{{parent}}-{{stem}}.ply'"
-                )
-            owners[name] = str(scene)
+        for name in outputs:
+            owners.setdefault(os.path.normcase(name), []).append(str(scene))  # on Windows A.ply and a.ply are one file
         paths = _paths_beside(options, scene)
         jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), **paths, within=within))
-    for name in owners:
+    return [replace(job, clash=_find_clash(job, out, owners, inputs)) for job in jobs]
+
+
+def _find_clash(job: Job, out: Path, owners: Mapping[str, Sequence[str]], inputs: Collection[str]) -> str | None:
+    """Return why a result cannot have its name: those of other scenes have it, or a scene itself has."""
+    for name in job.outputs:
+        scenes = owners[os.path.normcase(name)]
+        if len(scenes) > 1:
+            return (
+                f"{out / name}: expected a different name for each result, would be that of"
+                f" {list_some(scenes, ' and ')}; {DISTINGUISH}"
+            )
         if os.path.realpath(out / name) in inputs:
-            raise UsageError(f"{out / name}: is one of the scenes and would be replaced; name another --output")
-    return jobs
+            return f"{out / name}: is one of the scenes and would be replaced; name another --output"
+    return None
 
 
 def _check_place(option: str, place: str | None) -> None:

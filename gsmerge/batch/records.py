@@ -25,6 +25,7 @@ class DoneResult:
 
     key: str  # digest of the scene's files, the settings and the version
     files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each file
+    scene: str  # its path, as it was given
     doubts: tuple[str, ...] = ()  # notes that make it doubtful
 
     def holds(self, folder: Path, key: str) -> bool:
@@ -70,7 +71,8 @@ class RecordIndex:
 def _read_result(line: Mapping[str, Any]) -> DoneResult:
     """Read a record of a result; KeyError, TypeError or AttributeError if it is damaged."""
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
-    return DoneResult(_text(line["key"]), files, tuple(map(_text, line.get("doubts", ()))))
+    doubts = tuple(map(_text, line.get("doubts", ())))
+    return DoneResult(_text(line["key"]), files, _text(line["scene"]), doubts)
 
 
 def _text(value: Any) -> str:
@@ -96,7 +98,8 @@ def check_folder(folder: Path) -> None:
             raise SceneError(records, problem, "remove it, or name another folder with --output")
         if records.exists():
             check_file(records)  # not a pipe, which would wait for its reader
-        records.touch()
+        if os.access(folder, os.W_OK) or not records.exists():  # results that are done are skipped in any folder
+            records.touch()
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
         raise SceneError(folder, problem, "name another folder with --output") from error

@@ -7,21 +7,23 @@ process also leaves a file that marks its result as begun. This file shows that 
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import warnings
 from collections.abc import Generator, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from heapq import nlargest
-from itertools import accumulate
 from pathlib import Path
+from statistics import median_low
 from typing import Any
 
-from gsmerge.batch.jobs import BatchOptions, Job
+from gsmerge.batch.find import main_file
+from gsmerge.batch.jobs import DISTINGUISH, BatchOptions, Job
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, check_folder, record
 from gsmerge.errors import SceneError, error_line
-from gsmerge.io.atomic import atomic_output, remove_stale
+from gsmerge.io.atomic import atomic_output, describe_existing, remove_stale
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file
 from gsmerge.measure.documents import file_sha256, finite
@@ -40,6 +42,7 @@ class Concurrency:
 
     jobs: int  # 0: as many as the cluster has processors for
     threads: int
+    memory: float = math.inf  # bytes for all scenes at the same time; one that needs more runs alone
 
     def __str__(self) -> str:
         jobs = self.jobs or "as many as the cluster has room for"
@@ -56,46 +59,62 @@ class Run:
 
 
 def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrency:
-    """Divide the processors among scenes, with as many scenes at once as there are processors and free memory."""
+    """Divide the processors among scenes, with as many scenes at once as there are processors and free memory.
+
+    Memory is reckoned for scenes of the median size. While larger ones run, fewer run at once.
+    """
     threads, processors = options.settings.threads, available_threads()
     if options.engine == "ray":
         return Concurrency(options.jobs or 0, threads or 1)
-    count, free = options.jobs, free_memory()
-    if count is None:
-        count = processors // (threads or 1)
-        sums = accumulate(nlargest(count, (job.memory for job in jobs)))
-        count = count if free is None else sum(total <= FREE_MEMORY_SHARE * free for total in sums)
-    count = max(1, min(count, len(jobs)))
-    return Concurrency(count, threads or max(1, processors // count))
+    free = math.inf if options.jobs else free_memory() or math.inf
+    most = FREE_MEMORY_SHARE * free / median_low([job.memory for job in jobs] or [1])
+    count = max(1, min(int(options.jobs or min(processors // (threads or 1), most)), len(jobs)))
+    return Concurrency(count, threads or max(1, processors // count), FREE_MEMORY_SHARE * free)
 
 
 def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> list[tuple[Job, str | None]]:
     """List the jobs to do, each with the reason if it will be refused; with ``overwrite`` these are all."""
-    if options.overwrite:
-        return [(job, None) for job in jobs]
     results, pending = RecordIndex(folder).read_on().results, list[tuple[Job, str | None]]()
     for job in jobs:
         known = results.get(job.output)
         try:
             key = job.call.key(job.find_files())
-            if known is None or not known.holds(folder, key):
-                pending.append((job, refusal(job, folder, known, key)))
+            if options.overwrite or known is None or not known.holds(folder, key):
+                pending.append((job, refusal(job, folder, known, key, overwrite=options.overwrite)))
         except SceneError as error:
             pending.append((job, str(error)))
     return pending
 
 
-def refusal(job: Job, folder: Path, known: DoneResult | None, key: str, *, begun: bool = False) -> str | None:
-    """Return why a result must not be replaced, or None; ``begun``: the existing file may be from a killed run."""
+def refusal(
+    job: Job, folder: Path, known: DoneResult | None, key: str, *, overwrite: bool, begun: bool = False
+) -> str | None:
+    """Return why a result must not be made, or None; ``begun``: the existing file may be from a killed run."""
     names = () if known is None else [file["path"] for file in known.files]
     foreign = [name for name in job.outputs if os.path.lexists(folder / name) and name not in names]
-    if foreign and not begun:
-        return f"{folder / foreign[0]}: exists already and was not written by a batch; pass --overwrite to replace it"
-    settings, former = key.partition(".")[2], known and known.key.partition(".")[2]
-    if former in (None, settings) or not any(os.path.lexists(folder / name) for name in names):
+    (scene, _, settings), former = key.partition("."), ("" if known is None else known.key).partition(".")
+    if job.clash and (foreign or former[0] != scene):
+        return job.clash
+    if overwrite:
         return None
+    if foreign and not begun:
+        return (
+            f"{folder / foreign[0]}: {describe_existing(folder / foreign[0])} and was not written by a batch;"
+            " pass --overwrite to replace it"
+        )
+    if known is None or not os.path.lexists(folder / job.output):
+        return None
+    if (
+        former[0] != scene
+        and os.path.exists(known.scene)
+        and len({os.path.realpath(main_file(Path(path))) for path in (known.scene, job.scene)}) == 2
+    ):
+        return (
+            f"{folder / job.output}: is the result of {known.scene}, which is another scene; {DISTINGUISH}, or pass"
+            " --overwrite to replace it"
+        )
     remedy = "pass --overwrite to make it again, or name another --output"
-    return f"{folder / job.output}: was made with other settings; {remedy}"
+    return None if former[2] == settings else f"{folder / job.output}: was made with other settings; {remedy}"
 
 
 def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Generator[dict[str, Any], None, None]:
@@ -107,10 +126,10 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
     """
     concurrency = choose_concurrency(jobs, options)
     check_folder(folder)
-    run, active = Run(folder, concurrency.threads, options.overwrite), dict[str, Job]()
+    run, active = Run(folder, concurrency.threads, options.overwrite), dict[str, Job]()  # by scene
     with ExitStack() as stack:
         stack.callback(lambda: remove_unfinished(run, active.values()))
-        pool: WorkerPool = ProcessPool(concurrency.jobs, concurrency.threads)
+        pool: WorkerPool = ProcessPool(concurrency.jobs, concurrency.threads, concurrency.memory)
         if options.engine == "ray":
             cluster = stack.enter_context(closing(Cluster(options.address, store_bytes=SMALL_STORE)))
             pool = RayPool(cluster, concurrency.threads, jobs=concurrency.jobs)
@@ -118,14 +137,15 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
 
         def make_calls(jobs: Sequence[Job], *, wait: bool) -> Iterator[Call]:
             for job in jobs:
-                active[job.output] = job
+                active[job.scene] = job
                 yield Call(job, (job, run, wait), job.memory)
 
-        remaining, wait = jobs, False
+        # Scenes for which others wait come last
+        remaining, wait = sorted(jobs, key=lambda job: job.memory * concurrency.jobs > concurrency.memory), False
         while remaining:
             busy: list[Job] = []
             for job, outcome in pool.run(make_result, make_calls(remaining, wait=wait)):
-                del active[job.output]
+                del active[job.scene]
                 line = make_result(job, run, False, outcome.reason) if isinstance(outcome, LostProcess) else outcome
                 if line is None:
                     busy.append(job)
@@ -161,15 +181,19 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     key, known = job.call.key(files), read_index(run.folder).read_on().results.get(job.output)
     if known is not None and not run.overwrite and known.holds(run.folder, key):
         return record(SKIPPED, job.scene, job.output, key=key, files=known.files, doubts=known.doubts)
-    refused = None if run.overwrite else refusal(job, run.folder, known, key, begun=begun.exists())
+    refused = refusal(job, run.folder, known, key, overwrite=run.overwrite, begun=begun.exists())
     if refused:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
-    out = run.folder / job.output
+    out, cameras = run.folder / job.output, viewer_cameras_path(run.folder / job.output)
+    is_own = known is not None and any(run.folder / file["path"] == cameras for file in known.files)
+    is_free = os.path.realpath(cameras) not in map(os.path.realpath, files.paths) and (
+        is_own or run.overwrite or not os.path.lexists(cameras)  # results in other formats share them
+    )
     with atomic_output(begun, overwrite=True) as temporary:  # on the disk before the result
         temporary.write_text(f"{os.getpid()}\n")
     with warnings.catch_warnings(record=True) as caught_warnings:
         warnings.simplefilter("default")
-        document, written = job.call.run(files, out, run.threads)
+        document, written = job.call.run(files, out, cameras if is_free else None, run.threads)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught_warnings))
     facts = [
         {"path": Path(os.path.relpath(path, run.folder)).as_posix(), "sha256": file_sha256(path)}
@@ -208,8 +232,9 @@ def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[Path | Non
     """Lock a result against other processes in the block; SceneError if that fails.
 
     Yields the path of the file that marks the result as begun. If another process has locked the result, ``wait`` for
-    it or yield None.
+    it or yield None. A folder that cannot be written needs no lock: what is done in it is skipped.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
-    with lock_file(folder / f".batch-{name}.lock", wait=wait) as is_ours:
+    lock = lock_file(folder / f".batch-{name}.lock", wait=wait) if os.access(folder, os.W_OK) else nullcontext(True)
+    with lock as is_ours:
         yield folder / f".batch-{name}.begun" if is_ours else None

@@ -261,8 +261,8 @@ def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> N
 
     out, pending = args.output, pending_jobs(jobs, args.output, options)
     concurrency = choose_concurrency(jobs, options)
-    pending_outputs = {job.output for job, _ in pending}
-    num_refused = sum(refusal is not None for _, refusal in pending)
+    refusals = {job.scene: refusal for job, refusal in pending}
+    num_refused = sum(refusal is not None for refusal in refusals.values())
     num_pending = len(pending) - num_refused
     document = {
         **document_head(),
@@ -277,7 +277,8 @@ def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> N
                 "scene": job.scene,
                 "output": job.output,
                 "num_gaussians": job.num_gaussians,
-                "done": job.output not in pending_outputs,
+                "done": job.scene not in refusals,
+                "error": refusals.get(job.scene),
             }
             for job in jobs
         ],
@@ -285,6 +286,7 @@ def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> N
         **note_entries([]),
     }
     lines = [f"{job.scene} -> {f'refused: {refusal}' if refusal else out / job.output}" for job, refusal in pending]
-    refused = f", {num_refused:,} refused" if num_refused else ""
-    lines.append(f"would write {out}: {num_pending:,} of {len(jobs):,} scenes to do{refused}, {concurrency}")
+    lines.append(f"would write {out}: {num_pending:,} of {len(jobs):,} scenes to do, {concurrency}")
     print_document(document, lines, as_json=args.json)
+    if num_refused:
+        raise BatchError(f"{num_refused:,} of {count_words(len(jobs), 'scene')} would fail")

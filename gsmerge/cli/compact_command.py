@@ -58,7 +58,7 @@ def look(args: opt.Args) -> None:
     args.output = output_file(args.output or default, default.name)
     # The page cannot show joined files or Feature Gaussians, so it shows the result alone
     shown = [args.output] if features or len(args.scenes) > 1 else [scene, args.output]
-    if os.path.lexists(args.output) and not (args.overwrite or args.dry_run):
+    if os.path.exists(args.output) and not (args.overwrite or args.dry_run):
         words = shlex.join(["gsmerge", "view", *map(str, shown)])
         raise UsageError(f"{args.output}: exists already; {words} shows it, --overwrite makes it again")
     loads = list["Loaded"]()

@@ -93,6 +93,7 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     """Check one output as :func:`check_outputs` does; ``inputs``: real paths."""
+    from gsmerge.io.atomic import describe_existing
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
@@ -109,7 +110,9 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     if str(target) in inputs or (is_read and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another output")
     if os.path.lexists(output) and not overwrite:
-        raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another output")
+        raise UsageError(
+            f"{output}: {describe_existing(output)}; pass --overwrite to replace it, or name another output"
+        )
     _check_writable(output.parent, output, "a folder to write to")
 
 

@@ -262,4 +262,9 @@ def _refuse(path: Path, overwrite: bool) -> None:
     if not os.path.isdir(path.parent):
         raise SceneError(path, f"expected a folder to write to, found the file {path.parent}", "choose another folder")
     if os.path.lexists(path) and not overwrite:
-        raise SceneError(path, *_EXISTS)
+        raise SceneError(path, describe_existing(path), _EXISTS[1])
+
+
+def describe_existing(path: Path) -> str:
+    """Say that an output exists already, or that its name is a link without a file."""
+    return _EXISTS[0] if os.path.exists(path) else f"is a link to {os.readlink(path)}, which does not exist"

@@ -12,19 +12,28 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
+from gsmerge.runtime.memory import memory_problem
 from gsmerge.runtime.work import Call, LostProcess, WorkerPool
 
 LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-LOST = "its process was killed or ended unexpectedly; perhaps out of memory, try fewer --jobs"
+LOST, FEWER = "its process was killed or ended unexpectedly", "perhaps out of memory, try fewer --jobs"
 
 
 class ProcessPool(WorkerPool):
-    """A pool of up to ``jobs`` processes, each an executor of its own, so that one that dies costs its call alone."""
+    """A pool of up to ``jobs`` processes, each an executor of its own, so that one that dies costs its call alone.
 
-    def __init__(self, jobs: int, threads: int) -> None:
-        self.capacity, self.threads = jobs, threads
+    ``memory``: bytes that all calls may need together; a call that needs more runs alone.
+    """
+
+    def __init__(self, jobs: int, threads: int, memory: float) -> None:
+        self.capacity, self.threads, self.memory = jobs, threads, memory
         self.idle: list[ProcessPoolExecutor] = []
-        self.calls: dict[Future[Any], tuple[Any, ProcessPoolExecutor]] = {}  # key and executor of each running call
+        self.calls: dict[Future[Any], tuple[Call, ProcessPoolExecutor]] = {}  # running calls, each with its executor
+
+    def has_room(self, call: Call) -> bool:
+        """Return whether a call fits into the memory beside those that run."""
+        needed = call.memory + sum(running.memory for running, _ in self.calls.values())
+        return not self.calls or needed <= self.memory
 
     def submit(self, function: Callable[..., Any], call: Call) -> None:
         """Start a call."""
@@ -32,18 +41,18 @@ class ProcessPool(WorkerPool):
             1, multiprocessing.get_context("spawn"), initializer=begin_worker
         )  # fmt: skip
         with _library_threads(self.threads):  # the first call starts the process
-            self.calls[executor.submit(function, *call.arguments)] = call.key, executor
+            self.calls[executor.submit(function, *call.arguments)] = call, executor
 
     def wait(self) -> list[tuple[Any, Any]]:
         """Wait until a call ends; return key and result of each ended call."""
         ended = []
         for future in wait(self.calls, return_when=FIRST_COMPLETED).done:
-            key, executor = self.calls.pop(future)
+            call, executor = self.calls.pop(future)
             if isinstance(future.exception(), BrokenProcessPool):
-                ended.append((key, LostProcess(LOST)))
+                ended.append((call.key, LostProcess(f"{LOST}; {memory_problem(call.memory) or FEWER}")))
             else:
                 self.idle.append(executor)  # first, since the call may have failed, and all executors are closed
-                ended.append((key, future.result()))
+                ended.append((call.key, future.result()))
         return ended
 
     def close(self) -> None:

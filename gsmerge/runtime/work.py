@@ -53,16 +53,20 @@ class WorkerPool(ABC):
         Yields key and result of each call as it ends; the result is a :class:`LostProcess` if the process died. Raises
         the exception of a failed call.
         """
-        waiting, num_running = iter(calls), 0
+        waiting, num_running, call = iter(calls), 0, None
         while True:
-            while num_running < self.capacity and (call := next(waiting, None)) is not None:
+            while num_running < self.capacity and (call := call or next(waiting, None)) and self.has_room(call):
                 self.submit(function, call)
-                num_running += 1
+                num_running, call = num_running + 1, None
             if not num_running:
                 return
             ended = self.wait()
             num_running -= len(ended)
             yield from ended
+
+    def has_room(self, call: Call) -> bool:
+        """Return whether a call may start beside those that run; if none runs, it must."""
+        return True
 
     @abstractmethod
     def submit(self, function: Callable[..., Any], call: Call) -> None:

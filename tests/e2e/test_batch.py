@@ -68,7 +68,8 @@ def test_one_bad_scene_stops_no_other(first: tuple[int, Path], rooms: Path, run:
     names = [f"room{number}.ply" for number in range(2)]
     assert sorted(results(out)) == names
     assert statuses(out) == {"bad.ply": ["failed"], **{name: ["done"] for name in names}}
-    assert sorted(path.name for path in out.iterdir()) == ["batch.jsonl", *names]
+    cameras = [f"room{number}.cameras.json" for number in range(2)]
+    assert sorted(path.name for path in out.iterdir()) == sorted(["batch.jsonl", *cameras, *names])
     lines = {record["output"]: record for record in records(out)}
     assert "truncated" in lines["bad.ply"]["error"]
     for line in lines.values():
@@ -77,7 +78,8 @@ def test_one_bad_scene_stops_no_other(first: tuple[int, Path], rooms: Path, run:
     assert (report["input"]["num_gaussians"], report["options"]["threads"]) == (3 * 24 * 16, 1)
     assert report["output"]["bytes"] == lines["room1.ply"]["files"][0]["bytes"]
     assert run("compact", rooms / "room1", "-o", tmp_path / "one.ply", *FAST, "-q").code == 0
-    assert (tmp_path / "one.ply").read_bytes() == (out / "room1.ply").read_bytes()
+    for ending in (".ply", ".cameras.json"):
+        assert (tmp_path / f"one{ending}").read_bytes() == (out / f"room1{ending}").read_bytes()
 
 
 def test_the_same_again_does_what_failed_and_nothing_else(rooms: Path, out: Path, run: Run) -> None:
@@ -112,13 +114,27 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path,
     assert outcome.code == 0
     assert f"{rooms / 'bad'} -> {out / 'bad.ply'}" in outcome.out
     assert "1 of 3 scenes" in outcome.out
-    plan = json.loads(batch(run, rooms, out, "--dry-run", "--json", "--seed", 1, "--jobs", 3).out)
+    refused = batch(run, rooms, out, "--dry-run", "--json", "--seed", 1, "--jobs", 3)
+    assert refused.code == 5
+    assert names(refused.err, "2 of 3 scenes")
+    plan = json.loads(refused.out)
     assert (plan["dry_run"], plan["num_scenes"], plan["num_pending"], plan["jobs"]) == (True, 3, 1, 3)
-    assert plan["scenes"][0]["num_gaussians"] == 3 * 24 * 16
+    assert [scene["num_gaussians"] for scene in plan["scenes"]] == [0, 3 * 24 * 16, 3 * 24 * 16]  # one is cut
+    assert ["settings" in str(scene["error"]) for scene in plan["scenes"]] == [False, True, True]
     assert listing(out) == before
     new = batch(run, rooms, out.parent / "new", "--dry-run")
     assert "3 of 3 scenes" in new.out
     assert not (out.parent / "new").exists()
+
+
+def test_scenes_of_one_name_fail_and_no_other(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
+    """The night after: one whose result is there, one of the same name, and a new one."""
+    for name in ("room1", "hall"):
+        shutil.copytree(rooms / "room0", tmp_path / "later" / name)
+    before = results(out)
+    outcome = run("batch", rooms / "room1", tmp_path / "later", "--output", out, *FAST, code=5)
+    assert names(outcome.out, tmp_path / "later/room1", out / "room1.ply", "1 done, 1 skipped, 1 failed")
+    assert results(out) == before | {"hall.ply": before["room0.ply"]}
 
 
 def test_the_table_at_the_end_has_the_first_results() -> None:

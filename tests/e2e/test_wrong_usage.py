@@ -85,7 +85,6 @@ USAGE = {
     "compacc room": "*'compacc'*'compact'",
     "batch room -o out --set fit=none --quality 30": "quality*'30'",
     "batch room -o out --jobs many": "--jobs*auto*'many'",
-    "batch room/scene.ply alone.ply -o out --name same.ply": "out/same.ply*room/scene.ply*alone.ply*--name",
     "batch room -o room": "room*results",
     "batch room -o alone.ply": "--output*alone.ply",
     "compact room.gsm -o room.gsm --overwrite": "room.gsm*input",

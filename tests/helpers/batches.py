@@ -38,8 +38,9 @@ def statuses(folder: Path) -> dict[str, list[str]]:
 
 
 def results(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file but the records and a lock's: whatever is left half-done shows."""
+    """SHA-256 of every file but the records, a lock's and cameras of results: whatever is left half-done shows."""
     files = [path for path in folder.rglob("*") if path.is_file() and path.name not in (RECORDS, ".gsmerge-lock")]
+    files = [path for path in files if path.name.startswith(".") or not path.name.endswith(".cameras.json")]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
@@ -106,4 +107,5 @@ def touch(*names: str) -> None:
     """Write files that look like scenes of seven Gaussians, in folders that are made for them."""
     for name in names:
         Path(name).parent.mkdir(parents=True, exist_ok=True)
-        Path(name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 7\nend_header\n")
+        header = b"ply\nformat ascii 1.0\nelement vertex 7\nproperty char f_dc_0\nend_header\n"
+        Path(name).write_bytes(header + 7 * b"0\n")

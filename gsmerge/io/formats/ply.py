@@ -21,7 +21,7 @@ import numpy as np
 from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.bounds import ReadBudget, check_file, read_budget
+from gsmerge.io.bounds import ReadBudget, read_budget
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.columns import check_columns
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
@@ -312,11 +312,15 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
         yield read
 
 
-def header_counts(path: Path) -> tuple[int, int]:
-    """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if unreadable."""
-    header = _read_start(path)
+def header_counts(path: Path, *, held: bool = False) -> tuple[int, int]:
+    """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if unreadable.
+
+    ``held``: zeros also if the file is too short for its header.
+    """
+    header = _read_start(path, check=held)
     match = re.search(r"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
-    return int(match[1]) if match else 0, len(re.findall(r"^property \S+ \w*f_rest_\d+\s*$", header, re.MULTILINE))
+    num_rest = len(re.findall(r"^property \S+ \w*f_rest_\d+\s*$", header, re.MULTILINE))
+    return int(match[1]) if match else 0, min(num_rest, 3 * ((MAX_READ_DEGREE + 1) ** 2 - 1))
 
 
 def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
@@ -338,14 +342,17 @@ def is_file_from_gsmerge(path: Path) -> bool:
     return is_from_gsmerge(_list_comments(_read_start(path)))
 
 
-def _read_start(path: Path) -> str:
-    """Return a PLY file's header, of at most 64 KiB; empty if it is longer or unreadable."""
+def _read_start(path: Path, *, check: bool = False) -> str:
+    """Return a PLY file's header, of at most 64 KiB; empty if it is longer or unreadable, or fails the ``check``."""
     try:
-        check_file(path)  # reading a pipe would never end
+        budget = read_budget(path)  # first, since reading a pipe would never end
         with path.open("rb") as file:
-            header, end, _ = file.read(1 << 16).decode("latin-1").partition("end_header")
-    except (OSError, SceneError):
+            start = file.read(1 << 16)
+        if check:
+            _check_header(start, budget)
+    except (OSError, SceneError, ValueError):  # ValueError: no number of rows
         return ""
+    header, end, _ = start.decode("latin-1").partition("end_header")
     return header if end else ""
 
 

@@ -159,10 +159,13 @@ def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
 def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
     """Estimate the number of Gaussians in all files, and the largest number of harmonics columns in any file.
 
-    Columns of degree 0 are not counted. A ``.ply`` is counted exactly by its header, other formats by their size in
-    bytes; zeros for files that cannot be read.
+    Columns of degree 0 are not counted. A ``.ply`` is counted exactly by its header if it has the bytes for that, other
+    formats by their size in bytes, whatever they state; zeros for files that cannot be read.
     """
-    counts = [ply.header_counts(path) if find_format(path).read is ply.read_rows else _by_bytes(path) for path in paths]
+    counts = [
+        ply.header_counts(path, held=True) if find_format(path).read is ply.read_rows else _by_bytes(path)
+        for path in paths
+    ]
     return sum(count for count, _ in counts), max((rest for _, rest in counts), default=0)
 
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
 from typing import Any
 
 import pytest
+from batches import InlinePool
 
 from gsmerge.batch import BatchOptions, Job, run
 from gsmerge.batch.jobs import CompactCall
 from gsmerge.batch.run import choose_concurrency
 from gsmerge.runtime.memory import memory_bytes
+from gsmerge.runtime.processes import ProcessPool
+from gsmerge.runtime.work import Call
 from gsmerge.scene.exporters import NO_HINTS
 from gsmerge.settings.compact import CompactOptions
 
@@ -53,5 +58,45 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
         machine(monkeypatch, 4, None if share is None else int(share * need / run.FREE_MEMORY_SHARE) + 1)
         return choose_concurrency(scenes, BatchOptions(**message)).jobs
 
-    assert [count(3), count(2), count(1.9), count(0.5), count(None)] == [4, 2, 1, 1, 4]
+    assert [count(3), count(1), count(None)] == [4, 4, 4]  # those that are larger than most wait for each other
     assert count(1, jobs=3) == 3  # who asks for it gets it
+    scenes = jobs(small, large, large)
+    assert [count(4), count(2), count(1.9), count(0.5), count(None)] == [3, 2, 1, 1, 3]
+    assert choose_concurrency(scenes, BatchOptions(jobs=2)).memory == math.inf
+
+
+class Gauge(InlinePool):
+    """A pool of three calls at once, which end one after the other."""
+
+    capacity, most = 3, 0
+
+    def __init__(self, memory: float) -> None:
+        super().__init__()
+        self.memory, self.order, self.calls = memory, list[int](), dict[int, tuple[Call, None]]()
+
+    has_room = ProcessPool.has_room  # type: ignore[assignment]
+
+    def submit(self, _: Any, call: Call) -> None:
+        self.calls[call.key] = call, None
+        self.order.append(call.key)
+        self.most = max(self.most, sum(running.memory for running, _ in self.calls.values()))
+
+    def wait(self) -> list[tuple[Any, Any]]:
+        key = next(iter(self.calls))
+        return [(key, self.calls.pop(key)[0].memory)]
+
+
+@pytest.mark.parametrize(("memory", "most"), [(math.inf, 15), (12, 12), (10, 9), (8, 9), (0, 9)])
+def test_calls_fit_into_the_memory_together_and_a_larger_one_runs_alone(memory: float, most: int) -> None:
+    pool, sizes = Gauge(memory), [2, 3, 9, 2, 4, 1]
+    ended = dict(pool.run(int, (Call(key, (), size) for key, size in enumerate(sizes))))
+    assert ended == dict(enumerate(sizes))
+    assert pool.order == list(range(len(sizes)))
+    assert pool.most == most
+
+
+def test_scenes_that_others_wait_for_come_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine(monkeypatch, 4, 4 * memory_bytes(10))
+    monkeypatch.setattr(run, "ProcessPool", InlinePool)
+    done = run.run_batch(jobs(10, 10**7, 10, 10), tmp_path, BatchOptions())
+    assert [line["scene"] for line in done] == ["0", "2", "3", "1"]

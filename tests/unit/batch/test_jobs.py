@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from batches import touch
-from messages import refuses
+from messages import names, refuses
 
 from gsmerge.batch import BatchOptions, find_jobs
 from gsmerge.batch.jobs import output_name
@@ -47,6 +47,10 @@ def outputs(*arguments: str, options: BatchOptions | None = None, results: Colle
     return {job.output: Path(job.scene).as_posix() for job in jobs}
 
 
+def clashes(*arguments: str, options: BatchOptions | None = None) -> dict[str, bool]:
+    return {Path(job.scene).as_posix(): bool(job.clash) for job in find_jobs(arguments, OUT, options or BatchOptions())}
+
+
 def test_results_of_former_runs_are_no_scenes() -> None:
     touch("a.ply", "b.ply")
     assert outputs("*.ply", results={os.path.realpath("b.ply")}) == {"a.ply": "a.ply"}
@@ -59,9 +63,10 @@ def test_each_scene_comes_once() -> None:
 
 def test_two_scenes_are_not_written_to_one_file() -> None:
     touch("s/a/scene.ply", "t/a/scene.ply")
-    with refuses(UsageError, "out/a.ply", "s/a", "t/a", "--name"):
-        outputs("s", "t")
-    apart = outputs("s", "t", options=BatchOptions(output="{parent}/{stem}.ply"))
+    touch("t/b/scene.ply")
+    assert clashes("t", "s") == {"t/a": True, "t/b": False, "s/a": True}
+    assert names(find_jobs(["s", "t"], OUT, BatchOptions())[0].clash, "out/a.ply", "s/a and t/a", "--name")
+    apart = outputs("s", "t/a", options=BatchOptions(output="{parent}/{stem}.ply"))
     assert apart == {"s/a.ply": "s/a", "t/a.ply": "t/a"}
 
 
@@ -69,14 +74,13 @@ def test_levels_need_files_of_their_own_too() -> None:
     touch("a.ply", "a.level1.ply")
     levels = BatchOptions(CompactOptions().with_settings({"levels": 2}))
     assert len(outputs("*.ply")) == 2
-    with pytest.raises(UsageError, match=r"a\.level1\.ply"):
-        outputs("*.ply", options=levels)
+    assert clashes("*.ply", options=levels) == {"a.ply": True, "a.level1.ply": True}
 
 
 def test_a_result_does_not_replace_a_scene() -> None:
-    touch("out/a.ply", "b/a.ply")
-    with refuses(UsageError, "out/a.ply", "--output"):
-        outputs("out/a.ply")
+    touch("out/a.ply", "b/c.ply")
+    assert clashes("out/a.ply", "b") == {"out/a.ply": True, "b/c.ply": False}
+    assert names(find_jobs(["out/a.ply"], OUT, BatchOptions())[0].clash, "out/a.ply", "--output")
 
 
 def test_counts_come_from_the_header() -> None:

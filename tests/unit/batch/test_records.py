@@ -28,7 +28,7 @@ def test_results_are_known_by_what_they_were_made_of_and_what_they_are(tmp_path:
     append_line(tmp_path / RECORDS, done("a.ply"))
     index = RecordIndex(tmp_path).read_on()
     known = index.results["a.ply"]
-    assert known == DoneResult("k", FILES)
+    assert known == DoneResult("k", FILES, "in/a.ply")
     assert not known.holds(tmp_path, "k")  # there is no file
     (tmp_path / "a.ply").write_bytes(b"abc")
     assert known.holds(tmp_path, "k")
@@ -92,7 +92,7 @@ def test_whatever_a_line_holds_the_records_can_be_read(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
 def test_a_pipe_in_place_of_a_result_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.ply")
-    assert not DoneResult("k", FILES).holds(tmp_path, "k")
+    assert not DoneResult("k", FILES, "in/a.ply").holds(tmp_path, "k")
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:

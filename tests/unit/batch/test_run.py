@@ -22,8 +22,9 @@ from network_fixtures import noisy, untrained, written
 from gsmerge.batch import jobs as calls
 from gsmerge.batch import run as runs
 from gsmerge.batch import run_batch
-from gsmerge.batch.records import DONE, FAILED, SKIPPED
-from gsmerge.batch.run import lock_result, make_result, remove_unfinished
+from gsmerge.batch.jobs import find_jobs
+from gsmerge.batch.records import DONE, FAILED, SKIPPED, check_folder
+from gsmerge.batch.run import Run, lock_result, make_result, pending_jobs, remove_unfinished
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic
 
@@ -173,8 +174,9 @@ def test_a_checkpoint_counts_by_what_is_in_it(scene: Path, out: Path, tmp_path: 
 def test_results_in_other_formats(ending: str, scene: Path, out: Path) -> None:
     said = replace(QUICK, settings=QUICK.settings.with_settings({"levels": 2}), output="{stem}" + ending)
     actual = run(scene, out, said)
-    assert [file["path"] for file in actual["files"]] == [f"room{ending}", f"room.level1{ending}"]
-    assert sorted(results(out)) == sorted(file["path"] for file in actual["files"])
+    paths = [f"room{ending}", f"room.level1{ending}", "room.cameras.json"]
+    assert [file["path"] for file in actual["files"]] == paths
+    assert sorted(path.name for path in out.iterdir()) == sorted([*paths, "batch.jsonl"])
     start = {".sog": b"PK", ".spz": b"\x1f\x8b"}[ending]
     assert (out / f"room{ending}").read_bytes().startswith(start)
     assert run(scene, out, said)["status"] == SKIPPED
@@ -196,6 +198,37 @@ def test_unexpected_errors_are_recorded(scene: Path, out: Path, monkeypatch: pyt
     assert run(scene, out)["error"].startswith("out of memory")
 
 
+def test_the_result_of_another_scene_is_kept(scene: Path, out: Path) -> None:
+    """Also one whose name comes a night later, by itself or beside the first; each on its own."""
+    other = Path(shutil.copytree(scene, scene.parent / "later" / "room"))
+    (photo := next((other / "images").iterdir())).write_bytes(photo.read_bytes() + b"\0")
+    run(scene, out)
+    before = results(out)
+    assert says(run(other, out)["error"], out / "room.ply", scene, "--name", "--overwrite")
+    for options in (QUICK, replace(QUICK, overwrite=True)):
+        both, started = find_jobs([str(other), str(scene)], out, options), Run(out, 1, options.overwrite)
+        foreseen = {job.scene: refused for job, refused in pending_jobs(both, out, options)}
+        ended = {job.scene: make_result(job, started, wait=False) for job in both}
+        assert [line and line["status"] for line in ended.values()] == [FAILED, DONE if options.overwrite else SKIPPED]
+        assert says(foreseen[str(other)], out / "room.ply", scene, other, "--name")
+        assert foreseen.get(str(scene)) is None
+        assert results(out) == before
+    shutil.rmtree(scene)
+    assert run(other, out)["status"] == DONE  # the scene was moved, or is gone
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="folders cannot be locked there")
+def test_what_is_done_is_skipped_in_a_folder_that_cannot_be_written(
+    scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(scene, out)
+    monkeypatch.setattr(os, "access", lambda path, _: Path(path) != out)
+    monkeypatch.setattr(runs, "lock_file", None)
+    monkeypatch.setattr(Path, "touch", None)
+    check_folder(out)
+    assert run(scene, out)["status"] == SKIPPED
+
+
 def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> None:
     out.mkdir()
     (out / "room.ply").write_bytes(b"mine")
@@ -204,6 +237,16 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
         assert names(actual["error"], "exists", "batch", "--overwrite")
         assert (out / "room.ply").read_bytes() == b"mine"
     assert list(results(out)) == ["room.ply"]
+    (out / "room.ply").unlink()
+    (out / "room.ply").symlink_to("nowhere")
+    assert says(run(scene, out)["error"], out / "room.ply", "link to nowhere", "--overwrite")
+    (out / "room.ply").unlink()
+    (out / "room.cameras.json").write_bytes(b"mine")  # or those of a result in another format
+    assert [file["path"] for file in run(scene, out)["files"]] == ["room.ply"]
+    assert (out / "room.cameras.json").read_bytes() == b"mine"
+    mine = Path(shutil.copy(scene / "transforms.json", out / "room.cameras.json"))
+    run(scene, out, replace(QUICK, overwrite=True, cameras=str(mine)))
+    assert mine.read_bytes() == (scene / "transforms.json").read_bytes()
     assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
 
 

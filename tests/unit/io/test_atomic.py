@@ -235,9 +235,9 @@ def test_data_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pyt
 def test_a_link_stays_one_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "far").mkdir()
     (tmp_path / "far" / "file.txt").write_text("old")
-    for name, target in (("link.txt", "far/file.txt"), ("dangling.txt", "far/new.txt")):
+    for name, target, found in (("link.txt", "far/file.txt", "exists"), ("dangling.txt", "far/new.txt", "link to")):
         (tmp_path / name).symlink_to(target)
-        with refuses(SceneError, tmp_path / name, "exists"), atomic_output(tmp_path / name):
+        with refuses(SceneError, tmp_path / name, found), atomic_output(tmp_path / name):
             pass
         with atomic_output(tmp_path / name, overwrite=True) as temporary:
             temporary.write_text("new")

@@ -16,6 +16,7 @@ from plyfile import PlyData
 from gsmerge.errors import SceneError
 from gsmerge.io import read_gaussians, read_ply
 from gsmerge.io.formats.ply import header_counts, open_ply, open_rows
+from gsmerge.io.formats.table import estimate_counts
 
 from .test_read import columns, save
 
@@ -104,6 +105,32 @@ def test_what_a_header_promises(tmp_path: Path) -> None:
     if hasattr(os, "mkfifo"):
         os.mkfifo(tmp_path / "pipe.ply")  # which nobody writes to
         assert header_counts(tmp_path / "pipe.ply") == (0, 0)
+
+
+PLAIN, LINES = [b"property float x"] * 4, b"\n".join
+
+
+@pytest.mark.parametrize(
+    ("stated", "properties", "rows", "text", "held"),
+    [
+        (b"7", PLAIN, 7 * 16, False, (7, 0)), (b"8", PLAIN, 7 * 16, False, (0, 0)),
+        (b"999999999999", PLAIN, 7 * 16, False, (0, 0)), (b"9" * 5000, PLAIN, 7 * 16, False, (0, 0)),
+        (b"-7", PLAIN, 7 * 16, False, (0, 0)), (b"7", [], 7 * 16, False, (0, 0)),
+        (b"7", PLAIN, 7 * 8, True, (7, 0)), (b"8", PLAIN, 7 * 8, True, (0, 0)),
+        (b"7", [b"property double f_rest_0", b"property uchar f_rest_1"], 7 * 9, False, (7, 2)),
+        (b"7", [b"property double f_rest_0", b"property uchar f_rest_1"], 7 * 9 - 2, False, (0, 0)),
+        (b"7", [b"property list uchar float x"], 7 * 16, False, (0, 0)),
+        (b"7", [b"property uchar f_rest_%d" % i for i in range(500)], 7 * 500, False, (7, 72)),
+    ],
+)  # fmt: skip
+def test_a_header_counts_for_what_its_bytes_hold(
+    tmp_path: Path, stated: bytes, properties: list[bytes], rows: int, text: bool, held: tuple[int, int]
+) -> None:
+    kind = b"ascii" if text else b"binary_little_endian"
+    head = [b"ply", b"format " + kind + b" 1.0", b"element vertex " + stated, *properties, b"end_header", b""]
+    (tmp_path / "a.ply").write_bytes(LINES(head) + bytes(rows))
+    assert header_counts(tmp_path / "a.ply", held=True) == held
+    assert estimate_counts([tmp_path / "a.ply"] * 2) == (2 * held[0], held[1])
 
 
 def test_tensors_of_lyra_1_are_named(tmp_path: Path) -> None:
