@@ -56,6 +56,7 @@ def extend(args: opt.Args) -> None:
         if not args.silent:
             print_document(document, batch_line(document), as_json=False)
     if args.json:
-        from gsmerge.measure.documents import document_head, to_json
+        from gsmerge.measure.documents import document_head, note_entries, to_json
 
-        sys.stdout.write(to_json(document_head() | {"batches": documents}))
+        notes = note_entries(note for document in documents for note in document["notes"])
+        sys.stdout.write(to_json(document_head() | {"batches": documents} | notes))
