@@ -21,7 +21,7 @@ from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
 from gsmerge.photos.assign import Assignment
 from gsmerge.photos.grid_fit import WHOLE_FIT
-from gsmerge.photos.masks import NO_MASKS, Masks, check_masks
+from gsmerge.photos.masks import NO_MASKS, CameraMaskError, Masks, check_masks
 from gsmerge.photos.parts import choose_part, has_bars
 from gsmerge.photos.scene_photos import (
     UNNAMED,
@@ -250,7 +250,7 @@ def _answer(read: Callable[[], T]) -> T | SceneError:
     try:
         return read()
     except SceneError as error:
-        return SceneError(error.path, error.problem, error.remedy)  # a copy: the traceback keeps arrays in memory
+        return type(error)(error.path, error.problem, error.remedy)  # a copy: the traceback keeps arrays in memory
 
 
 def _note_left_out(load: Loaded, files: SceneFiles, names: list[str], cause: SceneError) -> Loaded:
@@ -390,9 +390,11 @@ def _without_photos(
 
 
 def _is_named(files: SceneFiles, cause: SceneError) -> bool:
-    """Return whether a picture at fault is in a folder that the caller named."""
+    """Return whether a picture at fault is in a folder that the caller named, or is named as a mask."""
     folders = (getattr(files, name) for name in ("images", "masks", "protect") if name in files.named)
-    return any(folder is not None and Path(cause.path).is_relative_to(folder) for folder in folders)
+    return isinstance(cause, CameraMaskError) or any(
+        folder is not None and Path(cause.path).is_relative_to(folder) for folder in folders
+    )
 
 
 def _combine(
@@ -426,8 +428,7 @@ def _combine(
         if "masks" in files.named or Path(found.path) in photos.paths or _is_named(files, found):
             raise found
         remedy = found.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        folder = Path(found.path).parent
-        left_out = [f"the masks in {folder} are left out: {found.path}: {found.problem}; {remedy}"]
+        left_out = [f"masks are left out: {found.path}: {found.problem}; {remedy}"]
         found = find_larger_and_masks(replace(files, masks=None, named=files.named | {"masks"}), *place)
     large, masks, mask_notes = found
     load = _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
