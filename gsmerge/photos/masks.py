@@ -144,12 +144,12 @@ def read_masks(
         return [of_views.get(view) for view in range(len(camera_file))]
 
     masks, protecting = spread(found), spread(protecting)
-    error, place = (CameraMaskError, camera_file.path) if by_cameras else (SceneError, files.masks or "")
-    _refuse_photos(error, place, "masks", masks, photos.pictures)
-    _refuse_photos(SceneError, files.protect or "", "protect", protecting, photos.pictures)
     turns = photos.turns or (0,) * len(masks)
     mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.part, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
+    error, place = (CameraMaskError, camera_file.path) if by_cameras else (SceneError, files.masks or "")
+    _refuse_photos(error, place, "masks", masks, photos.pictures)
+    _refuse_photos(SceneError, files.protect or "", "protect", protecting, photos.pictures)
     shape = cameras.height, cameras.width
     result = Masks(_stack(counts, True, shape), _stack(importance, np.float32(1), shape))
     if files.protect is not None:
