@@ -160,30 +160,31 @@ def read_masks(
 def _refuse_photos(
     error: type[SceneError], place: StrPath, option: str, masks: Sequence[Path | None], photos: PhotoArrays
 ) -> None:
-    """Raise an ``error`` if masks of views, which a ``place`` has or names, look like photos."""
+    """Raise an ``error`` if a view's mask, which a ``place`` has or names, is a photo for certain, or most may be."""
     views = {view: mask for view, mask in enumerate(masks) if mask is not None}
-    are_photos = parallel_map(lambda view: _looks_like_photo(views[view], photos, view), views)
-    doubtful = [views[view].name for view, is_photo in zip(views, are_photos, strict=True) if is_photo]
-    if doubtful:
+    doubts = parallel_map(lambda view: _doubt_mask(views[view], photos, view), views)
+    if 2 * sum(doubts) > len(views):
+        doubtful = [views[view].name for view, doubt in zip(views, doubts, strict=True) if doubt]
         expected = f"expected black, white and grey pictures for --{option}, found {len(doubtful)} of {len(views)}"
         problem = f"{expected} that look like photos, {list_some(doubtful)}"
         raise error(place, problem, f"name another folder with --{option}, or pass --{option} {NONE}")
 
 
-def _looks_like_photo(mask: Path, photos: PhotoArrays, view: int) -> bool:
-    """Return whether a mask has several colours, or greys that change from pixel to pixel as in the photo of a view.
+def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
+    """Return whether a mask looks like a photo: infinity if it is one for certain, 1 if it may be one, 0 otherwise.
 
-    If most pixels have one of two levels, as those of masks with soft edges, it does not look like a photo.
+    A picture of several colours is one for certain. A grey one may be if it changes from pixel to pixel as the photo of
+    its view does, unless most of its pixels have one of two levels, as in masks with soft edges.
     """
     picture = np.rint(decode_small(mask, SIDE) * _WHITE)
     spread = np.ptp(picture, axis=-1)
     if spread.mean() > 1:
         colors = picture[spread >= spread.max() / 2]
-        return bool(np.median(np.abs(colors - np.median(colors, 0)).max(1)) > 1)
+        return np.inf if np.median(np.abs(colors - np.median(colors, 0)).max(1)) > 1 else 0
     grey, middle = picture[..., 0], (picture.min() + picture.max()) / 2
     black, white = np.median(grey[grey <= middle]), np.median(grey[grey >= middle])
     if np.median(np.abs(grey - np.where(grey > middle, white, black))) <= 1:
-        return False
+        return 0
     photo = photos[view]
     small = cv2.resize(photo, limit_size((photo.shape[1], photo.shape[0]), 2 * SIDE), interpolation=cv2.INTER_AREA)
     return _texture(grey) > max(_texture(small.mean(-1)) / 2, _JPEG_TEXTURE)  # nearer to the photo's than to a mask's

@@ -237,6 +237,16 @@ PICTURES: dict[
 }
 
 
+@pytest.mark.parametrize(("kind", "is_photo"), [("another photo", True), ("another photo in grey", False)])
+def test_one_picture_among_masks(tiny_folder: Path, tiny: Tiny, kind: str, is_photo: bool) -> None:
+    """Colours say for certain that it is a photo; most greys have to."""
+    for number, name in enumerate(tiny.names):
+        mask = half(tiny).astype(np.uint8) * 255
+        write(tiny_folder / "masks" / name, mask if number else PICTURES[kind][1](tiny.images[0], mask))
+    load = load_scene(tiny_folder)
+    assert (load.left_out is not None, load.scene.masks is None) == (is_photo, is_photo)
+
+
 @pytest.mark.parametrize("ending", [".png", ".jpg"])
 @pytest.mark.parametrize("kind", PICTURES)
 def test_photos_in_place_of_masks_are_refused(tmp_path: Path, kind: str, ending: str) -> None:
