@@ -109,20 +109,31 @@ def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str
     return matches[0] if matches else None
 
 
-def match_masks(folder: Path, names: Sequence[str], option: str = "--masks") -> tuple[list[Path | None], list[str]]:
+def match_masks(
+    folder: Path, names: Sequence[str], option: str = "--masks", *, named: bool = True
+) -> tuple[list[Path | None], list[str]]:
     """Find the mask of every view by the name of its photo, with or without extension; None for a view without a mask.
 
-    Also returns a note on masks that belong to no view. SceneError, which names the ``option``, if the folder has no
-    mask of any view, or two of one view.
+    Also returns a note on masks that belong to no view. SceneError, which names the ``option``, if a view has two
+    masks, or if no view has one and the folder was ``named``.
     """
+
+    def is_of_neighbour(mask: Path, photo: Path) -> bool:
+        """Return whether a mask in a folder is for photos in the folder of the same name, beside that of a photo."""
+        neighbour = photo.parent.parent / mask.parent.name
+        return mask.parent != folder and neighbour != photo.parent and neighbour.is_dir()
+
     files = list_images(folder)
     by_ending = _by_ending(folder, files)
-    masks = [_lookup(folder, by_ending, name, option) for name in names]
+    found = ((_lookup(folder, by_ending, name, option), Path(name)) for name in names)
+    masks = [None if mask is None or is_of_neighbour(mask, photo) else mask for mask, photo in found]
     if not any(masks):
         rename = "none", f"rename the masks, or name another folder with {option}"
-        found, remedy = (None if files else _find_unread(walk_files(folder))) or rename
-        problem = f"expected masks with the names of the photos, such as {PurePath(names[0]).stem}.png, found {found}"
-        raise SceneError(folder, problem, remedy)
+        content, remedy = (None if files else _find_unread(walk_files(folder))) or rename
+        problem = f"expected masks with the names of the photos, such as {PurePath(names[0]).stem}.png, found {content}"
+        if named:
+            raise SceneError(folder, problem, remedy)
+        return masks, [f"masks are not used: {folder}: {problem}; {remedy}"]
     unused = [file.relative_to(folder).as_posix() for file in files if file not in masks]
     examples = ", ".join(unused[:3]) + ", ..." * (len(unused) > 3)
     note = f"{option.removeprefix('--')}: {len(unused)} pictures in {folder} have the name of no photo: {examples}"

@@ -36,7 +36,7 @@ from gsmerge.io.formats.table import (
     find_format,
     may_hold_gaussians,
 )
-from gsmerge.io.image_names import check_photo_folder, list_images, natural_order
+from gsmerge.io.image_names import check_photo_folder, list_images, match_masks, natural_order
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.record import list_some
 from gsmerge.settings.reading import NONE
@@ -55,8 +55,8 @@ IMAGE_PLACES = (
     "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
     "keyframes/images",
 )  # fmt: skip
-MASK_PLACES = ("masks",)
-_OTHER_PICTURES = {*MASK_PLACES, "targets"}  # folders of pictures that are no photos of the scene's views
+MASK_PLACES = ("masks", "keyframes/masks")
+_OTHER_PICTURES = {"masks", "targets"}  # folders of pictures that are no photos of the scene's views
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
@@ -93,7 +93,7 @@ class SceneFiles:
     num_copies: int = 0  # number of other files in the folder with the same bytes
     named: frozenset[str] = frozenset()  # names of the fields that the caller gave, which are not searched
     photo_option: str = "--images"  # names the folder of ``images``
-    # Photos and cameras in the folder above or in its folders, if the scene has none, by option; never read
+    # Photos, cameras and masks in the folder above or in its folders, if the scene has none, by option; never read
     above: tuple[tuple[str, Path], ...] = ()
     others: tuple[Path, ...] = ()  # further cameras, which are tried in turn if ``cameras`` do not fit
     below: bool = False  # whether they are in folders below, and are read only if photos show that they fit
@@ -188,11 +188,14 @@ def find_scene_files(
     These folders are searched in this order:
 
     - the given folder;
-    - the folder of the ``.ply``, and the folder of the file to which it links;
-    - the folder above it if its own is ``gs_ply/``, ``ply/`` or ``gaussians/``, or the folder two above it if its own
-      is ``point_cloud/iteration_n/``;
-    - the folders above it up to ``within``, by default up to the given folder;
-    - for cameras, if these have none, the folders below the first of them that have no Gaussians.
+    - the folder of the ``.ply``, and those above it up to the given folder; the folder above it if its own is
+      ``gs_ply/``, ``ply/`` or ``gaussians/``, or two above it if its own is ``point_cloud/iteration_n/``;
+    - for cameras and photos, the folder of the file to which the ``.ply`` links;
+    - for cameras and photos, the folders above it up to ``within``;
+    - for cameras, if these have none, the folders below the first of them.
+
+    A folder that has Gaussians of its own is a scene, and no file in it belongs to another scene. Masks lie beside the
+    photos that are read, or in the first two of these folders.
 
     In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
     their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, but come last if they
@@ -224,21 +227,25 @@ def find_scene_files(
         check_file(part)
         if part.suffix.lower() in SEVERAL_USES:
             _CHECK_SCENE_FILE(part)
-    roots = _search_roots(path, ply, within)
+    own_roots, shared = _search_roots(path, ply, within)
+    roots = [*own_roots, *shared]
     others, below = list[Path](), False
     if cameras is None:
         camera_path, others, below = _find_camera_paths(ply, roots)
     if images is None:
         image_path = _find_image_path(ply, camera_path, roots)
     if masks is None:
-        mask_path = _find_mask_path(image_path, roots)
+        holders = filter((image_path or roots[0]).is_relative_to, roots)
+        nearest = max(holders, key=lambda root: len(root.parts), default=roots[0])
+        beside = nearest if images is None or image_path is None else image_path.parent
+        mask_path = _find_pictures("masks", MASK_PLACES, [beside, *own_roots], ply)
     parts = tuple(plys) if len(plys) > 1 else ()
     pictures = image_path, mask_path, protect
     files = SceneFiles(
         ply, camera_path, *pictures, parts=parts, num_copies=num_copies, named=named, others=tuple(others),
         below=below, root=roots[0],
     )  # fmt: skip
-    return files if within is not None else replace(files, above=_find_above(files, roots))
+    return replace(files, above=_find_above(files, own_roots))
 
 
 def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, list[Path], bool]:
@@ -249,12 +256,14 @@ def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, l
     of_result = result_cameras(ply)
     if of_result is not None and _count_signs(ply) == 2:
         return of_result, [], False
-    known = dict.fromkeys(path for root in roots for path in list_cameras(root))
+    known = dict.fromkeys(
+        path for root in roots for path in list_cameras(root) if not _is_in_other_scene(path, root, ply)
+    )
     cameras = [*islice(known, _MAX_CAMERAS)] or [*filter(None, map(find_other_cameras, roots))][:1]
     if cameras:
         return cameras[0], cameras[1:], False
     folders = list_folders(roots[0])[:_MAX_FOLDERS]
-    below = dict.fromkeys(path for folder, _ in folders for path in list_cameras(folder))
+    below = dict.fromkeys(p for top, _ in folders for p in list_cameras(top) if not _is_in_other_scene(p, top, ply))
     return next(filter(None, map(find_unread, roots)), of_result), [*islice(below, _MAX_CAMERAS)], bool(below)
 
 
@@ -262,26 +271,29 @@ def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> 
     """Find the images of a scene: inside its cameras' file, or in a folder; None without."""
     if cameras is not None and (cameras.suffix == STATE_ENDING or (cameras.suffix == ".npz" and holds_images(cameras))):
         return cameras
-    folders = [f for root in roots for place in IMAGE_PLACES if can_be_listed(f := root / place, "images")]
-    # If a folder has several scenes, each may have its own folder of images
+    return _find_pictures("images", IMAGE_PLACES, roots, ply)
+
+
+def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], ply: Path) -> Path | None:
+    """Find the first folder with pictures, none of them of another scene, in ``places`` of the ``roots``."""
+    folders = [(root, f) for root in roots for place in places if can_be_listed(f := root / place, option)]
+    # If a folder has several scenes, each may have its own folder of pictures
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
-    own_folders = [folder / name for folder in folders for name in names]
-    may_be = (folder for folder in own_folders + folders if folder.is_dir() and not _is_other_scene(folder, ply))
-    return next((folder for folder in may_be if list_images(folder)), None)
+    for root, folder in [*((root, folder / name) for root, folder in folders for name in names), *folders]:
+        holders = {picture.parent for picture in list_images(folder)}
+        if holders and not any(_is_in_other_scene(holder, root, ply) for holder in holders):
+            return folder
+    return None
 
 
-def _is_other_scene(folder: Path, ply: Path) -> bool:
-    """Return whether a folder has other Gaussians than ``ply``, and its photos are in folders below, as in a scene."""
-    if Path(os.path.realpath(ply)).is_relative_to(os.path.realpath(folder)):
-        return False
-    return bool(_plys_in(folder)) and all(photo.parent != folder for photo in list_images(folder))
+def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
+    """Return whether a path is, or lies in, a folder below ``root`` that has Gaussians of its own, others than ``ply``.
 
-
-def _find_mask_path(images: Path | None, roots: Sequence[Path]) -> Path | None:
-    """Find the folder of masks beside the images, or else in the searched folders ``roots``; None without."""
-    image_folder = [] if images is None else [images.parent]
-    candidates = (root / place for root in (*image_folder, *roots) for place in MASK_PLACES)
-    return next((folder for folder in candidates if can_be_listed(folder, "masks") and list_images(folder)), None)
+    Such a folder is a scene, to which all its files belong.
+    """
+    folders = [place for place in (path, *path.parents) if place != root and place.is_relative_to(root)]
+    scenes = [_plys_in(place) or other_plys(place / SCENES_PLACE) for place in folders if place.is_dir()]
+    return any(plys and os.path.realpath(ply) not in map(os.path.realpath, plys) for plys in scenes)
 
 
 def can_be_listed(folder: Path, option: str) -> bool:
@@ -297,34 +309,38 @@ def can_be_listed(folder: Path, option: str) -> bool:
 
 
 def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Path], ...]:
-    """Find the photos and cameras that a scene lacks in the folder above the searched folders ``roots``.
+    """Find the photos, cameras and masks that a scene lacks in the folder above its own, ``roots``.
 
-    Files in a neighbouring folder with Gaussians of its own belong to those.
+    Files of a neighbouring scene belong to that one, and masks have the names of the scene's photos.
     """
-    own = Path(os.path.realpath(files.ply))
-    folder = min((r for r in roots if own.is_relative_to(r)), default=roots[0], key=lambda r: len(r.parts))
+    folder = min(filter(Path(os.path.realpath(files.ply)).is_relative_to, roots), default=roots[0]).parent
     places = dict[str, Path | None]()
     with suppress(SceneError, OSError):
         if files.images is None and "images" not in files.named:
-            pictures = (folder.parent / place for place in IMAGE_PLACES)
-            places["images"] = next((f for f in pictures if f.is_dir() and f not in roots and list_images(f)), None)
+            places["images"] = _find_pictures("images", IMAGE_PLACES, [folder], files.ply)
         if files.cameras is None and "cameras" not in files.named:
-            places["cameras"] = find_cameras(folder.parent)
-    paths = ((option, path) for option, path in places.items() if path is not None)
-    return tuple(pair for pair in paths if not _plys_in(folder.parent / pair[1].relative_to(folder.parent).parts[0]))
+            places["cameras"] = next(
+                (path for path in list_cameras(folder) if not _is_in_other_scene(path, folder, files.ply)), None
+            )
+        masks = _find_pictures("masks", MASK_PLACES, [folder], files.ply)
+        if masks and files.images and files.masks is None and "masks" not in files.named:
+            match_masks(masks, [*map(str, list_images(files.images))])  # SceneError without a name of a photo
+            places["masks"] = masks
+    return tuple((option, path) for option, path in places.items() if path is not None and path not in roots)
 
 
-def _search_roots(path: Path, ply: Path, within: StrPath | None) -> list[Path]:
-    """List the folders in which files that belong to a ``.ply`` are searched; see :func:`find_scene_files`."""
+def _search_roots(path: Path, ply: Path, within: StrPath | None) -> tuple[list[Path], list[Path]]:
+    """List a scene's own folders, and those that other scenes may share with it; see :func:`find_scene_files`."""
     base = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
-    above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
+    own = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
-        above = [folder.parent.parent]
-    target = Path(os.path.realpath(ply)).parent  # of a link
-    top = within or (path if path.is_dir() else None)
-    above += [] if top is None else _list_between(folder, Path(os.path.realpath(top)))
-    return list(dict.fromkeys((Path(os.path.realpath(base)), folder, target, *above)))
+        own = [folder.parent.parent]
+    own = [Path(os.path.realpath(base)), folder, *own, *_list_between(folder, Path(os.path.realpath(path)))]
+    above = _list_between(folder, Path(os.path.realpath(within or folder)))
+    # Files beside a scene of a usual name belong to it; folders of other files are shared
+    shared = [Path(os.path.realpath(ply)).parent, *(place for place in above if named_ply(place) is None)]
+    return list(dict.fromkeys(own)), [place for place in dict.fromkeys(shared) if place not in own]
 
 
 def _check_folders(**folders: Path | None) -> None:

@@ -9,21 +9,38 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import Doubt, SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import find_image, match_masks
-from gsmerge.io.photo_files import Part, Size, cut_part, decode_alpha, decode_levels, image_size, same_shape
+from gsmerge.io.photo_files import (
+    Part,
+    PhotoArrays,
+    Size,
+    cut_part,
+    decode_alpha,
+    decode_levels,
+    decode_small,
+    image_size,
+    limit_size,
+    same_shape,
+)  # fmt: skip
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.photos.photo_folders import is_grey
+from gsmerge.photos.offsets import SIDE
 from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import PROTECTED, Cameras
+from gsmerge.settings.reading import NONE
+from gsmerge.types import PROTECTED, Cameras, StrPath
 
 _MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _WHITE = np.uint8(255)
+_JPEG_TEXTURE = 0.2  # largest share of the pixels of a smooth mask that JPEG makes uneven
 _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
+
+
+class CameraMaskError(SceneError):
+    """Pictures that the cameras' file names as masks, and that are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +128,12 @@ def read_masks(
     views = [view for view in range(len(camera_file)) if not paths or paths[view] is not None]  # with a photo
     names = [path.as_posix() for path in paths if path is not None] or list(camera_file.names)
     of_cameras, notes = ([], []) if "masks" in files.named else _find_masks_of_cameras(camera_file)
-    if any(of_cameras):
-        found: Sequence[Path | None] = [of_cameras[view] for view in views]
-    else:
-        found, more = _match_masks(files, names)
-        notes += more
-    protecting: Sequence[Path | None] = [None] * len(views)
+    found = protecting = list[Path | None]([None] * len(views))
+    if by_cameras := any(of_cameras):
+        found = [of_cameras[view] for view in views]
+    elif files.masks is not None:
+        found, unused = match_masks(files.masks, names, named="masks" in files.named)
+        notes += unused
     if files.protect is not None:
         protecting, unused = match_masks(files.protect, names, "--protect")
         notes += unused
@@ -130,22 +147,53 @@ def read_masks(
     turns = photos.turns or (0,) * len(masks)
     mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.part, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
+    error, place = (CameraMaskError, camera_file.path) if by_cameras else (SceneError, files.masks or "")
+    _refuse_photos(error, place, "masks", masks, photos.pictures)
+    _refuse_photos(SceneError, files.protect or "", "protect", protecting, photos.pictures)
     shape = cameras.height, cameras.width
     result = Masks(_stack(counts, True, shape), _stack(importance, np.float32(1), shape))
     if files.protect is not None:
         notes.append(_describe_protected(result.importance, protecting))
-    return result, [*notes, *_doubt_masks("masks", masks), *_doubt_masks("protect", protecting)]
+    return result, notes
 
 
-def _doubt_masks(option: str, masks: Sequence[Path | None]) -> list[str]:
-    """Note masks that seem to be photos, because they have colours."""
-    known = [mask for mask in masks if mask is not None]
-    doubtful = [mask.name for mask, is_mask in zip(known, parallel_map(is_grey, known), strict=True) if not is_mask]
-    if not doubtful:
-        return []
-    expected = "white where a photo is protected" if option == "protect" else "dark where photos do not count"
-    problem = f"{len(doubtful)} of {len(known)} pictures look like photos, {list_some(doubtful)}"
-    return [f"{option}: {problem}; expected grey pictures, {expected}"]
+def _refuse_photos(
+    error: type[SceneError], place: StrPath, option: str, masks: Sequence[Path | None], photos: PhotoArrays
+) -> None:
+    """Raise an ``error`` if a view's mask, which a ``place`` has or names, is a photo for certain, or most may be."""
+    views = {view: mask for view, mask in enumerate(masks) if mask is not None}
+    doubts = parallel_map(lambda view: _doubt_mask(views[view], photos, view), views)
+    if 2 * sum(doubts) > len(views):
+        doubtful = [views[view].name for view, doubt in zip(views, doubts, strict=True) if doubt]
+        expected = f"expected black, white and grey pictures for --{option}, found {len(doubtful)} of {len(views)}"
+        problem = f"{expected} that look like photos, {list_some(doubtful)}"
+        raise error(place, problem, f"name another folder with --{option}, or pass --{option} {NONE}")
+
+
+def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
+    """Return whether a mask looks like a photo: infinity if it is one for certain, 1 if it may be one, 0 otherwise.
+
+    A picture of several colours is one for certain. A grey one may be if it changes from pixel to pixel as the photo of
+    its view does, unless most of its pixels have one of two levels, as in masks with soft edges.
+    """
+    picture = np.rint(decode_small(mask, SIDE) * _WHITE)
+    spread = np.ptp(picture, axis=-1)
+    if spread.mean() > 1:
+        colors = picture[spread >= spread.max() / 2]
+        return np.inf if np.median(np.abs(colors - np.median(colors, 0)).max(1)) > 1 else 0
+    grey, middle = picture[..., 0], (picture.min() + picture.max()) / 2
+    black, white = np.median(grey[grey <= middle]), np.median(grey[grey >= middle])
+    if np.median(np.abs(grey - np.where(grey > middle, white, black))) <= 1:
+        return 0
+    photo = photos[view]
+    small = cv2.resize(photo, limit_size((photo.shape[1], photo.shape[0]), 2 * SIDE), interpolation=cv2.INTER_AREA)
+    return _texture(grey) > max(_texture(small.mean(-1)) / 2, _JPEG_TEXTURE)  # nearer to the photo's than to a mask's
+
+
+def _texture(grey: np.ndarray) -> float:
+    """Return the share of pixels that differ from the mean of those left and right by more than a level of 255."""
+    bends = np.diff(grey, 2, prepend=grey[:, :1], append=grey[:, -1:])
+    return float((np.abs(bends) > 2).mean())
 
 
 def _stack(
@@ -179,19 +227,7 @@ def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], 
     missing = [name for name, mask in zip(names, masks, strict=True) if name and mask is None]
     problem = f"{len(missing)} of {len(masks)} masks that {path.name} names are not in its folder"
     remedy = f"correct these paths, or name the masks' folder with --masks: {list_some(missing)}"
-    return masks, [f"{problem}; {remedy}"] if missing else []
-
-
-def _match_masks(files: SceneFiles, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
-    """Find the masks of photos; return them and notes. SceneError if a folder that the user named has none of them."""
-    if files.masks is None:
-        return [None] * len(names), []
-    try:
-        return match_masks(files.masks, names)
-    except SceneError as error:
-        if "masks" in files.named:
-            raise
-        return [None] * len(names), [f"masks are not used: {error.path}: {error.problem}"]
+    return masks, [Doubt(f"{problem}; {remedy}")] if missing else []
 
 
 def check_masks(masks: Masks, files: SceneFiles) -> tuple[Masks, list[str]]:
@@ -207,5 +243,5 @@ def check_masks(masks: Masks, files: SceneFiles) -> tuple[Masks, list[str]]:
     problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % of their pixels dark"
     if "masks" not in files.named or files.masks is None:
         where = files.masks or "transparency, or masks that the cameras' file names"
-        return NO_MASKS, [f"masks are not used: {where}: {problem}; name them with --masks"]
+        return NO_MASKS, [Doubt(f"masks are not used: {where}: {problem}; name them with --masks")]
     raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")

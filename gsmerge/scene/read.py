@@ -22,7 +22,7 @@ from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
 from gsmerge.photos.assign import Assignment
 from gsmerge.photos.grid_fit import WHOLE_FIT
-from gsmerge.photos.masks import NO_MASKS, Masks, check_masks
+from gsmerge.photos.masks import NO_MASKS, CameraMaskError, Masks, check_masks
 from gsmerge.photos.parts import choose_part, has_bars
 from gsmerge.photos.scene_photos import (
     UNNAMED,
@@ -255,7 +255,7 @@ def _answer(read: Callable[[], T]) -> T | SceneError:
     try:
         return read()
     except SceneError as error:
-        return SceneError(error.path, error.problem, error.remedy)  # a copy: the traceback keeps arrays in memory
+        return type(error)(error.path, error.problem, error.remedy)  # a copy: the traceback keeps arrays in memory
 
 
 def _note_left_out(load: Loaded, files: SceneFiles, names: list[str], cause: SceneError) -> Loaded:
@@ -394,9 +394,11 @@ def _without_photos(
 
 
 def _is_named(files: SceneFiles, cause: SceneError) -> bool:
-    """Return whether a picture at fault is in a folder that the caller named."""
+    """Return whether a picture at fault is in a folder that the caller named, or is named as a mask."""
     folders = (getattr(files, name) for name in ("images", "masks", "protect") if name in files.named)
-    return any(folder is not None and Path(cause.path).is_relative_to(folder) for folder in folders)
+    return isinstance(cause, CameraMaskError) or any(
+        folder is not None and Path(cause.path).is_relative_to(folder) for folder in folders
+    )
 
 
 def _combine(
@@ -421,17 +423,17 @@ def _combine(
         result = replace(result, cameras=cameras, images=images)
         notes += size_notes
     size = photo_size(limited)
-    unused = [f"--{name}" for name in ("masks", "protect") if name in files.named and getattr(files, name) is not None]
+    unused = [name for name in ("masks", "protect") if getattr(files, name) is not None]
     if unused and not size:
-        notes.append(Doubt(f"the pictures of {' and '.join(unused)} are not used, since there are no photos"))
+        kind = Doubt if files.named.intersection(unused) else str
+        notes.append(kind(f"the pictures of --{' and --'.join(unused)} are not used, since there are no photos"))
     place = camera_file, photos, size, result.transform, result.cameras
     found = _answer(lambda: find_larger_and_masks(files, *place))
     if isinstance(found, SceneError):
         if "masks" in files.named or Path(found.path) in photos.paths or _is_named(files, found):
             raise found
         remedy = found.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        folder = Path(found.path).parent
-        notes.append(Doubt(f"the masks in {folder} are left out: {found.path}: {found.problem}; {remedy}"))
+        notes.append(Doubt(f"masks are left out: {found.path}: {found.problem}; {remedy}"))
         found = find_larger_and_masks(replace(files, masks=None, named=files.named | {"masks"}), *place)
     large, masks, mask_notes = found
     return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)

@@ -60,6 +60,21 @@ def test_a_protected_part_of_the_photos_is_shown_better(
     assert any(note.startswith("protect: ") for note in report["notes"])
 
 
+def test_a_batch_takes_no_masks_of_other_scenes(run: Run, make_scene: Callable[..., Path], tmp_path: Path) -> None:
+    """A scene called masks and a folder of grey masks beside it change no bytes; the folder is named."""
+    quick = ("--effort", "draft", "--set", "fit=none")
+    for number, name in enumerate(("rooms/room", "rooms/masks", "halls/room")):
+        room = make_scene(tmp_path / name, num_views=3, width=24, height=16, seed=number)
+    for photo in (room / "images").iterdir():
+        (path := tmp_path / "halls/masks" / photo.name).parent.mkdir(exist_ok=True)
+        assert cv2.imwrite(str(path), np.tile(np.uint8([0, 255]), (16, 12)))
+    for folder in ("rooms", "halls"):
+        run("compact", tmp_path / folder / "room", "-o", alone := tmp_path / f"{folder}.ply", *quick, "--masks", "none")
+        done = run("batch", tmp_path / folder, "-o", out := tmp_path / f"{folder}-small", *quick, "--strict", "--json")
+        assert (out / "room.ply").read_bytes() == alone.read_bytes()
+        assert (f"--masks {tmp_path}/halls/masks" in done.out) == (folder == "halls")
+
+
 def test_a_batch_takes_what_each_scene_has(run: Run, make_scene: Callable[..., Path], tmp_path: Path) -> None:
     """Masks and what is to be protected, as of ``compact``: the same bytes."""
     for number in (0, 1):

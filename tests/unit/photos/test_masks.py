@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,10 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from messages import refuses
+from exports import export_rows, save_export, smooth_scene
+from messages import names, noted, refuses
 from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
+from gsmerge.inspection.inspect import inspect
 from gsmerge.io.image_names import match_masks
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.photos.views import subset
@@ -46,6 +49,18 @@ def test_masks_beside_the_photos_by_their_names(tiny_folder: Path, tiny: Tiny, n
     assert np.array_equal(load.scene.masks[1], half(tiny))
     assert load.scene.masks[[0, 2]].all()  # they have none
     assert "masks leave out 17 % of the photos' pixels; 1 of 3 photos have a mask" in load.notes
+
+
+def test_masks_in_a_folder_are_of_the_photos_in_the_folder_of_its_name(tmp_path: Path) -> None:
+    """Unless no photo is in one."""
+    for name in ("images/a/1.png", "images/b/1.png", "masks/a/1.png", "cut/c/1.png"):
+        write(tmp_path / name, np.zeros((2, 2), np.uint8))
+    photos = [str(tmp_path / "images" / name) for name in ("a/1.png", "b/1.png")]
+    assert match_masks(tmp_path / "masks", photos)[0] == [tmp_path / "masks/a/1.png", None]
+    assert match_masks(tmp_path / "cut", photos)[0] == [tmp_path / "cut/c/1.png"] * 2
+    masks, notes = match_masks(tmp_path / "masks", photos[1:], named=False)
+    assert masks == [None]
+    assert noted(notes, "masks are not used", tmp_path / "masks", "1.png")
 
 
 def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
@@ -115,7 +130,8 @@ def test_a_folder_of_other_masks_beside_the_photos_is_not_used(tiny_folder: Path
     write(tiny_folder / "masks" / "object_0.png", half(tiny).astype(np.uint8) * 255)
     load = load_scene(tiny_folder)
     assert load.scene.masks is None
-    assert any(note.startswith("masks are not used: ") and "found none" in note for note in load.notes)
+    assert not load.doubts
+    assert noted(load.notes, "masks are not used", tiny_folder / "masks", "found none")
 
 
 def test_masks_without_photos_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
@@ -190,10 +206,72 @@ def test_pictures_to_protect_that_do_not_fit(tiny_folder: Path, tiny: Tiny, tmp_
         read_scene(tiny_folder, protect=tmp_path / "wrong")
 
 
-def test_photos_in_place_of_masks_are_doubted(tiny_folder: Path, tiny: Tiny) -> None:
-    """Not masks, which are grey."""
-    notes = load_scene(tiny_folder, protect=tiny_folder / "images").notes
-    assert any(note.startswith("protect: 3 of 3 pictures look like photos, ") for note in notes)
-    for name in tiny.names:
-        write(tiny_folder / "signs" / f"{name}.png", half(tiny).astype(np.uint8) * 200)
-    assert not any("look like photos" in note for note in load_scene(tiny_folder, protect=tiny_folder / "signs").notes)
+def speckle(shape: tuple[int, ...]) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+
+
+def soften(mask: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(mask, (0, 0), 2)
+
+
+def tint(mask: np.ndarray) -> np.ndarray:
+    return np.dstack([mask // 9, mask, mask // 2])
+
+
+PICTURES: dict[
+    str, tuple[bool, Callable[[np.ndarray, np.ndarray], np.ndarray]]
+] = {  # of a photo and a mask of 2 levels
+    "the photo": (True, lambda photo, _: photo),
+    "another photo": (True, lambda photo, _: speckle(photo.shape)),
+    "the photo in grey": (True, lambda photo, _: cv2.cvtColor(photo, cv2.COLOR_BGR2GRAY)),
+    "another photo in grey": (True, lambda photo, _: speckle(photo.shape[:2])),
+    "a part of the photo on black": (True, lambda photo, mask: photo * (mask > 0)[..., None]),
+    "a mask": (False, lambda _, mask: mask),
+    "a mask of 0 and 1": (False, lambda _, mask: mask // 255),
+    "soft edges": (False, lambda _, mask: soften(mask)),
+    "equal channels": (False, lambda _, mask: np.dstack([soften(mask)] * 3)),
+    "opacity": (False, lambda _, mask: np.dstack([mask] * 4)),
+    "one colour": (False, lambda _, mask: tint(mask)),
+    "levels": (False, lambda _, mask: mask // 255 * np.linspace(130, 255, mask.shape[1]).astype(np.uint8)),
+    "holes everywhere": (False, lambda _, mask: mask | speckle(mask.shape) // 128 * 255),
+}
+
+
+@pytest.mark.parametrize(("kind", "is_photo"), [("another photo", True), ("another photo in grey", False)])
+def test_one_picture_among_masks(tiny_folder: Path, tiny: Tiny, kind: str, is_photo: bool) -> None:
+    """Colours say for certain that it is a photo; most greys have to."""
+    for number, name in enumerate(tiny.names):
+        mask = half(tiny).astype(np.uint8) * 255
+        write(tiny_folder / "masks" / name, mask if number else PICTURES[kind][1](tiny.images[0], mask))
+    load = load_scene(tiny_folder)
+    assert (bool(load.doubts), load.scene.masks is None) == (is_photo, is_photo)
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+@pytest.mark.parametrize("kind", PICTURES)
+def test_photos_in_place_of_masks_are_refused(tmp_path: Path, kind: str, ending: str) -> None:
+    """By their colours, or where greys change as those of the photo do; found beside the scene, they are left out."""
+    is_photo, draw = PICTURES[kind]
+    scene = smooth_scene(56, 40)
+    folder = save_export(tmp_path / "scene", scene, export_rows(scene))
+    mask = np.zeros((40, 56), np.uint8)
+    mask[:, 12:] = 255
+    for name, image in zip(scene.names, scene.images, strict=True):
+        noisy = np.clip(image[..., ::-1] + np.random.default_rng(1).normal(0, 4, image.shape), 0, 255).astype(np.uint8)
+        write(folder / "masks" / Path(name).with_suffix(ending), draw(noisy, mask))
+    load, named = load_scene(folder), dict.fromkeys(("masks", "protect"), folder / "masks")
+    assert (bool(load.doubts), load.scene.masks is None) == (is_photo, is_photo)
+    if not is_photo:
+        assert load_scene(folder, masks="none", protect=named["protect"]).scene.importance is not None
+        return
+    assert names(str(load.doubts), "masks are left out", folder / "masks", "3 of 3", "--masks none")
+    for option, place in named.items():
+        with refuses(SceneError, "masks", "3 of 3", f"--{option} none"):
+            load_scene(folder, **{"masks": "none", option: place})
+    assert names(str(inspect(folder, masks=folder / "masks")["alignment_problem"]), "3 of 3", "--masks none")
+    document = json.loads((folder / "transforms.json").read_text())
+    for frame, name in zip(document["frames"], scene.names, strict=True):
+        frame["mask_path"] = Path("masks", name).with_suffix(ending).as_posix()
+    (folder / "transforms.json").write_text(json.dumps(document))
+    with refuses(SceneError, "transforms.json", "3 of 3", "--masks none"):
+        load_scene(folder)

@@ -76,15 +76,66 @@ def test_image_folders_in_order(tmp_path: Path, tiny: Tiny) -> None:
     assert find_scene_files(tmp_path).images == tmp_path / "images"
 
 
-def test_photos_of_a_scene_in_a_folder_of_photos(tmp_path: Path, tiny: Tiny) -> None:
-    """A folder called ``rgb`` with Gaussians and a folder of photos is a scene of its own."""
-    write_ply(make(tmp_path, "rgb/images/1.png") / "x.ply", tiny.gaussians)
-    assert find_scene_files(tmp_path / "x.ply").images == tmp_path / "rgb"
-    write_ply(tmp_path / "rgb/scene.ply", tiny.gaussians)
-    assert find_scene_files(tmp_path / "x.ply").images is None
-    assert find_scene_files(tmp_path / "rgb").images == tmp_path / "rgb/images"
-    make(tmp_path, "rgb/1.png")  # AnySplat writes its Gaussians among the photos
-    assert find_scene_files(tmp_path / "x.ply").images == tmp_path / "rgb"
+LAYOUTS = {  # files of Gaussians, pictures and cameras -> the scene, and where its cameras, photos and masks lie
+    "masks of its own": ("a/scene.ply a/images/1.png a/masks/1.png", "a", None, "a/images", "a/masks"),
+    "beside a folder of masks": ("a/scene.ply a/images/1.png masks/1.png", "a", None, "a/images", None),
+    "below a folder of masks": ("b/a/scene.ply b/a/images/1.png masks/1.png", "b/a", None, "b/a/images", None),
+    "beside a scene called masks": ("a.ply images/1.png masks/scene.ply masks/1.png", "a.ply", None, "images", None),
+    "beside scenes in masks": ("a.ply images/1.png masks/b/c.ply masks/b/1.png", "a.ply", None, "images", None),
+    "beside a result of masks": ("a.ply images/1.png masks/gaussians/b.ply masks/1.png", "a.ply", None, "images", None),
+    "beside a scene called images": ("a/scene.ply images/scene.ply images/1.png", "a", None, None, None),
+    "beside scenes in input": ("a/scene.ply input/b/scene.ply input/b/1.png", "a", None, None, None),
+    "beside a scene called rgb": ("a.ply rgb/scene.ply rgb/images/1.png", "a.ply", None, None, None),
+    "beside Gaussians among photos": ("a.ply rgb/b.ply rgb/1.png", "a.ply", None, None, None),
+    "its Gaussians among photos": ("a/images/b.ply a/images/1.png a/masks/1.png", "a", None, "a/images", "a/masks"),
+    "photos of its own, shared masks": ("a.ply images/a/1.png masks/1.png", "a.ply", None, "images/a", "masks"),
+    "photos among those of masks": (
+        "a.ply masks.ply images/a/1.png images/masks/1.png",
+        "a.ply",
+        None,
+        "images/a",
+        None,
+    ),
+    "pictures of its own": ("a.ply b.ply images/a/1.png masks/a/1.png", "a.ply", None, "images/a", "masks/a"),
+    "shared photos": ("a/scene.ply images/1.png masks/1.png", "a", None, "images", "masks"),
+    "shared cameras": ("a/scene.ply b.ply cameras.json", "a", "cameras.json", None, None),
+    "beside cameras of a scene": ("a/scene.ply opensfm/b.ply opensfm/reconstruction.json", "a", None, None, None),
+    "beside cameras in a scene": ("a/scene.ply exports/b.ply exports/npz/results.npz", "a", None, None, None),
+    "in a scene": ("a/scene.ply a/cameras.json a/images/1.png a/b/scene.ply", "a/b", None, None, None),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_belongs_to_a_scene_of_many(tmp_path: Path, layout: str) -> None:
+    """Masks lie beside its photos or in its folder; no file of another scene is its own."""
+    files, scene, *places = LAYOUTS[layout]
+    make(tmp_path, *files.split())
+    found = find_scene_files(tmp_path / scene, within=tmp_path)
+    expected = [None if place is None else tmp_path / place for place in places]
+    assert [found.cameras, found.images, found.masks] == expected
+
+
+def test_masks_above_the_scene_are_named_if_they_have_its_names(tmp_path: Path) -> None:
+    make(tmp_path, "a/scene.ply", "a/images/1.png", "b/scene.ply", "b/images/2.png", "masks/1.png")
+    assert noted(find_scene_files(tmp_path / "a", within=tmp_path).notes, f"--masks {tmp_path}/masks")
+    assert noted(find_scene_files(tmp_path / "a/scene.ply").notes, f"--masks {tmp_path}/masks")
+    others = find_scene_files(tmp_path / "b"), find_scene_files(tmp_path / "a", masks="none")
+    assert [files.notes for files in others] == [(), ()]
+
+
+def test_masks_beside_photos_that_are_named(tmp_path: Path) -> None:
+    make(tmp_path, "a/scene.ply", "b/photos/1.png", "b/masks/1.png")
+    assert find_scene_files(tmp_path / "a", images=tmp_path / "b/photos").masks == tmp_path / "b/masks"
+    assert find_scene_files(tmp_path / "a", images="none").masks is None
+
+
+def test_masks_beside_the_file_to_which_a_link_leads(tmp_path: Path) -> None:
+    """They are the scene's where its photos lie there."""
+    make(tmp_path, "all/a.ply", "all/b.ply", "all/masks/1.png", "a/masks/2.png")
+    (link := tmp_path / "a/scene.ply").symlink_to(tmp_path / "all/a.ply")
+    assert find_scene_files(link).masks == tmp_path / "a/masks"
+    make(tmp_path, "all/images/1.png")
+    assert find_scene_files(link).masks == tmp_path / "all/masks"
 
 
 @pytest.mark.parametrize("folder", ["color", "corrected_images", "keyframes/corrected_images", "keyframes/images"])

@@ -167,7 +167,7 @@ def test_masks_that_nothing_names(tmp_path: Path) -> None:
         load_scene(folder, masks=folder / "masks")
     (folder / "masks" / SMOOTH.names[1]).write_bytes(b"\x89PNG nothing")
     actual = load_scene(folder)
-    assert names(str(actual.doubts), "the masks in", SMOOTH.names[1])
+    assert names(str(actual.doubts), "masks are left out", SMOOTH.names[1])
     assert actual.scene.images is not None
 
 
