@@ -15,11 +15,6 @@ if TYPE_CHECKING:
     from gsmerge.io.scene_files import SceneFiles
 
 
-# Reports that gsmerge writes (pages, JSON, CSV) have one of these texts in their first MARKED_BYTES
-MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,")
-MARKED_BYTES = 4000
-
-
 @dataclass(frozen=True)
 class FileOptions(Settings):
     """Options for writing a result."""
@@ -45,20 +40,6 @@ def output_file(output: Path, name: str) -> Path:
     """
     is_folder = output.is_dir() or not (output.suffix or os.path.lexists(output))
     return output / name if is_folder else output
-
-
-def is_page(path: Path) -> bool:
-    """Return whether a file is a report that gsmerge made: a page or a table."""
-    return any(mark in _read_start(path) for mark in MARKS)
-
-
-def _read_start(path: Path) -> bytes:
-    """Read the first bytes of a file; empty if it does not exist or cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(MARKED_BYTES)
-    except OSError:  # if it exists but cannot be read, writing fails with a reason of its own
-        return b""
 
 
 def check_format(output: Path, options: FileOptions) -> None:
@@ -115,8 +96,10 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
 
 def check_replaced(outputs: Sequence[Path]) -> None:
     """Raise UsageError for an output that exists, unless it is a page or a table that gsmerge made."""
+    from gsmerge.io.first_bytes import may_be_replaced
+
     for output in outputs:
-        if _read_start(output) and not is_page(output):
+        if not may_be_replaced(output):
             raise UsageError(f"{output}: exists already and is not a report of gsmerge; name another output")
 
 
@@ -139,11 +122,14 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
     return (*files.paths, *(path for scene_files in files.more for path in input_files(scene_files)))
 
 
-def write_texts(texts: Mapping[Path, str | bytes]) -> None:
-    """Write text files, of text or of its bytes, in place of existing ones: either all of them or none."""
+def write_texts(texts: Mapping[Path, str | bytes], mode: int = 0o666) -> None:
+    """Write text files, of text or of its bytes, in place of existing ones: either all of them or none.
+
+    ``mode``: the most rights of new files.
+    """
     from gsmerge.io import atomic_outputs
 
-    with atomic_outputs(overwrite=True) as add:
+    with atomic_outputs(overwrite=True, mode=mode) as add:
         for path, text in texts.items():
             add(path).write_bytes(text if isinstance(text, bytes) else text.encode(errors="replace"))
 

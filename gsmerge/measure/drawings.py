@@ -11,7 +11,7 @@ from typing import Any
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import NO_VIEWS, add_views
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
-from gsmerge.io.atomic import atomic_outputs
+from gsmerge.io.atomic import atomic_outputs, common_mode
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
@@ -92,6 +92,7 @@ class Drawing:
     paths: list[Path]  # Of the pictures, or of the video
     facts: dict[str, Any]  # For the report
     draw: Callable[[int], Iterator[Picture]]  # Takes the number of threads; as many views are in memory
+    mode: int = 0o666  # The most rights of new files, those of the photos that are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +146,7 @@ def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | No
 
 def prepare_panel(options: DrawOptions) -> Drawing:
     """Prepare one picture with the columns photo, before, after, ... and a row for each view and the outside view."""
+    mode = common_mode(options.framing.paths)
     group = _read(options, photos=True)
     scene = group.load.scene
     cameras, photos, pictured = options.resize(scene.cameras), scene.images, scene.photo_views
@@ -163,7 +165,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(pictured) > 0, "notes": group.notes}
-    return Drawing([options.output], facts, draw)
+    return Drawing([options.output], facts, draw, mode)
 
 
 def prepare_pictures(options: DrawOptions) -> Drawing:
@@ -333,7 +335,7 @@ def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> d
         pictures = report_each(drawing.draw(at_once))
         if fps is not None:
             return {"encoding": write_clip(drawing.paths[0], pictures, fps, overwrite=overwrite)}
-        with atomic_outputs(overwrite=overwrite) as add:
+        with atomic_outputs(overwrite=overwrite, mode=drawing.mode) as add:
             for path, picture in zip(drawing.paths, pictures, strict=True):
                 save_picture(add(path), picture, overwrite=overwrite)
     return {}

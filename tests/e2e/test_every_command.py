@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -99,6 +100,28 @@ def test_quiet_says_nothing(command: str, small_copy: Path, run: Run) -> None:
     written = ["-o", small_copy / "scores.json"] if command == "evaluate" else []  # without it nothing would be left
     outcome = run(*call(command, small_copy), *written, "--quiet")
     assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
+@pytest.mark.parametrize("command", ["compact", "compact a state", "extend", *WRITERS])
+def test_rights(command: str, small_copy: Path, run: Run) -> None:
+    """Outputs that hold photos are as private as these, and what replaces a file takes its mode."""
+    for path in (small_copy / "images").iterdir():
+        path.chmod(0o600)
+    words, before = call(command, small_copy), listing(small_copy)
+    again = [] if command in ("view", "extend") else ["--overwrite"]
+    assert run(*words, "-q").code == 0
+    written = [small_copy / name for name in set(listing(small_copy)) - set(before)]
+    usual = 0o600 if command in ("view", "extend", "render --views 1") else 0o644
+    assert {path.stat().st_mode & 0o777 for path in written} == {usual}
+    for path in written:
+        path.chmod(0o604)
+    if command == "extend":
+        words += ["--set", "other_world=true"]
+        with (small_copy / "transforms.json").open("a") as file:
+            file.write("\n")  # another batch
+    assert run(*words, *again, "-q").code == 0
+    assert {path.stat().st_mode & 0o777 for path in written} == {0o604}
 
 
 @pytest.mark.parametrize("command", ["compact", "compact a state"])
