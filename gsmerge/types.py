@@ -24,6 +24,7 @@ from gsmerge.values.arrays import (
     Array,
     ArrayFields,
     as_array,
+    as_floats,
     as_index,
     as_pictures,
     as_tensor,
@@ -101,7 +102,8 @@ class Gaussians(ArrayFields):
     @property
     def device(self) -> torch.device | None:
         """Device of the tensors; None for NumPy arrays."""
-        return None if isinstance(self.means, np.ndarray) else self.means.device
+        means: Any = self.means
+        return means.device if hasattr(means, "detach") else None
 
     def to(self, device: torch.device | str) -> Gaussians:
         """Return the same Gaussians as tensors on a device; gradients pass."""
@@ -110,7 +112,7 @@ class Gaussians(ArrayFields):
 
     def numpy(self) -> Gaussians:
         """Return the same Gaussians as NumPy arrays."""
-        return Gaussians(*(as_array(getattr(self, f.name)) for f in fields(self)))
+        return Gaussians(*(as_floats(getattr(self, f.name)) for f in fields(self)))
 
     @staticmethod
     def concat(parts: Sequence[Gaussians]) -> Gaussians:
@@ -340,7 +342,7 @@ class Scene(ArrayFields):
     Args:
         gaussians: n Gaussians, in the frame of the cameras.
         cameras: The v views; None, or no cameras, if none are known.
-        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None. A run also accepts uint8, and no other type.
+        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None. A run also accepts uint8.
         pixels: The pixel of each Gaussian, and the Gaussian in front of each pixel; None: not known yet.
         names: The views' names, which are the image file names if these are known; None: numbers.
         large_photos: The photos with more pixels than the views, or None.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from gsmerge.errors import refuse_without_torch
 if TYPE_CHECKING:
     import torch
 
+NUMBERS = "an array or a dense tensor of numbers"
 Array = NDArray[Any]  # or a torch tensor if a docstring allows one; type checkers do not see that
 
 
@@ -32,6 +34,18 @@ class ArrayFields:
     def __repr__(self) -> str:
         names = [field.name for field in fields(self) if field.repr]  # type: ignore[arg-type]
         return f"{type(self).__name__}({', '.join(f'{name}={shorten(getattr(self, name))}' for name in names)})"
+
+
+def wrong_kind(values: Any) -> str:
+    """Describe values that are no array or dense tensor of real numbers; empty if they are."""
+    kind = f"{type(values).__name__}{f' of {values.dtype}' if hasattr(values, 'dtype') else ''}"
+    if hasattr(values, "detach"):
+        has_places = "strided" in str(values.layout) and not (values.is_nested or values.is_quantized)
+        is_real = has_places and not (values.is_meta or values.is_complex())
+        return "" if is_real else f"{kind} ({values.layout}, on {values.device})"
+    with suppress(ValueError):  # lists of different lengths
+        return "" if np.asarray(values).dtype.kind in "fiub" else kind
+    return kind
 
 
 def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> int:
@@ -61,8 +75,23 @@ def as_index(rows: str, index: Any) -> Any:
 
 
 def as_array(values: Array) -> np.ndarray:
-    """Return an array, or a tensor on any device, as a NumPy array without gradient; copy it only if needed."""
-    return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
+    """Return an array, or a tensor on any device, as a NumPy array without gradient; copy it only if needed.
+
+    Floats that NumPy lacks, such as bfloat16, become float32. TypeError for a tensor without a value in each place.
+    """
+    if not hasattr(values, "detach"):
+        return np.asarray(values)
+    if kind := wrong_kind(values):
+        raise TypeError(f"expected {NUMBERS}, got {kind}")
+    tensor: Any = values.detach()
+    is_known = not tensor.is_floating_point() or str(tensor.dtype) in ("torch.float32", "torch.float64")
+    return np.asarray((tensor if is_known else tensor.float()).cpu().numpy())
+
+
+def as_floats(values: Array) -> np.ndarray:
+    """Return an array or tensor as :func:`as_array` does; numbers that are neither float32 nor float64 as float32."""
+    array = as_array(values)
+    return array if array.dtype in (np.float32, np.float64) else to_float32(array)
 
 
 def as_pictures(images: Array) -> np.ndarray:
@@ -77,7 +106,7 @@ def as_pictures(images: Array) -> np.ndarray:
     if not (low >= -1 / 255 and high <= 1 + 1 / 255):
         remedy = "divide them by 255" if low >= 0 and 1.5 < high <= 255 else "clip them"
         raise ValueError(f"images: expected sRGB in [0, 1], or uint8, got {low:.4g} to {high:.4g}; {remedy}")
-    return pictures
+    return as_floats(pictures)
 
 
 def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
@@ -85,6 +114,8 @@ def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor
     with refuse_without_torch():
         import torch
 
+    if str(device) != "meta" and (kind := wrong_kind(values)):
+        raise TypeError(f"expected {NUMBERS}, got {kind}")
     return torch.as_tensor(values, device=device)
 
 
@@ -99,7 +130,7 @@ def distinct(values: np.ndarray) -> np.ndarray:
 def to_float32(values: np.ndarray) -> np.ndarray:
     """Round an array to float32; numbers beyond its range become infinite."""
     with np.errstate(over="ignore"):
-        return values.astype(np.float32)
+        return values.astype(np.float32, order="C")
 
 
 def like(values: np.ndarray, template: Array) -> Any:
