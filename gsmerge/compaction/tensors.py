@@ -71,7 +71,8 @@ def compact_tensors(
     """Compact Gaussians given as arrays or tensors, as :func:`gsmerge.compact` compacts a scene.
 
     Arrays are NumPy's, or dense tensors of torch on any device, of any real numbers in any layout; they are copied
-    without gradients. Leading axes are flattened, so ``[1,n,3]`` and ``[V,H,W,3]`` mean ``[n,3]``. Rows with NaN or infinities are left out.
+    without gradients. Leading axes are flattened, so ``[1,n,3]`` and ``[V,H,W,3]`` mean ``[n,3]``. Rows with NaN or
+    infinities are left out.
 
     Args:
         means: ``[n,3]`` centres, world units; row ``(v·H + y)·W + x`` belongs to pixel (x, y) of view v.
