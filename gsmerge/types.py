@@ -24,7 +24,6 @@ from gsmerge.values.arrays import (
     Array,
     ArrayFields,
     as_array,
-    as_floats,
     as_index,
     as_pictures,
     as_tensor,
@@ -102,8 +101,7 @@ class Gaussians(ArrayFields):
     @property
     def device(self) -> torch.device | None:
         """Device of the tensors; None for NumPy arrays."""
-        means: Any = self.means
-        return means.device if hasattr(means, "detach") else None
+        return getattr(self.means, "device", None) if hasattr(self.means, "detach") else None
 
     def to(self, device: torch.device | str) -> Gaussians:
         """Return the same Gaussians as tensors on a device; gradients pass."""
@@ -112,7 +110,7 @@ class Gaussians(ArrayFields):
 
     def numpy(self) -> Gaussians:
         """Return the same Gaussians as NumPy arrays."""
-        return Gaussians(*(as_floats(getattr(self, f.name)) for f in fields(self)))
+        return Gaussians(*(as_array(getattr(self, f.name)) for f in fields(self)))
 
     @staticmethod
     def concat(parts: Sequence[Gaussians]) -> Gaussians:

@@ -14,7 +14,6 @@ from contextlib import suppress
 from typing import NoReturn
 
 INTERRUPTED = 130  # exit code
-PLAIN = "dumb", "unknown", ""  # terminals that may know no escape sequences; Rich writes these to the last one
 GC_THRESHOLDS = 200_000, 10, 10  # above the 115,000 objects of imports, where each search for cycles takes 30 ms
 
 
@@ -80,9 +79,9 @@ def program() -> NoReturn:
     """
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         signal.signal(signal.SIGINT, stop_at_once)
-    if os.name != "nt" and os.environ.get("TERM", "") in PLAIN and not os.environ.get("FORCE_COLOR"):
-        columns, lines = shutil.get_terminal_size()
-        os.environ |= {"TERM": PLAIN[0], "COLUMNS": str(columns), "LINES": str(lines)}  # Rich would assume 80 by 25
+    if os.name != "nt" and os.environ.get("TERM", "") in ("dumb", "unknown", "") and not os.environ.get("FORCE_COLOR"):
+        # Rich assumes that these have 80 by 25 letters, and that the last one knows escape sequences
+        os.environ |= dict(zip(("COLUMNS", "LINES"), map(str, shutil.get_terminal_size()), strict=True), TERM="dumb")
     code = main()
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

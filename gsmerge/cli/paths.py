@@ -51,12 +51,14 @@ def check_format(output: Path, options: FileOptions) -> None:
         raise UsageError(f"columns full: expected a .ply output with normals, got {output.name}")
 
 
-def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
+def check_outputs(
+    outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool = False, reports: bool = False
+) -> None:
     """Raise UsageError for an output that is an input, exists without ``overwrite``, or is given twice.
 
-    ``inputs`` are the files that are read, and folders of photos or cameras; no file in them is replaced.
-    SceneError if the output cannot be written. Missing folders are made together with their first file, so a run that
-    fails earlier makes no folders.
+    ``reports``: reports that gsmerge made are replaced, and no other files. ``inputs`` are the files that are read, and
+    folders of photos or cameras; no file in them is replaced. SceneError if the output cannot be written. Missing
+    folders are made together with their first file, so a run that fails earlier makes no folders.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -66,14 +68,15 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
     for output in outputs:
         if output is None:
             continue
-        _check_output(output, input_paths, overwrite=overwrite)
+        _check_output(output, input_paths, overwrite=overwrite, reports=reports)
         if os.path.realpath(output) in seen:
             raise UsageError(f"{output}: expected a different file for each output, got it twice")
         seen.add(os.path.realpath(output))
 
 
-def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+def _check_output(output: Path, inputs: set[str], *, overwrite: bool, reports: bool) -> None:
     """Check one output as :func:`check_outputs` does; ``inputs``: real paths."""
+    from gsmerge.io.first_bytes import may_be_replaced
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
@@ -89,18 +92,12 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     is_read = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
     if str(target) in inputs or (is_read and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another output")
-    if os.path.lexists(output) and not overwrite:
-        raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another output")
+    if os.path.lexists(output) and not (may_be_replaced(output) if reports else overwrite):
+        raise UsageError(
+            f"{output}: exists already and is not a report of gsmerge; name another output" if reports
+            else f"{output}: exists already; pass --overwrite to replace it, or name another output"
+        )  # fmt: skip
     _check_writable(output.parent, output, "a folder to write to")
-
-
-def check_replaced(outputs: Sequence[Path]) -> None:
-    """Raise UsageError for an output that exists, unless it is a page or a table that gsmerge made."""
-    from gsmerge.io.first_bytes import may_be_replaced
-
-    for output in outputs:
-        if not may_be_replaced(output):
-            raise UsageError(f"{output}: exists already and is not a report of gsmerge; name another output")
 
 
 def _check_writable(folder: Path, output: Path, expected: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import read_before_after
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
-from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_texts
+from gsmerge.cli.paths import check_outputs, input_files, write_texts
 
 
 @opt.command(
@@ -37,8 +37,7 @@ def view(args: opt.Args) -> None:
     default = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")
     output = args.output or default
     shown = [path for path in (*input_files(files), *after, args.targets) if path is not None]
-    check_outputs((output,), shown, overwrite=True)
-    check_replaced((output,))
+    check_outputs((output,), shown, reports=True)
     check_page_name(output)
     mode = common_mode(shown)
     with stage_progress(quiet=args.silent) as progress:

@@ -4,7 +4,7 @@ Each file is first written under a temporary name in its folder. When all files 
 temporary name contains the process id and a hash of the machine. A later process can thus remove the files of a killed
 process.
 
-A file that replaces another one takes its rights: mode, access list, and owner and group where the system allows that.
+A file that replaces another one takes its mode, and its owner and group where the system allows that.
 A new file has the rights that the umask leaves, but none that a file lacks whose content it holds, such as a photo.
 """
 
@@ -34,7 +34,6 @@ from gsmerge.types import StrPath
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
 _PRIVATE, _SHARED = 0o600, 0o666  # modes of files that the owner alone, or everybody, can read and write
-_ACCESS_LIST = "system.posix_acl_access"  # of Linux: rights of further users and groups
 _MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
 _STALE_SECONDS = 7 * 86400  # age at which a file is stale if its process is not visible here
 _BOOT = "/proc/sys/kernel/random/boot_id"
@@ -102,9 +101,8 @@ class _Outputs:
         temporary = temporary_path(target)
         self.paths[str(temporary)] = path, target
         _written.add(str(temporary))
-        replaced = os.path.exists(target)
-        self.modes.extend([common_mode([target])] * replaced)
-        mode = _PRIVATE if replaced else reduce(and_, self.modes)
+        self.modes.append(common_mode([target]))
+        mode = _PRIVATE if os.path.exists(target) else reduce(and_, self.modes)
         try:
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode))
         except OSError as error:
@@ -161,31 +159,22 @@ def _make_folder(folder: Path) -> Iterator[Path]:
 
 def common_mode(paths: Iterable[Path]) -> int:
     """Return the mode of rights that all files give to others, also the files in folders; owners can read and write."""
-    mode = _SHARED
-    for path in paths:
-        for file in walk_files(path) if path.is_dir() else [path]:
-            with suppress(FileNotFoundError):
-                mode &= os.stat(file).st_mode | _PRIVATE
-    return mode
+    files = (file for path in paths for file in (walk_files(path) if path.is_dir() else [path]))
+    return reduce(and_, (os.stat(file).st_mode | _PRIVATE for file in files if os.path.exists(file)), _SHARED)
 
 
 def _copy_rights(source: Path, path: str) -> None:
-    """Give a private file the mode and access list of another one, and its owner and group if that is allowed.
+    """Give a private file the mode of another one, and its group and owner if that is allowed.
 
     If the group has to be another one, it gets no rights that others do not have.
     """
     status = os.stat(source)
-    mode = status.st_mode & 0o777
-    for owner in (status.st_uid, -1):
-        with suppress(OSError):
-            os.chown(path, owner, status.st_gid)
-            break
-    else:
-        mode &= ~0o070 | (mode & 0o007) << 3
+    with suppress(OSError):
+        os.chown(path, -1, status.st_gid)
+        os.chown(path, status.st_uid, -1)
+    mode, is_same = status.st_mode & 0o777, os.stat(path).st_gid == status.st_gid
     with suppress(OSError):  # a file system without modes
-        os.chmod(path, mode)
-    with suppress(OSError, AttributeError):  # most files and systems have no such list
-        os.setxattr(path, _ACCESS_LIST, os.getxattr(source, _ACCESS_LIST))
+        os.chmod(path, mode if is_same else mode & (0o707 | (mode & 0o007) << 3))
 
 
 def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:

@@ -146,7 +146,6 @@ def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | No
 
 def prepare_panel(options: DrawOptions) -> Drawing:
     """Prepare one picture with the columns photo, before, after, ... and a row for each view and the outside view."""
-    mode = common_mode(options.framing.paths)
     group = _read(options, photos=True)
     scene = group.load.scene
     cameras, photos, pictured = options.resize(scene.cameras), scene.images, scene.photo_views
@@ -165,7 +164,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(pictured) > 0, "notes": group.notes}
-    return Drawing([options.output], facts, draw, mode)
+    return Drawing([options.output], facts, draw, common_mode(options.framing.paths))
 
 
 def prepare_pictures(options: DrawOptions) -> Drawing:
@@ -296,9 +295,10 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
 
 
 def find_view(view: str, names: Sequence[str]) -> int:
-    """Find a view by its name, with or without folders and ending; UsageError if there is none, or several."""
-    stems = picture_stems(names)
+    """Find a view by its name, with or without folders, ending and zeros in front; UsageError for none or several."""
+    stems, number = picture_stems(names), picture_stems([view])[0].lstrip("0")
     ids = [i for i, name in enumerate(names) if view in (name, Path(name).name, stems[i])]
+    ids = ids or [i for i, stem in enumerate(stems) if stem.lstrip("0") == number]
     if len(ids) != 1:
         problem = f"{len(ids)} views of this name" if ids else "no view of this name"
         raise UsageError(f"--views {view}: expected a number or a name of a view such as {stems[0]}, found {problem}")

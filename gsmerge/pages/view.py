@@ -13,7 +13,7 @@ from typing import Any
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
-from gsmerge.io.atomic import atomic_output, common_mode
+from gsmerge.io.atomic import atomic_output
 from gsmerge.io.first_bytes import may_be_replaced
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import file_bytes
@@ -37,7 +37,6 @@ class Page:
 
     text: str  # HTML
     headline: str
-    mode: int = 0o666  # the most rights of a new file, those of the files that the page shows
 
     def __repr__(self) -> str:
         return f"Page({self.headline}, {human_bytes(len(self.text))})"
@@ -53,8 +52,7 @@ class Page:
         A page that gsmerge made is replaced, as by ``gsmerge view``; with ``overwrite`` any file is.
         """
         check_page_name(Path(path))
-        overwrite = overwrite or may_be_replaced(Path(path))
-        with atomic_output(path, overwrite=overwrite, mode=self.mode) as temporary:
+        with atomic_output(path, overwrite=overwrite or may_be_replaced(Path(path))) as temporary:
             temporary.write_bytes(self.text.encode())
         return Path(path)
 
@@ -115,15 +113,13 @@ def view(
         for name, result in named.items()
         if (moved := getattr(result, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
     }
-    read_paths = find_scene_files(scene).paths if isinstance(scene, str | PathLike) else ()
-    mode = common_mode([*read_paths, *(Path(each) for each in named.values() if isinstance(each, str | PathLike))])
     is_light = len(read.gaussians) > MAX_SOLID if light is None else light
     data = collect(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
         [_num_bytes(scene), *(_num_bytes(result) for result in loaded.values())], held_out,
         cameras=cameras, new_gains=gains, light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
-    return Page(view_page(data).decode(), headline(data), mode)
+    return Page(view_page(data).decode(), headline(data))
 
 
 def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, float]]:

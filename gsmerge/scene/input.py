@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from gsmerge.io.cameras.camera_file import check_camera
 from gsmerge.runtime.record import note
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Scene, StrPath
-from gsmerge.values.arrays import NUMBERS, Array, as_array, wrong_kind
+from gsmerge.values.arrays import Array, as_array, check_numbers
 
 TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by so much
 
@@ -37,12 +36,6 @@ def check_scene(scene: Scene) -> None:
             check_numbers(name, values)
     check_values(gaussians)
     check_cameras(as_array(cameras.viewmats), as_array(cameras.Ks))
-
-
-def check_numbers(name: str, values: Any) -> None:
-    """Raise SceneError if an array or tensor does not hold real numbers."""
-    if kind := wrong_kind(values):
-        raise SceneError(name, f"expected {NUMBERS}, found {kind}")
 
 
 def check_values(columns: Mapping[str, Array]) -> None:

@@ -9,11 +9,8 @@ from typing import Any
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
-from gsmerge.io.atomic import common_mode
 from gsmerge.io.formats.table import STATE_ENDING
-from gsmerge.io.scene_files import find_scene_files
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.content_hash import list_files
 from gsmerge.scene.input import as_scene
 from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.stages import DecodeOptions
@@ -78,7 +75,6 @@ class Compactor:
         batch_settings(settings)
         self._settings = settings
         self._state: State | None = None
-        self._mode = common_mode([])  # the most rights of a file with pictures of the files read so far
 
     @classmethod
     @check_arguments
@@ -90,7 +86,7 @@ class Compactor:
             ValueError: If a setting is unknown or out of range.
         """
         compactor = cls(**settings)
-        compactor._state, compactor._mode = load_state(path), common_mode([Path(path)])
+        compactor._state = load_state(path)
         return compactor
 
     def __repr__(self) -> str:
@@ -119,9 +115,7 @@ class Compactor:
         Raises:
             SceneError: If the pictures of the batch do not show the earlier Gaussians, without ``other_world=True``.
         """
-        mode = self._mode if isinstance(scene, Scene) else self._mode & common_mode(list_files(find_scene_files(scene)))
         self._state, report = extend_state(self._state, as_scene(scene), self._settings, progress=progress)
-        self._mode = mode
         return report
 
     @check_arguments
@@ -159,4 +153,4 @@ class Compactor:
         """
         if Path(path).suffix.lower() != STATE_ENDING:
             raise ValueError(f"{path}: expected a name ending in {STATE_ENDING}")
-        save_state(path, self.state, overwrite=overwrite, mode=self._mode)
+        save_state(path, self.state, overwrite=overwrite)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.errors import refuse_without_torch
+from gsmerge.errors import SceneError, refuse_without_torch
 
 if TYPE_CHECKING:
     import torch
 
-NUMBERS = "an array or a dense tensor of numbers"
 Array = NDArray[Any]  # or a torch tensor if a docstring allows one; type checkers do not see that
 
 
@@ -36,16 +34,18 @@ class ArrayFields:
         return f"{type(self).__name__}({', '.join(f'{name}={shorten(getattr(self, name))}' for name in names)})"
 
 
-def wrong_kind(values: Any) -> str:
-    """Describe values that are no array or dense tensor of real numbers; empty if they are."""
-    kind = f"{type(values).__name__}{f' of {values.dtype}' if hasattr(values, 'dtype') else ''}"
+def check_numbers(name: str, values: Any) -> None:
+    """Raise SceneError unless values are an array, or a tensor that has a real number in each place."""
+    kind = type(values).__name__ + (f" of {values.dtype}" if hasattr(values, "dtype") else "")
     if hasattr(values, "detach"):
-        has_places = "strided" in str(values.layout) and not (values.is_nested or values.is_quantized)
-        is_real = has_places and not (values.is_meta or values.is_complex())
-        return "" if is_real else f"{kind} ({values.layout}, on {values.device})"
-    with suppress(ValueError):  # lists of different lengths
-        return "" if np.asarray(values).dtype.kind in "fiub" else kind
-    return kind
+        kind = f"{kind} ({values.layout}, on {values.device})"
+        is_real = "strided" in str(values.layout) and not (
+            values.is_nested or values.is_quantized or values.is_meta or values.is_complex()
+        )
+    else:
+        is_real = np.asarray(values).dtype.kind in "fiub"
+    if not is_real:
+        raise SceneError(name, f"expected an array or a dense tensor of numbers, found {kind}")
 
 
 def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> int:
@@ -74,24 +74,14 @@ def as_index(rows: str, index: Any) -> Any:
     raise TypeError(f"{rows}: expected a slice, a mask or indices, got {actual}{remedy}")
 
 
-def as_array(values: Array) -> np.ndarray:
+def as_array(values: Any) -> np.ndarray:
     """Return an array, or a tensor on any device, as a NumPy array without gradient; copy it only if needed.
 
-    Floats that NumPy lacks, such as bfloat16, become float32. TypeError for a tensor without a value in each place.
+    Floats of less than 32 bits, of which NumPy lacks some, become float32 if they are a tensor's.
     """
-    if not hasattr(values, "detach"):
-        return np.asarray(values)
-    if kind := wrong_kind(values):
-        raise TypeError(f"expected {NUMBERS}, got {kind}")
-    tensor: Any = values.detach()
-    is_known = not tensor.is_floating_point() or str(tensor.dtype) in ("torch.float32", "torch.float64")
-    return np.asarray((tensor if is_known else tensor.float()).cpu().numpy())
-
-
-def as_floats(values: Array) -> np.ndarray:
-    """Return an array or tensor as :func:`as_array` does; numbers that are neither float32 nor float64 as float32."""
-    array = as_array(values)
-    return array if array.dtype in (np.float32, np.float64) else to_float32(array)
+    if hasattr(values, "detach") and values.is_floating_point() and values.element_size() < 4:
+        values = values.float()
+    return np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
 
 
 def as_pictures(images: Array) -> np.ndarray:
@@ -106,7 +96,7 @@ def as_pictures(images: Array) -> np.ndarray:
     if not (low >= -1 / 255 and high <= 1 + 1 / 255):
         remedy = "divide them by 255" if low >= 0 and 1.5 < high <= 255 else "clip them"
         raise ValueError(f"images: expected sRGB in [0, 1], or uint8, got {low:.4g} to {high:.4g}; {remedy}")
-    return as_floats(pictures)
+    return pictures if pictures.dtype in (np.float32, np.float64) else to_float32(pictures)
 
 
 def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
@@ -114,8 +104,6 @@ def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor
     with refuse_without_torch():
         import torch
 
-    if str(device) != "meta" and (kind := wrong_kind(values)):
-        raise TypeError(f"expected {NUMBERS}, got {kind}")
     return torch.as_tensor(values, device=device)
 
 

@@ -13,7 +13,7 @@ import pytest
 from messages import noted, refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
-from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate, render
+from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels import elementary
 from gsmerge.scene.input import check_scene
@@ -99,7 +99,6 @@ WITHOUT_NUMBERS: dict[str, Callable[[Any, Any], Any]] = {  # by a word of their 
     "qint8": lambda torch, values: torch.quantize_per_tensor(values.float(), 0.1, 0, torch.qint8),
     "strided": lambda torch, values: torch.nested.nested_tensor([values]),
     "object": lambda _, values: values.numpy().astype(object),
-    "list": lambda _, values: [[1], [2, 3]],
 }
 
 
@@ -112,11 +111,6 @@ def test_what_has_no_number_in_each_place_is_named(scene: Scene, torch: Any, kin
     wrong = WITHOUT_NUMBERS[kind](torch, torch.tensor(given[name]))
     with pytest.raises(SceneError, match=rf"{name}: expected an array or a dense tensor of numbers, found .*{kind}.*"):
         compact_tensors(**given | {name: wrong}, **FAST)
-
-
-def test_tensors_without_values_are_not_drawn(scene: Scene, torch: Any) -> None:
-    with pytest.raises(TypeError, match=r"expected an array or a dense tensor of numbers, got Tensor .* on meta\)$"):
-        render(replace(scene.gaussians, means=torch.tensor(scene.gaussians.means).to("meta")), scene.cameras)
 
 
 def test_colors_stand_for_harmonics(scene: Scene) -> None:
