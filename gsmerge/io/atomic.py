@@ -33,7 +33,7 @@ from gsmerge.types import StrPath
 # Errors of the disk while a file is written; other OSErrors are errors of the caller
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
-_PRIVATE, _SHARED = 0o600, 0o666  # modes of files that the owner alone, or everybody, can read and write
+_PRIVATE = 0o600  # mode of a file that its owner alone can read and write
 _MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
 _STALE_SECONDS = 7 * 86400  # age at which a file is stale if its process is not visible here
 _BOOT = "/proc/sys/kernel/random/boot_id"
@@ -44,7 +44,7 @@ _written: set[str] = set()  # the temporary files of this process
 
 
 @contextmanager
-def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = _SHARED) -> Iterator[Path]:
+def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = 0o666) -> Iterator[Path]:
     """Yield an empty temporary file beside ``path``, and rename it to ``path`` when the block succeeds.
 
     Missing folders are made. A link stays a link, and the file that it points to is replaced. If ``path`` is itself a
@@ -56,7 +56,7 @@ def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = _SHARED
 
 
 @contextmanager
-def atomic_outputs(*, overwrite: bool = False, mode: int = _SHARED) -> Iterator[AddOutput]:
+def atomic_outputs(*, overwrite: bool = False, mode: int = 0o666) -> Iterator[AddOutput]:
     """Write several files and rename all of them at the end; if the block fails, no file remains.
 
     Yields a function that adds a file and returns its temporary file, as in :func:`atomic_output`. If the process is
@@ -160,7 +160,7 @@ def _make_folder(folder: Path) -> Iterator[Path]:
 def common_mode(paths: Iterable[Path]) -> int:
     """Return the mode of rights that all files give to others, also the files in folders; owners can read and write."""
     files = (file for path in paths for file in (walk_files(path) if path.is_dir() else [path]))
-    return reduce(and_, (os.stat(file).st_mode | _PRIVATE for file in files if os.path.exists(file)), _SHARED)
+    return reduce(and_, (os.stat(file).st_mode | _PRIVATE for file in files if os.path.exists(file)), 0o666)
 
 
 def _copy_rights(source: Path, path: str) -> None:

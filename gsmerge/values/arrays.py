@@ -36,15 +36,18 @@ class ArrayFields:
 
 def check_numbers(name: str, values: Any) -> None:
     """Raise SceneError unless values are an array, or a tensor that has a real number in each place."""
-    kind = type(values).__name__ + (f" of {values.dtype}" if hasattr(values, "dtype") else "")
-    if hasattr(values, "detach"):
-        kind = f"{kind} ({values.layout}, on {values.device})"
-        is_real = "strided" in str(values.layout) and not (
-            values.is_nested or values.is_quantized or values.is_meta or values.is_complex()
-        )
-    else:
-        is_real = np.asarray(values).dtype.kind in "fiub"
+    is_tensor = hasattr(values, "detach")
+    is_real = (
+        "strided" in str(values.layout)
+        and not (values.is_nested or values.is_quantized or values.is_meta or values.is_complex())
+        if is_tensor else np.asarray(values).dtype.kind in "fiub"
+    )  # fmt: skip
     if not is_real:
+        kind = (
+            type(values).__name__
+            + (f" of {values.dtype}" if hasattr(values, "dtype") else "")
+            + (f" ({values.layout}, on {values.device})" if is_tensor else "")
+        )
         raise SceneError(name, f"expected an array or a dense tensor of numbers, found {kind}")
 
 
@@ -79,8 +82,9 @@ def as_array(values: Any) -> np.ndarray:
 
     Floats of less than 32 bits, of which NumPy lacks some, become float32 if they are a tensor's.
     """
-    if hasattr(values, "detach") and values.is_floating_point() and values.element_size() < 4:
-        values = values.float()
+    if hasattr(values, "detach"):
+        check_numbers("tensor", values)
+        values = values.float() if values.is_floating_point() and values.element_size() < 4 else values
     return np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
 
 
@@ -104,6 +108,7 @@ def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor
     with refuse_without_torch():
         import torch
 
+    check_numbers("tensor", values)
     return torch.as_tensor(values, device=device)
 
 

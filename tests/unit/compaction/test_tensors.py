@@ -13,7 +13,7 @@ import pytest
 from messages import noted, refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
-from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate
+from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate, render
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels import elementary
 from gsmerge.scene.input import check_scene
@@ -111,6 +111,11 @@ def test_what_has_no_number_in_each_place_is_named(scene: Scene, torch: Any, kin
     wrong = WITHOUT_NUMBERS[kind](torch, torch.tensor(given[name]))
     with pytest.raises(SceneError, match=rf"{name}: expected an array or a dense tensor of numbers, found .*{kind}.*"):
         compact_tensors(**given | {name: wrong}, **FAST)
+
+
+def test_tensors_without_values_are_not_drawn(scene: Scene) -> None:
+    with refuses(SceneError, "tensor", "on meta"):
+        render(scene.gaussians.to("meta"), scene.cameras)
 
 
 def test_colors_stand_for_harmonics(scene: Scene) -> None:
