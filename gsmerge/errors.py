@@ -46,7 +46,8 @@ class SceneError(GsmergeError):
     exit_code = 3
 
     def __init__(self, path: str | PathLike[str], problem: str, remedy: str = "") -> None:
-        problem = " ".join(problem.split())  # messages of libraries may have several lines
+        # Messages of libraries may have several lines, and views without names are called "view 0"
+        problem = " ".join(problem.split()).replace("view view ", "view ")
         self.path, self.problem, self.remedy = str(path), problem, remedy
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
 
@@ -105,7 +106,7 @@ def is_opencv_damaged(error: BaseException) -> bool:
 
 
 TORCH_INSTALL = 'pip install "torch>=2.4,<3" --extra-index-url https://download.pytorch.org/whl/cpu'
-NO_TORCH = f"this needs torch, which is not installed; install gsmerge[torch], or torch for CPUs: {TORCH_INSTALL}"
+NO_TORCH = f"this needs torch, which is not installed; this installs it for CPUs: {TORCH_INSTALL}"
 
 
 def is_torch_missing(error: BaseException) -> bool:

@@ -86,22 +86,23 @@ def fit(starts: list[Decoded], prepared: Prepared, plan: Plan) -> Fitted:
 def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Plan) -> Fitted:
     """Drop the Gaussians that no view sees, and fill gaps between the views with new Gaussians instead.
 
-    Gaps are filled only after a long fit that was accepted, and only if all of the scene counts, not a region of it.
-    Merged pairs and an unchanged input stay complete.
+    Gaps are filled only after a long fit that was accepted, and only if all of the scene counts, not a region of it. If
+    nothing is to be dropped, only the Gaussians whose places they take are. Merged pairs, trials and an unchanged input
+    stay complete.
     """
-    is_unchanged = start.is_input and fitted.report is None
-    if not plan.prunes or is_unchanged:
-        return fitted
-    scene = prepared.scene
-    seen, unseen = split_unseen(fitted.gaussians, fitted.cameras)
+    scene, is_unchanged = prepared.scene, start.is_input and fitted.report is None
     is_long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
-    is_whole = scene.empty is None and scene.region is None and prepared.reference.of_views
+    has_gaps = is_long and scene.empty is None and scene.region is None and prepared.reference.of_views
+    if plan.merges_pairs or plan.is_trial or is_unchanged or not (plan.prunes or has_gaps):
+        return fitted
+    seen, unseen = split_unseen(fitted.gaussians, fitted.cameras)
     added = seen[:0]
-    if is_long and is_whole:
+    if has_gaps:
         added = fill_between(seen, fitted.cameras, fitted.outside, len(unseen), beyond=plan.fit.beyond)
-    if plan.fit.fills:  # the rest of the budget goes to Gaussians that no view sees
+    if plan.fit.fills or not plan.prunes:  # the rest of the budget goes to Gaussians that no view sees
         added = Gaussians.concat([unseen[: len(unseen) - len(added)], added])
     written = Gaussians.concat([seen, added])
     most = start.count if plan.fit.grows else len(start.gaussians)
-    choose(pruned=max(0, most - len(written)))
+    if plan.prunes:
+        choose(pruned=max(0, most - len(written)))
     return replace(fitted, gaussians=written)

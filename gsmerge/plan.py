@@ -142,7 +142,7 @@ class Plan:
     @property
     def prunes(self) -> bool:
         """Whether Gaussians that no photo shows are dropped after the fit."""
-        return self.fit.min_contribution > 0 and not (self.merges_pairs or self.is_trial)
+        return self.fit.min_contribution > 0
 
     @property
     def limits(self) -> CountLimits:

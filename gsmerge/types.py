@@ -101,7 +101,7 @@ class Gaussians(ArrayFields):
     @property
     def device(self) -> torch.device | None:
         """Device of the tensors; None for NumPy arrays."""
-        return None if isinstance(self.means, np.ndarray) else self.means.device
+        return getattr(self.means, "device", None) if hasattr(self.means, "detach") else None
 
     def to(self, device: torch.device | str) -> Gaussians:
         """Return the same Gaussians as tensors on a device; gradients pass."""
@@ -340,7 +340,7 @@ class Scene(ArrayFields):
     Args:
         gaussians: n Gaussians, in the frame of the cameras.
         cameras: The v views; None, or no cameras, if none are known.
-        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None. A run also accepts uint8, and no other type.
+        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None. A run also accepts uint8.
         pixels: The pixel of each Gaussian, and the Gaussian in front of each pixel; None: not known yet.
         names: The views' names, which are the image file names if these are known; None: numbers.
         large_photos: The photos with more pixels than the views, or None.

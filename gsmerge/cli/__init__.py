@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import shutil
 import signal
 import sys
 import traceback
@@ -78,6 +79,9 @@ def program() -> NoReturn:
     """
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         signal.signal(signal.SIGINT, stop_at_once)
+    if os.name != "nt" and os.environ.get("TERM", "") in ("dumb", "unknown", "") and not os.environ.get("FORCE_COLOR"):
+        # Rich assumes that these have 80 by 25 letters, and that the last one knows escape sequences
+        os.environ |= dict(zip(("COLUMNS", "LINES"), map(str, shutil.get_terminal_size()), strict=True), TERM="dumb")
     code = main()
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

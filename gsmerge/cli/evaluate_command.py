@@ -11,7 +11,7 @@ from typing import Any
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import BeforeAfter, lpips_networks, read_before_after
 from gsmerge.cli.console import print_document, say_notes, stage_progress, terminal_columns
-from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_texts
+from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.setting import Settings, setting
@@ -83,8 +83,7 @@ def _check_files(args: opt.Args, outputs: Sequence[Path], inputs: Sequence[Path]
     for path in outputs:
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path}: expected a name ending in {opt.join_words(SUFFIXES)}; gsmerge view makes pages")
-    check_outputs(outputs, (*inputs, *args.after, args.targets, args.target_images), overwrite=True)
-    check_replaced(outputs)
+    check_outputs(outputs, (*inputs, *args.after, args.targets, args.target_images), reports=True)
 
 
 def _facts(pair: BeforeAfter) -> dict[str, dict[str, Any]]:

@@ -15,11 +15,6 @@ if TYPE_CHECKING:
     from gsmerge.io.scene_files import SceneFiles
 
 
-# Reports that gsmerge writes (pages, JSON, CSV) have one of these texts in their first MARKED_BYTES
-MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,")
-MARKED_BYTES = 4000
-
-
 @dataclass(frozen=True)
 class FileOptions(Settings):
     """Options for writing a result."""
@@ -47,20 +42,6 @@ def output_file(output: Path, name: str) -> Path:
     return output / name if is_folder else output
 
 
-def is_page(path: Path) -> bool:
-    """Return whether a file is a report that gsmerge made: a page or a table."""
-    return any(mark in _read_start(path) for mark in MARKS)
-
-
-def _read_start(path: Path) -> bytes:
-    """Read the first bytes of a file; empty if it does not exist or cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(MARKED_BYTES)
-    except OSError:  # if it exists but cannot be read, writing fails with a reason of its own
-        return b""
-
-
 def check_format(output: Path, options: FileOptions) -> None:
     """Raise UsageError if an output's ending is unknown, needs a missing package, or does not fit the options."""
     from gsmerge.io import output_format
@@ -70,12 +51,14 @@ def check_format(output: Path, options: FileOptions) -> None:
         raise UsageError(f"columns full: expected a .ply output with normals, got {output.name}")
 
 
-def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
+def check_outputs(
+    outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool = False, reports: bool = False
+) -> None:
     """Raise UsageError for an output that is an input, exists without ``overwrite``, or is given twice.
 
-    ``inputs`` are the files that are read, and folders of photos or cameras; no file in them is replaced.
-    SceneError if the output cannot be written. Missing folders are made together with their first file, so a run that
-    fails earlier makes no folders.
+    ``reports``: reports that gsmerge made are replaced, and no other files. ``inputs`` are the files that are read, and
+    folders of photos or cameras; no file in them is replaced. SceneError if the output cannot be written. Missing
+    folders are made together with their first file, so a run that fails earlier makes no folders.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -85,15 +68,16 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
     for output in outputs:
         if output is None:
             continue
-        _check_output(output, input_paths, overwrite=overwrite)
+        _check_output(output, input_paths, overwrite=overwrite, reports=reports)
         if os.path.realpath(output) in seen:
             raise UsageError(f"{output}: expected a different file for each output, got it twice")
         seen.add(os.path.realpath(output))
 
 
-def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+def _check_output(output: Path, inputs: set[str], *, overwrite: bool, reports: bool) -> None:
     """Check one output as :func:`check_outputs` does; ``inputs``: real paths."""
     from gsmerge.io.atomic import describe_existing
+    from gsmerge.io.first_bytes import may_be_replaced
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
@@ -109,18 +93,13 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     is_read = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
     if str(target) in inputs or (is_read and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another output")
-    if os.path.lexists(output) and not overwrite:
+    if os.path.lexists(output) and not (may_be_replaced(output) if reports else overwrite):
+        problem = f"{output}: {describe_existing(output)}"
         raise UsageError(
-            f"{output}: {describe_existing(output)}; pass --overwrite to replace it, or name another output"
-        )
+            f"{problem} and is not a report of gsmerge; name another output" if reports
+            else f"{problem}; pass --overwrite to replace it, or name another output"
+        )  # fmt: skip
     _check_writable(output.parent, output, "a folder to write to")
-
-
-def check_replaced(outputs: Sequence[Path]) -> None:
-    """Raise UsageError for an output that exists, unless it is a page or a table that gsmerge made."""
-    for output in outputs:
-        if _read_start(output) and not is_page(output):
-            raise UsageError(f"{output}: exists already and is not a report of gsmerge; name another output")
 
 
 def _check_writable(folder: Path, output: Path, expected: str) -> None:
@@ -142,11 +121,14 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
     return (*files.paths, *(path for scene_files in files.more for path in input_files(scene_files)))
 
 
-def write_texts(texts: Mapping[Path, str | bytes]) -> None:
-    """Write text files, of text or of its bytes, in place of existing ones: either all of them or none."""
+def write_texts(texts: Mapping[Path, str | bytes], mode: int = 0o666) -> None:
+    """Write text files, of text or of its bytes, in place of existing ones: either all of them or none.
+
+    ``mode``: the most rights of new files.
+    """
     from gsmerge.io import atomic_outputs
 
-    with atomic_outputs(overwrite=True) as add:
+    with atomic_outputs(overwrite=True, mode=mode) as add:
         for path, text in texts.items():
             add(path).write_bytes(text if isinstance(text, bytes) else text.encode(errors="replace"))
 

@@ -53,6 +53,8 @@ class _OneLine:
         for param in params:
             if not (param.multiple or getattr(param, "is_flag", True)) and sum(map(typed.count, param.opts)) > 1:
                 raise UsageError(f"{param.opts[0]}: expected it once, got it again")
+            if isinstance(getattr(param, "show_default", None), str):  # Typer would put brackets into its brackets
+                param._get_default_string = lambda words=param.show_default, **_: words
         for word in words:
             if re.match("-[^-]", word) and f"-{word.partition('=')[0]}" in names:
                 raise UsageError(f"{word}: expected two dashes, -{word}")

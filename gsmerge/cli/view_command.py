@@ -9,7 +9,7 @@ from pathlib import Path
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import read_before_after
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
-from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_texts
+from gsmerge.cli.paths import check_outputs, input_files, write_texts
 
 
 @opt.command(
@@ -26,6 +26,7 @@ from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_
 )  # fmt: skip
 def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D and scores in one file."""
+    from gsmerge.io.atomic import common_mode
     from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.pages.data import collect
     from gsmerge.pages.page import headline, speed, speed_words, view_page
@@ -35,9 +36,10 @@ def view(args: opt.Args) -> None:
     files, after = args.files(args.before), args.after
     default = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")
     output = args.output or default
-    check_outputs((output,), (*input_files(files), *after, args.targets), overwrite=True)
-    check_replaced((output,))
+    shown = [path for path in (*input_files(files), *after, args.targets) if path is not None]
+    check_outputs((output,), shown, reports=True)
     check_page_name(output)
+    mode = common_mode(shown)
     with stage_progress(quiet=args.silent) as progress:
         progress("read", 0, 0)
         pair = read_before_after(args, files)
@@ -48,7 +50,7 @@ def view(args: opt.Args) -> None:
             new_gains=file_gains(pair.plys), light=args.light, progress=progress,
         )  # fmt: skip
     page = view_page(data)
-    write_texts({output: page})
+    write_texts({output: page}, mode)
     say_notes(data.notes, quiet=args.silent)
     summary = headline(data) + speed_words(speed(data)).replace("\u00a0", " ")
     notes = [*pair.notes, *data.notes]

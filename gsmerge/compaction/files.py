@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.outputs import add_views
+from gsmerge.compaction.outputs import add_views, refuse_other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import DoubtWarning, SceneError
@@ -73,6 +73,8 @@ def compact_files(
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras if len(load.scene) else None
+        if cameras_path is not None and cameras_path.exists() and not outputs.overwrite:  # before the work is done
+            refuse_other_cameras(cameras_path, load.scene.cameras[views], names, moved=True)
         read = perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DoubtWarning)  # the report has them

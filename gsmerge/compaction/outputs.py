@@ -31,18 +31,25 @@ def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str]
     """
     if overwrite or not path.exists():
         add(path).write_bytes(viewer_cameras(cameras, names).encode())
-    elif not _has_cameras(path, cameras, names):
+    else:
+        refuse_other_cameras(path, cameras, names)
+
+
+def refuse_other_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool = False) -> None:
+    """Raise UsageError if a file has other cameras than these, to within rounding; ``moved``: by names and size."""
+    if not _has_cameras(path, cameras, names, moved=moved):
         remedy = "name another output, or pass --overwrite to replace it"
         raise UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
 
-def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> bool:
-    """Return whether a file holds these cameras under these names, to within rounding."""
+def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool) -> bool:
     with suppress(SceneError):
         file, farthest = read_cameras(path), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
         stored = to_cameras(file)
         same_views = [*file.names, stored.width, stored.height] == [*names, cameras.width, cameras.height]
-        same_poses = same_views and np.allclose(stored.viewmats, cameras.viewmats, rtol=0, atol=SAME * farthest)
+        same_poses = same_views and (
+            moved or np.allclose(stored.viewmats, cameras.viewmats, rtol=0, atol=SAME * farthest)
+        )
         return bool(same_poses and np.allclose(stored.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME))
     return False
 

@@ -70,8 +70,9 @@ def compact_tensors(
 ) -> CompactResult:
     """Compact Gaussians given as arrays or tensors, as :func:`gsmerge.compact` compacts a scene.
 
-    Arrays are NumPy's or torch's, on any device, and are copied without gradients. Leading axes are
-    flattened, so ``[1,n,3]`` and ``[V,H,W,3]`` mean ``[n,3]``. Rows with NaN or infinities are left out.
+    Arrays are NumPy's, or dense tensors of torch on any device, of any real numbers in any layout; they are copied
+    without gradients. Leading axes are flattened, so ``[1,n,3]`` and ``[V,H,W,3]`` mean ``[n,3]``. Rows with NaN or
+    infinities are left out.
 
     Args:
         means: ``[n,3]`` centres, world units; row ``(v·H + y)·W + x`` belongs to pixel (x, y) of view v.
@@ -160,8 +161,6 @@ def make_scene(
 
 def _to_numpy(name: str, values: Any) -> np.ndarray:
     """Return an array or tensor as a NumPy array; raise SceneError if it holds no numbers."""
-    if hasattr(values, "detach") and "float" in str(values.dtype):  # NumPy knows no bfloat16
-        values = values.detach().double() if str(values.dtype) == "torch.float64" else values.detach().float()
     check_numbers(name, values)
     return as_array(values)
 
@@ -285,7 +284,7 @@ def _read_views(
 
 def _matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: int) -> np.ndarray:
     """Return one float64 matrix for each view; SceneError if its shape is none of ``shapes``."""
-    array = _to_numpy(name, values).astype(np.float64)
+    array = _to_numpy(name, values).astype(np.float64, order="C")
     if array.shape[-2:] not in shapes or array.size != views * array.shape[-2] * array.shape[-1]:
         expected = " or ".join(str([views, *shape]) for shape in shapes)
         raise SceneError(name, f"expected shape {expected}, found {list(array.shape)}")

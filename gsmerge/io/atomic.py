@@ -3,6 +3,9 @@
 Each file is first written under a temporary name in its folder. When all files are on the disk, all are renamed. The
 temporary name contains the process id and a hash of the machine. A later process can thus remove the files of a killed
 process.
+
+A file that replaces another one takes its mode, and its owner and group where the system allows that.
+A new file has the rights that the umask leaves, but none that a file lacks whose content it holds, such as a photo.
 """
 
 from __future__ import annotations
@@ -15,19 +18,22 @@ import stat
 import sys
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, reduce
 from itertools import groupby, takewhile
+from operator import and_
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import walk_files
 from gsmerge.types import StrPath
 
 # Errors of the disk while a file is written; other OSErrors are errors of the caller
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
+_PRIVATE = 0o600  # mode of a file that its owner alone can read and write
 _MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
 _STALE_SECONDS = 7 * 86400  # age at which a file is stale if its process is not visible here
 _BOOT = "/proc/sys/kernel/random/boot_id"
@@ -38,27 +44,30 @@ _written: set[str] = set()  # the temporary files of this process
 
 
 @contextmanager
-def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
+def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = 0o666) -> Iterator[Path]:
     """Yield an empty temporary file beside ``path``, and rename it to ``path`` when the block succeeds.
 
     Missing folders are made. A link stays a link, and the file that it points to is replaced. If ``path`` is itself a
     temporary file of an outer block, it is yielded unchanged. SceneError if the file cannot be written, or if it exists
     and ``overwrite`` is False.
     """
-    with atomic_outputs(overwrite=overwrite) as add:
+    with atomic_outputs(overwrite=overwrite, mode=mode) as add:
         yield add(Path(path))
 
 
 @contextmanager
-def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
+def atomic_outputs(*, overwrite: bool = False, mode: int = 0o666) -> Iterator[AddOutput]:
     """Write several files and rename all of them at the end; if the block fails, no file remains.
 
     Yields a function that adds a file and returns its temporary file, as in :func:`atomic_output`. If the process is
     killed or the disk fails between two renames, each file is complete, either old or new. Files in deeper folders are
     renamed first, and their names are on the disk before the next folder is renamed. Therefore an index above them
     never names a missing file.
+
+    ``mode``: the most rights of new files, for outputs that hold the content of other files see :func:`common_mode`.
+    New files also have at most the rights of files that the same call replaces.
     """
-    outputs = _Outputs(overwrite)
+    outputs = _Outputs(overwrite, [mode])
     try:
         yield outputs.add
         outputs.rename()
@@ -76,6 +85,7 @@ class _Outputs:
     """The files of one call of :func:`atomic_outputs`."""
 
     overwrite: bool
+    modes: list[int]  # those that limit the mode of a new file
     # Temporary file -> path as the caller gave it, and path after links
     paths: dict[str, tuple[Path, Path]] = field(default_factory=dict)
     new_folders: list[Path] = field(default_factory=list)  # parents before their children
@@ -91,16 +101,20 @@ class _Outputs:
         temporary = temporary_path(target)
         self.paths[str(temporary)] = path, target
         _written.add(str(temporary))
+        self.modes.append(common_mode([target]))
+        mode = _PRIVATE if os.path.exists(target) else reduce(and_, self.modes)
         try:
-            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode))
         except OSError as error:
             raise SceneError(path, f"cannot be written ({error.strerror})", "choose another folder") from error
         return temporary
 
     def rename(self) -> None:
         """Wait until all files are on the disk, and rename them, deepest folders first."""
-        for temporary in self.paths:
+        for temporary, (_, target) in self.paths.items():
             _flush(temporary)
+            if sys.platform != "win32" and os.path.exists(target):
+                _copy_rights(target, temporary)
         for folder in {folder.parent for folder in self.new_folders}:
             _flush_names(folder)
         files = [(temporary, path, target) for temporary, (path, target) in self.paths.items()]
@@ -141,6 +155,26 @@ def _make_folder(folder: Path) -> Iterator[Path]:
             pass
         except OSError as error:
             raise SceneError(path, f"cannot be made ({error.strerror})", "choose another folder") from error
+
+
+def common_mode(paths: Iterable[Path]) -> int:
+    """Return the mode of rights that all files give to others, also the files in folders; owners can read and write."""
+    files = (file for path in paths for file in (walk_files(path) if path.is_dir() else [path]))
+    return reduce(and_, (os.stat(file).st_mode | _PRIVATE for file in files if os.path.exists(file)), 0o666)
+
+
+def _copy_rights(source: Path, path: str) -> None:
+    """Give a private file the mode of another one, and its group and owner if that is allowed.
+
+    If the group has to be another one, it gets no rights that others do not have.
+    """
+    status = os.stat(source)
+    with suppress(OSError):
+        os.chown(path, -1, status.st_gid)
+        os.chown(path, status.st_uid, -1)
+    mode, is_same = status.st_mode & 0o777, os.stat(path).st_gid == status.st_gid
+    with suppress(OSError):  # a file system without modes
+        os.chmod(path, mode if is_same else mode & (0o707 | (mode & 0o007) << 3))
 
 
 def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:

@@ -15,6 +15,8 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", "
 # Endings of files that are never text
 NO_TEXT = (".ply", *_PACKED_SCENES, *IMAGE_SUFFIXES - {".ppm"}, ".torch", ".safetensors", ".bin")
 _START = 1 << 10  # bytes of a file that are compared with the patterns
+# Reports that gsmerge writes (pages, JSON, CSV) have one of these texts at their start
+_REPORTS = b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,"
 _DOWNLOAD = "download it again, in a browser if the page needs a click or a login"
 _UNPACK = "unpack it, and name the scene in it"
 _GLB = "export it as .glb, which is a single file"
@@ -107,6 +109,11 @@ def read_start(path: Path, count: int = 1 << 12) -> bytes:
     with suppress(OSError), path.open("rb") as file:
         return file.read(count)
     return b""
+
+
+def may_be_replaced(path: Path) -> bool:
+    """Return whether a report may take the place of what is at a path: no file, an empty one, or a report of ours."""
+    return not path.is_file() or path.stat().st_size == 0 or any(mark in read_start(path) for mark in _REPORTS)
 
 
 def refuse_picture(path: Path) -> None:

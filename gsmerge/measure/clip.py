@@ -181,6 +181,8 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
         if path.suffix.lower() == GIF:
             _write_gif(temporary, list(frames), fps)
             return "GIF"
+        if str(temporary).encode(errors="ignore") != os.fsencode(temporary):
+            raise SceneError(path, "expected a folder whose name is UTF-8, as OpenCV needs it for videos", FOLDER)
         even_frames = (_to_even(frame) for frame in frames)
         first_frame = next(even_frames)
         writer, encoding = _open_writer(path, temporary, first_frame.shape, fps)

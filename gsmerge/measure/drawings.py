@@ -11,7 +11,7 @@ from typing import Any
 from gsmerge.errors import SceneError, UsageError, name_notes
 from gsmerge.facts.place_cameras import NO_VIEWS, add_views
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
-from gsmerge.io.atomic import atomic_outputs
+from gsmerge.io.atomic import atomic_outputs, common_mode
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
@@ -92,6 +92,7 @@ class Drawing:
     paths: list[Path]  # Of the pictures, or of the video
     facts: dict[str, Any]  # For the report
     draw: Callable[[int], Iterator[Picture]]  # Takes the number of threads; as many views are in memory
+    mode: int = 0o666  # The most rights of new files, those of the photos that are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +164,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(pictured) > 0, "notes": group.notes}
-    return Drawing([options.output], facts, draw)
+    return Drawing([options.output], facts, draw, common_mode(options.framing.paths))
 
 
 def prepare_pictures(options: DrawOptions) -> Drawing:
@@ -294,9 +295,10 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
 
 
 def find_view(view: str, names: Sequence[str]) -> int:
-    """Find a view by its name, with or without folders and ending; UsageError if there is none, or several."""
-    stems = picture_stems(names)
+    """Find a view by its name, with or without folders, ending and zeros in front; UsageError for none or several."""
+    stems, number = picture_stems(names), picture_stems([view])[0].lstrip("0")
     ids = [i for i, name in enumerate(names) if view in (name, Path(name).name, stems[i])]
+    ids = ids or [i for i, stem in enumerate(stems) if stem.lstrip("0") == number]
     if len(ids) != 1:
         problem = f"{len(ids)} views of this name" if ids else "no view of this name"
         raise UsageError(f"--views {view}: expected a number or a name of a view such as {stems[0]}, found {problem}")
@@ -333,7 +335,7 @@ def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> d
         pictures = report_each(drawing.draw(at_once))
         if fps is not None:
             return {"encoding": write_clip(drawing.paths[0], pictures, fps, overwrite=overwrite)}
-        with atomic_outputs(overwrite=overwrite) as add:
+        with atomic_outputs(overwrite=overwrite, mode=drawing.mode) as add:
             for path, picture in zip(drawing.paths, pictures, strict=True):
                 save_picture(add(path), picture, overwrite=overwrite)
     return {}

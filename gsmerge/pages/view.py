@@ -14,6 +14,7 @@ from typing import Any
 from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.io.atomic import atomic_output
+from gsmerge.io.first_bytes import may_be_replaced
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.read import GaussianFile, read_gaussians
@@ -46,9 +47,12 @@ class Page:
 
     @check_arguments
     def save(self, path: StrPath, *, overwrite: bool = False) -> Path:
-        """Write the page as an ``.html`` file that opens anywhere; return its path. UsageError for another ending."""
+        """Write the page as an ``.html`` file that opens anywhere; return its path. UsageError for another ending.
+
+        A page that gsmerge made is replaced, as by ``gsmerge view``; with ``overwrite`` any file is.
+        """
         check_page_name(Path(path))
-        with atomic_output(path, overwrite=overwrite) as temporary:
+        with atomic_output(path, overwrite=overwrite or may_be_replaced(Path(path))) as temporary:
             temporary.write_bytes(self.text.encode())
         return Path(path)
 

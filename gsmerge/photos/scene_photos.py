@@ -425,7 +425,9 @@ def describe_assignment(
         text = f"{len(turned)} of {count} photos are turned or mirrored relative to their orientation tags"
         notes.append(f"{text}: {list_some(turned)}")
     moved = [
-        f"photo {_inside(proposal.pool[assignment.photo], proposal)} for view {camera_file.names[view]}"
+        f"photo {_inside(proposal.pool[assignment.photo], proposal)} for view {camera_file.names[view]}".replace(
+            "view view ", "view "
+        )
         for view, assignment in enumerate(chosen)
         if assignment is not None and assignment.photo != proposal.named[view]
     ]

@@ -232,9 +232,7 @@ def require_ray() -> ModuleType:
     try:
         import ray
     except ImportError as error:
-        raise UsageError(
-            "engine ray: Ray is not installed; install gsmerge[ray], or pip install 'ray>=2.9,<3'"
-        ) from error
+        raise UsageError('engine ray: Ray is not installed; run pip install "ray>=2.9,<3"') from error
     return ray
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -35,7 +36,7 @@ def content_hash(files: Sequence[Path]) -> str:
         for path in _walk(root):
             name = path.relative_to(root).as_posix() if root.is_dir() else path.name
             with read_errors(path), path.open("rb") as file:
-                state.update(f"{len(name)}:{name}:{path.stat().st_size}:".encode())
+                state.update(os.fsencode(f"{len(name)}:{name}:{path.stat().st_size}:"))
                 while block := file.read(1 << 20):
                     state.update(block)
     return state.hexdigest()

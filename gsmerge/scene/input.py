@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from gsmerge.io.cameras.camera_file import check_camera
 from gsmerge.runtime.record import note
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Scene, StrPath
-from gsmerge.values.arrays import Array, as_array
+from gsmerge.values.arrays import Array, as_array, check_numbers
 
 TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by so much
 
@@ -37,14 +36,6 @@ def check_scene(scene: Scene) -> None:
             check_numbers(name, values)
     check_values(gaussians)
     check_cameras(as_array(cameras.viewmats), as_array(cameras.Ks))
-
-
-def check_numbers(name: str, values: Any) -> None:
-    """Raise SceneError if an array or tensor does not hold real numbers."""
-    is_real = not values.is_complex() if hasattr(values, "detach") else np.asarray(values).dtype.kind in "fiub"
-    if not is_real:
-        kind = f" of {values.dtype}" if hasattr(values, "dtype") else ""
-        raise SceneError(name, f"expected an array or tensor of numbers, found {type(values).__name__}{kind}")
 
 
 def check_values(columns: Mapping[str, Array]) -> None:

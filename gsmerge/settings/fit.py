@@ -93,7 +93,8 @@ class FitOptions(Settings):
         "accepted.", above=0, below=1)  # fmt: skip
     min_contribution: float = setting(1 / 255, "Least blending weight of a Gaussian. A fit removes Gaussians that "
         "stay below it at all pixels of the photos that they lie in. 0 keeps all Gaussians, even those that change "
-        "no photo by more than rounding.", least=0, most=1)  # fmt: skip
+        "no photo by more than rounding, except where others fill gaps between the views in their place.",
+        least=0, most=1)  # fmt: skip
     scored: bool = setting(True, "Score held-out patches, and compare whole photos if these hardly gain; "
         "false if the start was made from these patches.", internal=True)  # fmt: skip
     move_cameras: bool = setting(False, "Refine the cameras during the full fit; the plan decides it by `poses`.",

@@ -212,7 +212,7 @@ class Engine(Settings):
     """Settings of where scenes or blocks are compacted; the result does not depend on them."""
 
     engine: str = setting("local", "Where scenes or blocks are compacted. local: on this machine; ray: on a Ray "
-        "cluster (pip install gsmerge[ray]).", choices=("local", "ray"))  # fmt: skip
+        "cluster, which needs the package `ray`.", choices=("local", "ray"))  # fmt: skip
     address: str | None = setting(None, "Address of the Ray cluster, such as auto or HOST:PORT.")  # fmt: skip
 
     def __post_init__(self) -> None:

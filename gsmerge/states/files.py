@@ -13,6 +13,7 @@ from typing import Any
 from gsmerge.compaction.files import read_input
 from gsmerge.compaction.outputs import write_contents
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.io.atomic import common_mode
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents
@@ -60,7 +61,8 @@ def extend_file(
         raise UsageError(str(error)) from error
     with nullcontext() if dry_run else lock_state(path):
         start = perf_counter()
-        state, content = tried or (load_state(path) if os.path.exists(path) else None), content_hash(list_files(files))
+        state, read = tried or (load_state(path) if os.path.exists(path) else None), list_files(files)
+        content, mode = content_hash(read), common_mode(read)
         document = {**document_head(), "input": {"path": str(files.ply), "content": content}, "dry_run": dry_run}
         batches = [] if state is None else state.about["batches"]
         contents = [batch.get("content", batch.get("sha256")) for batch in batches]  # sha256: of versions before 0.6
@@ -78,7 +80,7 @@ def extend_file(
         state = _note_source(state, content, load.comments)
         extend_end = perf_counter()
         if not dry_run:
-            save_state(path, state, overwrite=True)
+            save_state(path, state, overwrite=True, mode=mode)
         seconds = {**(seconds_before or {}), "load": load_end - start, "read": read_end - load_end, **report.seconds}
         seconds["other"] = extend_end - read_end - sum(report.seconds.values())
         facts = {name: fact for name, fact in asdict(report).items() if name not in ("seconds", "notes", "options")}

@@ -51,10 +51,13 @@ class State:
         return len(self.scene.gaussians) if self.scene is not None else len(self.features or ())
 
 
-def save_state(path: StrPath, state: State, *, overwrite: bool = False) -> None:
-    """Write a state to a file, completely or not at all; SceneError if the file exists or cannot be written."""
+def save_state(path: StrPath, state: State, *, overwrite: bool = False, mode: int = 0o666) -> None:
+    """Write a state to a file, completely or not at all; SceneError if the file exists or cannot be written.
+
+    ``mode``: the most rights of a new file, see :func:`gsmerge.io.atomic.common_mode`.
+    """
     if state.scene is not None:
-        write_scene(path, state.scene, state.about, overwrite=overwrite)
+        write_scene(path, state.scene, state.about, overwrite=overwrite, mode=mode)
         return
     features = state.features
     assert features is not None
@@ -70,7 +73,7 @@ def save_state(path: StrPath, state: State, *, overwrite: bool = False) -> None:
     header["names"] = list(features.names)
     header |= {"networks": asdict(features.networks.options), "checkpoint": features.checkpoint}
     header |= {"about": dict(state.about)}
-    write_gsm(path, header, arrays, overwrite=overwrite)
+    write_gsm(path, header, arrays, overwrite=overwrite, mode=mode)
 
 
 def load_state(path: StrPath) -> State:

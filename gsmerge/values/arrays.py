@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.errors import refuse_without_torch
+from gsmerge.errors import SceneError, refuse_without_torch
 
 if TYPE_CHECKING:
     import torch
@@ -32,6 +32,23 @@ class ArrayFields:
     def __repr__(self) -> str:
         names = [field.name for field in fields(self) if field.repr]  # type: ignore[arg-type]
         return f"{type(self).__name__}({', '.join(f'{name}={shorten(getattr(self, name))}' for name in names)})"
+
+
+def check_numbers(name: str, values: Any) -> None:
+    """Raise SceneError unless values are an array, or a tensor that has a real number in each place."""
+    is_tensor = hasattr(values, "detach")
+    is_real = (
+        "strided" in str(values.layout)
+        and not (values.is_nested or values.is_quantized or values.is_meta or values.is_complex())
+        if is_tensor else np.asarray(values).dtype.kind in "fiub"
+    )  # fmt: skip
+    if not is_real:
+        kind = (
+            type(values).__name__
+            + (f" of {values.dtype}" if hasattr(values, "dtype") else "")
+            + (f" ({values.layout}, on {values.device})" if is_tensor else "")
+        )
+        raise SceneError(name, f"expected an array or a dense tensor of numbers, found {kind}")
 
 
 def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> int:
@@ -60,9 +77,15 @@ def as_index(rows: str, index: Any) -> Any:
     raise TypeError(f"{rows}: expected a slice, a mask or indices, got {actual}{remedy}")
 
 
-def as_array(values: Array) -> np.ndarray:
-    """Return an array, or a tensor on any device, as a NumPy array without gradient; copy it only if needed."""
-    return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
+def as_array(values: Any) -> np.ndarray:
+    """Return an array, or a tensor on any device, as a NumPy array without gradient; copy it only if needed.
+
+    Floats of less than 32 bits, of which NumPy lacks some, become float32 if they are a tensor's.
+    """
+    if hasattr(values, "detach"):
+        check_numbers("tensor", values)
+        values = values.float() if values.is_floating_point() and values.element_size() < 4 else values
+    return np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
 
 
 def as_pictures(images: Array) -> np.ndarray:
@@ -77,7 +100,7 @@ def as_pictures(images: Array) -> np.ndarray:
     if not (low >= -1 / 255 and high <= 1 + 1 / 255):
         remedy = "divide them by 255" if low >= 0 and 1.5 < high <= 255 else "clip them"
         raise ValueError(f"images: expected sRGB in [0, 1], or uint8, got {low:.4g} to {high:.4g}; {remedy}")
-    return pictures
+    return pictures if pictures.dtype in (np.float32, np.float64) else to_float32(pictures)
 
 
 def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
@@ -85,6 +108,7 @@ def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor
     with refuse_without_torch():
         import torch
 
+    check_numbers("tensor", values)
     return torch.as_tensor(values, device=device)
 
 
@@ -99,7 +123,7 @@ def distinct(values: np.ndarray) -> np.ndarray:
 def to_float32(values: np.ndarray) -> np.ndarray:
     """Round an array to float32; numbers beyond its range become infinite."""
     with np.errstate(over="ignore"):
-        return values.astype(np.float32)
+        return values.astype(np.float32, order="C")
 
 
 def like(values: np.ndarray, template: Array) -> Any:

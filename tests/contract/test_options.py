@@ -93,6 +93,16 @@ def test_help_shows_all_options_in_panels(capsys: pytest.CaptureFixture[str], mo
     assert all(title in text for title in ("─ Input ─", "─ How many Gaussians ─", "─ Method ─", "─ Output ─"))
 
 
+@pytest.mark.parametrize("command", ["compact", "batch", "view", "render", "evaluate", "lab stress"])
+def test_defaults_in_words_have_one_pair_of_brackets(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", "400")
+        assert main([*command.split(), "--help"]) == 0
+    defaults = re.findall(r"\[default: (.*?)\]", capsys.readouterr().out)
+    assert defaults
+    assert not any(words.startswith("(") for words in defaults)
+
+
 def test_set_help_lists_all_settings(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "60")
     for command in ("compact", "extend", "convert", "lab chart"):

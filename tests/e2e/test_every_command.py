@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,6 +35,7 @@ OTHERS: dict[str, tuple[str, ...]] = {  # that take no scene, or several
     "generate": ("made", "--scenes", "1", "--views", "3", "--size", "24x16"),
 }
 COMMANDS = ("inspect", "evaluate", *WRITERS)
+DRAFT = ("--effort", "draft")
 MODES = 3  # of them, in the end, are modes of one command
 PICTURES = {  # with their number
     "render": VIEWS,
@@ -69,6 +72,12 @@ def call(command: str, scene: Path) -> list[object]:
     return [*command.split(), scene, *more, "-o", scene / output, *rest]
 
 
+def all_texts(value: object) -> list[str]:
+    """The texts in a value of JSON, at any depth."""
+    parts = value if isinstance(value, list) else [*value, *value.values()] if isinstance(value, dict) else []
+    return [value] if isinstance(value, str) else [text for part in parts for text in all_texts(part)]
+
+
 def spoil_rows(ply: Path) -> None:
     """NaN in one row, a log scale of 40 in another, and every opacity between 0 and 1."""
     head, data = ply.read_bytes().split(b"end_header\n", 1)
@@ -99,6 +108,52 @@ def test_quiet_says_nothing(command: str, small_copy: Path, run: Run) -> None:
     written = ["-o", small_copy / "scores.json"] if command == "evaluate" else []  # without it nothing would be left
     outcome = run(*call(command, small_copy), *written, "--quiet")
     assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems allow no such names")
+@pytest.mark.parametrize("command", ["extend", "compact a state", "evaluate", "inspect", *WRITERS, "batch"])
+def test_names_that_are_not_utf_8(command: str, small_copy: Path, run: Run) -> None:
+    """They are in the JSON, from which the bytes of the name follow."""
+    name, photo = os.fsdecode(b"r\xe9sum\xe9"), os.fsdecode(b"\xff.png")
+    cameras = small_copy / "transforms.json"
+    document = json.loads(cameras.read_text())
+    first = small_copy / document["frames"][0]["file_path"]
+    first.rename(first.with_name(photo))
+    document["frames"][0]["file_path"] = f"{first.parent.name}/{photo}"
+    cameras.write_text(json.dumps(document))
+    scene = small_copy.rename(small_copy.with_name(name))
+    words = call(command, scene) if command != "batch" else ["batch", scene.parent, "-o", scene / "out", *DRAFT]
+    outcome = run(*words, "--json")
+    if command == "render --path orbit":  # OpenCV would end the process
+        assert_refused(outcome, 3, "walk.mp4", "UTF-8")
+        return
+    assert (outcome.code, outcome.err) == (0, "")
+    assert outcome.out.isascii()
+    assert r"r\udce9sum\udce9" in outcome.out
+    lines = outcome.out.splitlines() if command == "batch" else [outcome.out]
+    assert any(name in text for line in lines for text in all_texts(json.loads(line)))
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
+@pytest.mark.parametrize("command", ["compact", "compact a state", "extend", *WRITERS])
+def test_rights(command: str, small_copy: Path, run: Run) -> None:
+    """Outputs that hold photos are as private as these, and what replaces a file takes its mode."""
+    for path in (small_copy / "images").iterdir():
+        path.chmod(0o600)
+    words, before = call(command, small_copy), listing(small_copy)
+    again = [] if command in ("view", "extend") else ["--overwrite"]
+    assert run(*words, "-q").code == 0
+    written = [small_copy / name for name in set(listing(small_copy)) - set(before)]
+    usual = 0o600 if command in ("view", "extend", "render --views 1") else 0o644
+    assert {path.stat().st_mode & 0o777 for path in written} == {usual}
+    for path in written:
+        path.chmod(0o604)
+    if command == "extend":
+        words += ["--set", "other_world=true"]
+        with (small_copy / "transforms.json").open("a") as file:
+            file.write("\n")  # another batch
+    assert run(*words, *again, "-q").code == 0
+    assert {path.stat().st_mode & 0o777 for path in written} == {0o604}
 
 
 @pytest.mark.parametrize("command", ["compact", "compact a state"])

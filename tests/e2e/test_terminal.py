@@ -43,16 +43,18 @@ def screen(data: bytes) -> list[str]:
     return [line.rstrip() for line in lines if line.strip()]
 
 
-def in_terminal(*words: object, interrupt_at: bytes | None = None) -> tuple[int, bytes]:
+def in_terminal(
+    *words: object, interrupt_at: bytes | None = None, kind: str = "xterm", columns: int = COLUMNS
+) -> tuple[int, bytes]:
     """Exit code and bytes of Python in a terminal; Ctrl-C is typed once ``interrupt_at`` has been printed."""
     import fcntl
     import termios
 
     pid, terminal = pty.fork()
     if pid == 0:
-        environment = {**os.environ, "TERM": "xterm", "COLUMNS": str(COLUMNS)}
+        environment = {**os.environ, "TERM": kind, "COLUMNS": str(columns)}
         os.execve(sys.executable, [sys.executable, *map(str, words)], environment)
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, columns, 0, 0))
     output = b""
     while select.select([terminal], [], [], 300)[0]:
         try:
@@ -86,6 +88,18 @@ def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
     stages = set(re.findall(r"━+ +\d:\d\d:\d\d +(?:[-:\d]+ +)?(prepare|match|fit)", text))
     assert stages == {"prepare", "match", "fit"}
     assert "/17" not in output.decode()
+
+
+@pytest.mark.parametrize("kind", ["", "dumb", "unknown", "xterm"])
+@pytest.mark.parametrize("words", ["--help", "compact --help", "lab --help", "compact", "inspect {scene}"])
+def test_a_narrow_terminal_of_any_kind(kind: str, words: str, small_scene: Path) -> None:
+    """Nothing is wider than it, and one without a known name gets no escape sequences."""
+    given = words.format(scene=small_scene).split()
+    code, output = in_terminal("-m", "gsmerge", *given, kind=kind, columns=40)
+    assert code == (2 if words == "compact" else 0)
+    assert kind == "xterm" or b"\x1b" not in output
+    text = re.sub(r"\x1b\[[^A-Za-z]*[A-Za-z]", "", output.decode())
+    assert max(len(line) for line in re.split(r"[\r\n]+", text) if str(small_scene) not in line) <= 40
 
 
 @pytest.mark.usefixtures("foreground")

@@ -8,8 +8,10 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
+import pytest
 from bare_files import write_without_grid
 from messages import ERROR, says
 from tiny_scene import edited_json
@@ -77,9 +79,11 @@ def test_a_second_format_shares_them(smallest_copy: Path, run: Run, tmp_path: Pa
     assert (out / "a.cameras.json").read_bytes() == before
     run("compact", smallest_copy, "-o", out / "a.cameras.json", *QUICK, code=2)
     entries = json.loads(before)
-    for change in ({"img_name": "other"}, {"fx": 1.0 + entries[0]["fx"]}):
+    for change in ({"img_name": "other"}, {"fx": 1.0 + entries[0]["fx"]}, {"width": 1}):
         (out / "a.cameras.json").write_text(json.dumps([entries[0] | change, *entries[1:]]))
-        done = run("compact", smallest_copy, "-o", out / "a.sog", *QUICK, code=2)
+        with pytest.MonkeyPatch.context() as patch:  # before anything is compacted
+            patch.setattr("gsmerge.compaction.files.compact", Mock(side_effect=AssertionError))
+            done = run("compact", smallest_copy, "-o", out / "a.sog", *QUICK, code=2)
         assert says(done.err.removeprefix(ERROR), "a.cameras.json", "cameras", "--overwrite")
     assert sorted(path.name for path in out.iterdir()) == ["a.cameras.json", "a.ply", "a.spz"]
     run("compact", smallest_copy, "-o", out / "a.sog", "--overwrite", *QUICK, "-q", code=0)

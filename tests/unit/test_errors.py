@@ -23,3 +23,7 @@ def test_errors_can_be_pickled(error: GsmergeError) -> None:
 
 def test_advice_for_all_commands_names_no_option() -> None:
     assert "--" not in OUT_OF_MEMORY
+
+
+def test_views_without_names_are_named_once() -> None:
+    assert str(SceneError("a.json", "view view 0: expected numbers")) == "a.json: view 0: expected numbers"

@@ -71,8 +71,11 @@ def test_a_result_shows_its_scene_beside_it(
     assert page.text.count('class="card"') >= len(scene)
     path = page.save(tmp_path / "page.html")
     assert path.read_text(encoding="utf-8") == page.text
+    page.save(path)  # as the command, in place of a page
+    path.write_text("mine")
     with pytest.raises(gsmerge.SceneError, match="exists already"):
         page.save(path)
+    assert page.save(path, overwrite=True).read_text(encoding="utf-8") == page.text
     with pytest.raises(ValueError, match=r"page.txt: expected a name ending in .html"):
         page.save(tmp_path / "page.txt")
 

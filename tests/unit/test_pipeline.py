@@ -85,6 +85,8 @@ def test_what_no_photo_shows_is_not_written(scene: Scene) -> None:
     count = pruned.report.choices["pruned"]
     assert 0 < count == len(whole.gaussians) - len(pruned.gaussians)
     assert "pruned" not in whole.report.choices
+    assert "fill" in pruned.report.seconds
+    assert "fill" in whole.report.seconds
     images = [scenes.images_of(result.gaussians, scene.cameras)[0].clip(0, 1) for result in (pruned, whole)]
     assert 0 < np.sqrt(np.square(images[0] - images[1]).mean()) < 2 * ROUNDING
 

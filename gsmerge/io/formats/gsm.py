@@ -72,11 +72,16 @@ class GsmFile:
         return array
 
 
-def write_gsm(path: StrPath, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, overwrite: bool) -> None:
-    """Write a ``.gsm`` with the entries of a header; schema, version and checksums are added."""
+def write_gsm(
+    path: StrPath, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, overwrite: bool, mode: int
+) -> None:
+    """Write a ``.gsm`` with the entries of a header; schema, version and checksums are added.
+
+    ``mode``: the most rights of a new file, which holds pictures.
+    """
     header = {"schema": SCHEMA, "gsmerge": __version__, **header}
     data = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    with atomic_output(path, overwrite=overwrite) as temporary:
+    with atomic_output(path, overwrite=overwrite, mode=mode) as temporary:
         header["checksums"] = _checksums(header, data)
         temporary.write_bytes(
             save(data, {HEADER: json.dumps(header)})
@@ -137,7 +142,7 @@ def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return dict(header)
 
 
-def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwrite: bool) -> None:
+def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwrite: bool, mode: int) -> None:
     """Write a scene without pixels, with its cameras, its pictures as uint8, and facts ``about`` it as JSON."""
     arrays = {name: np.asarray(column, np.float32) for name, column in vars(scene.gaussians).items()}
     cameras = scene.cameras
@@ -145,7 +150,7 @@ def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwr
     if scene.images is not None:
         arrays["images"] = np.rint(255 * scene.images.clip(0, 1)).astype(np.uint8)
     header = {"kind": SCENE, "width": cameras.width, "height": cameras.height, "names": list(scene.names)}
-    write_gsm(path, header | {"about": dict(about)}, arrays, overwrite=overwrite)
+    write_gsm(path, header | {"about": dict(about)}, arrays, overwrite=overwrite, mode=mode)
 
 
 def read_rows(path: Path) -> StoredRows:

@@ -13,7 +13,7 @@ import pytest
 from messages import noted, refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
-from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate
+from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate, render
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels import elementary
 from gsmerge.scene.input import check_scene
@@ -80,6 +80,42 @@ def test_bfloat16_is_read(scene: Scene, torch: Any) -> None:
     opacities = torch.tensor(scene.gaussians.opacities).bfloat16()
     small = compact_tensors(**tensors_of(scene, opacities=opacities), **FAST)
     assert small.gaussians.opacities.dtype == np.float32
+
+
+@pytest.mark.parametrize("change", [
+    np.asfortranarray, lambda values: np.repeat(values, 2, 0)[::2], lambda values: values.astype(">f8"),
+    lambda values: values.astype(np.longdouble),
+], ids=["column by column", "with gaps", "big-endian", "long double"])  # fmt: skip
+def test_arrays_of_every_layout(scene: Scene, change: Change) -> None:
+    plain = {name: np.array(value, np.float32) for name, value in tensors_of(scene).items()}
+    given = {name: change(value) for name, value in plain.items()}
+    assert same(compact_tensors(**given, **FAST), compact_tensors(**plain, **FAST).gaussians)
+
+
+WITHOUT_NUMBERS: dict[str, Callable[[Any, Any], Any]] = {  # by a word of their description
+    "meta": lambda _, values: values.to("meta"),
+    "sparse_coo": lambda _, values: values.to_sparse(),
+    "complex": lambda _, values: values + 1j,
+    "qint8": lambda torch, values: torch.quantize_per_tensor(values.float(), 0.1, 0, torch.qint8),
+    "strided": lambda torch, values: torch.nested.nested_tensor([values]),
+    "object": lambda _, values: values.numpy().astype(object),
+}
+
+
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
+@pytest.mark.filterwarnings("ignore:torch.quantize")
+@pytest.mark.parametrize("name", ["means", "opacities", "viewmats", "images"])
+@pytest.mark.parametrize("kind", WITHOUT_NUMBERS)
+def test_what_has_no_number_in_each_place_is_named(scene: Scene, torch: Any, kind: str, name: str) -> None:
+    given = tensors_of(scene)
+    wrong = WITHOUT_NUMBERS[kind](torch, torch.tensor(given[name]))
+    with pytest.raises(SceneError, match=rf"{name}: expected an array or a dense tensor of numbers, found .*{kind}.*"):
+        compact_tensors(**given | {name: wrong}, **FAST)
+
+
+def test_tensors_without_values_are_not_drawn(scene: Scene) -> None:
+    with refuses(SceneError, "tensor", "on meta"):
+        render(scene.gaussians.to("meta"), scene.cameras)
 
 
 def test_colors_stand_for_harmonics(scene: Scene) -> None:

@@ -16,7 +16,7 @@ from messages import NO_FOLDER, refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic, atomic_output, atomic_outputs
-from gsmerge.io.atomic import remove_stale, temporary_path
+from gsmerge.io.atomic import common_mode, remove_stale, temporary_path
 
 
 def write_half_and_fail(path: Path, error: BaseException) -> None:
@@ -286,3 +286,106 @@ def test_files_get_the_usual_permissions(tmp_path: Path) -> None:
     with atomic_output(tmp_path / "atomic"):
         pass
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+posix = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
+
+
+def mode_of(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def made(path: Path, mode: int) -> Path:
+    path.write_text("old")
+    path.chmod(mode)
+    return path
+
+
+@posix
+@pytest.mark.parametrize("link", [False, True])
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444, 0o666, 0o200, 0o000, 0o755])
+def test_a_replaced_file_keeps_its_mode_and_is_private_before(tmp_path: Path, mode: int, link: bool) -> None:
+    target = path = made(tmp_path / "out.txt", mode)
+    if link:
+        path = tmp_path / "link.txt"
+        path.symlink_to(target)
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text("new")
+        assert mode_of(temporary) == 0o600
+    assert mode_of(target) == mode
+    target.chmod(0o600)
+    assert target.read_text() == "new"
+
+
+@posix
+def test_the_mode_is_that_of_the_file_at_the_end(tmp_path: Path) -> None:
+    """A run takes minutes, in which its owner may make a file private, or remove it."""
+    with atomic_outputs(overwrite=True) as add:
+        for name in ("changed", "gone"):
+            add(made(tmp_path / name, 0o644)).write_text("new")
+        (tmp_path / "changed").chmod(0o600)
+        (tmp_path / "gone").unlink()
+    assert [mode_of(tmp_path / name) for name in ("changed", "gone")] == [0o600, 0o600]
+
+
+@posix
+def test_new_files_have_no_rights_that_one_beside_them_lacked(tmp_path: Path) -> None:
+    made(tmp_path / "index", 0o640)
+    with atomic_outputs(overwrite=True) as add:
+        for name in ("index", "chunk"):
+            add(tmp_path / name).write_text("new")
+    assert [mode_of(tmp_path / name) for name in ("index", "chunk")] == [0o640, 0o640]
+
+
+@posix
+@pytest.mark.parametrize(("modes", "umask", "expected"), [
+    ([], 0o022, 0o644), ([0o644, 0o640], 0o022, 0o640), ([0o666], 0o027, 0o640), ([0o400], 0o022, 0o600),
+    ([0o755], 0o000, 0o644), ([0o604, 0o640], 0o022, 0o600),
+])  # fmt: skip
+def test_a_new_file_has_at_most_the_rights_of_the_files_it_holds(
+    tmp_path: Path, modes: list[int], umask: int, expected: int
+) -> None:
+    (tmp_path / "photos" / "deeper").mkdir(parents=True)
+    for number, mode in enumerate(modes):
+        made(tmp_path / "photos" / ("deeper" if number else ".") / f"{number}.png", mode)
+    before = os.umask(umask)
+    try:
+        with atomic_output(tmp_path / "out", mode=common_mode([tmp_path / "photos", tmp_path / "gone"])) as temporary:
+            assert mode_of(temporary) == expected
+    finally:
+        os.umask(before)
+    assert mode_of(tmp_path / "out") == expected
+
+
+@posix
+@pytest.mark.parametrize(("refused", "mode", "expected"), [
+    ([], 0o640, 0o640), (["owner"], 0o640, 0o640), (["owner"], 0o664, 0o664),  # as for a user who is in the group
+    (["owner", "group"], 0o640, 0o600), (["owner", "group"], 0o664, 0o644), (["owner", "group"], 0o604, 0o604),
+])  # fmt: skip
+def test_owner_and_group_stay_where_that_is_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: list[str], mode: int, expected: int
+) -> None:
+    """Another group gets no rights that others do not have."""
+    target, ask = made(tmp_path / "out.txt", mode), os.stat
+    owner, group = 4321, 8765
+    kept: dict[str, int] = {}
+
+    def owned(path: Any, **options: Any) -> os.stat_result:
+        status, is_old = ask(path, **options), Path(path) == target
+        ids = (owner, group) if is_old else (kept.get("owner", status.st_uid), kept.get("group", status.st_gid))
+        return os.stat_result((*status[:4], *ids, *status[6:]))
+
+    def chown(path: str, uid: int, gid: int) -> None:
+        assert Path(path) != target
+        for name, value in {"owner": uid, "group": gid}.items():
+            if name in refused and value != -1:
+                raise PermissionError(errno.EPERM, "Operation not permitted")
+            kept.update({name: value} if value != -1 else {})
+
+    monkeypatch.setattr(os, "stat", owned)
+    monkeypatch.setattr(os, "chown", chown)
+    with atomic_output(target, overwrite=True) as temporary:
+        temporary.write_text("new")
+    monkeypatch.undo()
+    assert kept == {name: {"owner": owner, "group": group}[name] for name in ("group", "owner") if name not in refused}
+    assert mode_of(target) == expected

@@ -15,8 +15,9 @@ import pytest
 import scenes
 from page_policy import check_policy
 
-from gsmerge.cli.paths import is_page, output_file
+from gsmerge.cli.paths import output_file
 from gsmerge.io import read_gaussians
+from gsmerge.io.first_bytes import may_be_replaced
 from gsmerge.pages.site import MAX_VIEWS, NAMES, make_page
 from gsmerge.types import Cameras
 
@@ -114,5 +115,6 @@ def test_a_page_with_a_scene_is_a_result_that_no_report_replaces(tmp_path: Path)
     (tmp_path / "scene.html").write_text(page_of_room())
     (tmp_path / "mine.html").write_text("<!DOCTYPE html><title>mine</title>")
     (tmp_path / "report.html").write_text('<meta name="generator" content="gsmerge 0.3.0">')
-    names = ("scene.html", "mine.html", "report.html")
-    assert [is_page(tmp_path / name) for name in names] == [False, False, True]
+    (tmp_path / "empty.html").touch()
+    names = ("scene.html", "mine.html", "report.html", "empty.html", "none.html")
+    assert [may_be_replaced(tmp_path / name) for name in names] == [False, False, True, True, True]
