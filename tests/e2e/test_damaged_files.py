@@ -49,8 +49,8 @@ OFTEN = (
 )  # fmt: skip
 QUICK = [name for name, (_, damage) in DAMAGES.items() if not damage.slow]
 BY_COMMANDS = [name for name, (kind, _) in DAMAGES.items() if SOUNDS[kind].words]
-COMPACTED = ("one position 1e30", "half of the positions NaN", *(f"{what} 1e38" for what in ("colours", "opacities",
-             "scales", "rotations")))  # fmt: skip
+COMPACTED = ("one position 1e30", "half of the positions NaN", *(f"{what} 1e38" for what in ("opacities",
+             "rotations")))  # fmt: skip
 
 of_linux = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
 

@@ -514,7 +514,8 @@ def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
     num_valid = len(valid) - len(invalid)
     if len(invalid) and num_valid < MIN_FINITE * len(valid):
         number = f"{len(invalid):,} of" if num_valid else "all"
-        problem = f"expected finite Gaussians, found NaN or inf in {number} {len(valid):,} rows"
+        rows = f"{number} {len(valid):,} rows"
+        problem = f"expected finite Gaussians, found NaN, inf or numbers that no scene has in {rows}"
         raise SceneError(path, problem, "export it again")
     clear_rows(out, invalid)
     return len(invalid)
