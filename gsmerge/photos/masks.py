@@ -31,7 +31,7 @@ from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import NONE
-from gsmerge.types import PROTECTED, Cameras, StrPath
+from gsmerge.types import PROTECTED, Cameras, Pixels, StrPath
 
 _MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _WHITE = np.uint8(255)
@@ -230,16 +230,24 @@ def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], 
     return masks, [Doubt(f"{problem}; {remedy}")] if missing else []
 
 
-def check_masks(masks: Masks, files: SceneFiles) -> tuple[Masks, list[str]]:
-    """Note the share of the photos that masks leave out; SceneError if named masks leave out nearly everything."""
+def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple[Masks, list[str]]:
+    """Note the share of the photos that masks leave out; SceneError if named masks leave out nearly everything.
+
+    A folder of masks that was found is doubted if it hides most of the pixels that have Gaussians, as the wrong way
+    round: whoever wants only what it leaves, names it.
+    """
     counts = masks.counts
     if counts is None:
         return masks, []
     share = float(1 - counts.mean())
     if share < _MAX_MASKED:
         count = int((~counts.all((1, 2))).sum())
-        pixels = f"{100 * share:.0f} % of the photos' pixels"
-        return masks, [f"masks leave out {pixels}; {count} of {len(counts)} photos have a mask"]
+        note = f"masks leave out {100 * share:.0f} % of the photos' pixels; {count} of {len(counts)} photos have a mask"
+        shown = None if pixels is None or "masks" in files.named or files.masks is None else pixels.shown
+        if shown is None or 2 * (counts & shown).sum() >= shown.sum():
+            return masks, [note]
+        remedy = f"if they are right, pass --masks {files.masks}; otherwise invert them, or pass --masks {NONE}"
+        return masks, [Doubt(f"{note}: most of what the Gaussians show; {remedy}")]
     problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % of their pixels dark"
     if "masks" not in files.named or files.masks is None:
         where = files.masks or "transparency, or masks that the cameras' file names"

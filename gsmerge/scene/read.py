@@ -487,7 +487,7 @@ def _make_load(
     num_faint = int(ply.valid.sum()) - len(gaussians)
     faint = "fainter than 1/255, which nothing draws, set aside"
     faint_notes = [count_words(num_faint, "Gaussian", faint)] if num_faint else []
-    masks, mask_notes = check_masks(masks, files)
+    masks, mask_notes = check_masks(masks, files, pixels)
     photos = result.images if len(result.images) else None
     names = () if camera_file is None else camera_file.names
     scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)

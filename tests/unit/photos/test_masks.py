@@ -247,6 +247,20 @@ def test_one_picture_among_masks(tiny_folder: Path, tiny: Tiny, kind: str, is_ph
     assert (bool(load.doubts), load.scene.masks is None) == (is_photo, is_photo)
 
 
+@pytest.mark.parametrize("is_inverted", [False, True])
+def test_found_masks_that_hide_most_of_the_scene_are_doubted(tmp_path: Path, is_inverted: bool) -> None:
+    scene = smooth_scene(56, 40)
+    folder = save_export(tmp_path / "scene", scene, export_rows(scene))
+    mask = np.full((40, 56), 255, np.uint8)
+    mask[:, :12] = 0
+    for name in scene.names:
+        write(folder / "masks" / name, 255 - mask if is_inverted else mask)
+    load = load_scene(folder)
+    assert load.scene.masks is not None
+    assert [names(doubt, "masks leave out 79 %", "--masks none") for doubt in load.doubts] == [True] * is_inverted
+    assert not load_scene(folder, masks=folder / "masks").doubts
+
+
 @pytest.mark.parametrize("ending", [".png", ".jpg"])
 @pytest.mark.parametrize("kind", PICTURES)
 def test_photos_in_place_of_masks_are_refused(tmp_path: Path, kind: str, ending: str) -> None:
