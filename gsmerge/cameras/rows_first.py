@@ -8,7 +8,7 @@ may have no row. All other rows get cameras alone, which the colours of the phot
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -174,7 +174,7 @@ def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     if source.camera_file.pixel_ids is not None:
         layouts = [replace(layout, ids=source.camera_file.pixel_ids)]
     elif count != layers * num_pixels or source.order == "view-fastest":
-        return _follow_order(source, grid)
+        return _follow_order(source, grid, _list_frames(source, grid))
     elif layers == 1:  # views are in the order of the camera file, or of the names
         names = source.camera_file.names
         by_name = np.array(sorted(range(len(names)), key=lambda view: natural_key(names[view])))
@@ -242,8 +242,8 @@ def _move_cameras(source: RowSource, grid: Grid, layout: Layout) -> Grid:
     return replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
 
 
-def _follow_order(source: RowSource, grid: Grid) -> Recovery | None:
-    """Take rows as pixels in order of which some have no row, in any likely frame; None for rows in another order.
+def _follow_order(source: RowSource, grid: Grid, frames: Iterable[Similarity]) -> Recovery | None:
+    """Take rows as pixels in order of which some have no row, in one of the ``frames``; None for rows in another order.
 
     The rows of a view follow each other, or else those of a pixel.
     """
@@ -252,7 +252,7 @@ def _follow_order(source: RowSource, grid: Grid) -> Recovery | None:
         return None
     orders = [order for order in ("view-major", "view-fastest") if source.order in ("auto", order)]
     points = np.ascontiguousarray(source.ply.gaussians.means[rows], np.float32)
-    for frame in _list_frames(source, grid):
+    for frame in frames:
         place = PlacedGrid(grid, frame, _EVIDENCE)
         for order in orders:
             ids = _follow(points, place.cameras, mixed=order == "view-fastest")
@@ -308,6 +308,9 @@ def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence
         place = PlacedGrid(grid, upright, "photos' colours")
     cameras, camera_file = place.cameras, place.grid.camera_file
     if place.frame is not IDENTITY:
+        recovery = None if source.order == "none" else _follow_order(source, grid, [place.frame])
+        if recovery is not None:  # rows that say too little of their scale, which photos show
+            return _make_result(source, recovery)
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
     notes = (*place.notes(source.camera_file.convention), *more_notes)
     return AlignmentResult(

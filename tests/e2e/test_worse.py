@@ -101,8 +101,9 @@ def test_levels_are_compared_as_well(small_scene: Path, tmp_path: Path, run: Run
     usual = ("--set", "fit_steps=60", "--threads", 1, "--budget", 120, "--levels", 3, "--json")
     said = run("compact", small_scene, "-o", tmp_path / "x.ply", *usual, code=0)
     document = json.loads(said.out)
-    assert not any(SAID in note for note in document["notes"])
     assert document["worse"].startswith("level ")
+    assert {*document["doubts"]} == {note for note in document["notes"] if SAID in note}
+    assert all(doubt.startswith("level ") for doubt in document["doubts"])
     assert any(document["worse"] in level["notes"] for level in document["levels"])
 
 
