@@ -8,7 +8,6 @@ gets its own part of the plan, and no stage knows the options of another.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +21,7 @@ from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.photos.row_colors import RENDERS
 from gsmerge.photos.views import REPORT_VIEWS, pick_views, scored_views
+from gsmerge.raster.photos import scored_tiles
 from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import OURS, CompactOptions
@@ -78,7 +78,7 @@ class Effort:
 
 
 EFFORTS = {
-    "draft": Effort(36, 1.0, 0, merges=False, refines=False, prunes=False, large_photos=False, report_views=2),
+    "draft": Effort(36, 1.0, 0, merges=False, refines=False, prunes=False, large_photos=False, report_views=3),
     "fast": Effort(55, 1.0, 0, refines=False, large_photos=False),
     "default": Effort(STEPS, 2.0, 0),
     "best": Effort(900, 3.0, 1),
@@ -107,6 +107,7 @@ class Plan:
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
     free_poses: bool = False  # The options ask for moved cameras, even where the scene does not need it
+    samples: bool = False  # Only the report needs the scores, so a sample of the pixels is scored
     new_views: bool = False  # Estimate the quality of new views
     is_trial: bool = False  # Only a score of the fit counts, in which filled gaps do not show
     before: PhotoScore | None = None  # Score of the input, if photos and not pixels decide the count
@@ -198,7 +199,9 @@ def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | N
     if keeps and has_few_rows(size):
         few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
         note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
-    budget = options.budget
+    budget, cameras = options.budget, prepared.scene.cameras
+    # a quality is measured on all pixels, and so are small views
+    samples = not (keeps or target is not None) and scored_tiles(0, cameras.width, cameras.height, 2) is not None
     searches = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
     shares_tree = cuts_views(options, size) and not pairs and (searches or limits.count is not None)
     return Plan(
@@ -215,7 +218,8 @@ def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | N
         levels=budget.levels,
         output=budget.output,
         size=file_size(asked.budget),
-        scored_views=_choose_scored_views(prepared, None if keeps or target is not None else EFFORTS[options.effort]),
+        scored_views=_choose_scored_views(prepared, EFFORTS[options.effort] if samples else None),
+        samples=samples,
         seed=options.seed,
         checkpoint=checkpoint,
         settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
@@ -525,12 +529,15 @@ def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int
 
     ``effort``: choose as many as its report needs; None: as many as a decision about the count needs.
     """
-    reference = prepared.reference
-    if reference.placed:
-        return reference.score_views
-    candidates: Sequence[int] = reference.score_views
-    if reference.of_views:  # views of the input, each of which may stand for several
-        candidates = [view for view, place in enumerate(prepared.repeated) if place in candidates]
-    count = len(candidates)
-    chosen = scored_views(count) if effort is None else pick_views(count, effort.report_views)
-    return tuple(candidates[i] for i in chosen)
+    own = own_views(prepared)
+    if prepared.reference.placed:
+        return own
+    chosen = scored_views(len(own)) if effort is None else pick_views(len(own), effort.report_views)
+    return tuple(own[i] for i in chosen)
+
+
+def own_views(prepared: Prepared) -> tuple[int, ...]:
+    """Return the views whose pictures show the scene: placed ones, or of the input, where one may stand for several."""
+    if not prepared.reference.of_views:
+        return prepared.reference.score_views
+    return tuple(view for view, place in enumerate(prepared.repeated) if place in prepared.reference.score_views)

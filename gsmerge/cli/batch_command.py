@@ -241,11 +241,14 @@ def _describe_lack(report: Mapping[str, Any]) -> str:
 
 def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the row of the table for a result and its report."""
-    from gsmerge.raster.metrics import MAX_PSNR
+    from gsmerge.raster.metrics import MAX_PSNR, psnr_figure
     from gsmerge.runtime.memory import human_share
 
     psnr = report["psnr_input_views"]
-    quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
+    quality = [
+        "" if psnr[name] is None else psnr_figure(psnr[name], report["choices"]).removesuffix(" dB")
+        for name in ("before", "after")
+    ]
     if fidelity := report["choices"].get("fidelity"):
         # without photos the result is compared with the input
         quality = ["the input", "equal" if fidelity["psnr"] >= MAX_PSNR else f"{fidelity['psnr']:.2f}"]

@@ -9,11 +9,13 @@ import numpy as np
 from gsmerge.compaction.block_start import BlockStart
 from gsmerge.compaction.report import CompactReport
 from gsmerge.errors import Doubt
+from gsmerge.measure.evaluate import evaluate
 from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS
-from gsmerge.raster.metrics import describe_loss
+from gsmerge.raster.metrics import SPARE, describe_loss, is_worse
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Gaussians, Scene
 
 
@@ -34,14 +36,18 @@ def join_reports(
         numbers = [value for value in values if value is not None]
         return None if len(numbers) < len(values) else float(np.average(numbers, weights=sizes))
 
-    scored = [len(start.plan.scored_views) for start, psnr in zip(starts, psnrs, strict=True) if psnr is not None]
+    scored = sum(len(start.plan.scored_views) for start, psnr in zip(starts, psnrs, strict=True) if psnr is not None)
     before, after = mean([start.psnr_before for start in starts]), mean(psnrs)
     reference = None if before is None else starts[0].prepared.reference.name
     pictures = OWN_PHOTOS if reference == PHOTOS else reference
+    is_near = reference == PHOTOS and is_worse(before, after, SPARE)
+    if is_near:  # all photos decide
+        exact = evaluate(scene, {"result": gaussians}, options=EvaluateOptions(lpips=(), fog=False))
+        before, after = (scores.mean("context")[scene.masks is not None].psnr for scores in exact.results)
     worse = None if pictures is None else describe_loss("the result", before, after, pictures)
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
-        psnr_after=after, choices=run.choices | {"scored_views": sum(scored)},
-        notes=[*run.notes, *([] if worse is None else [Doubt(worse)])],
+        psnr_after=after, notes=[*run.notes, *([] if worse is None else [Doubt(worse)])],
+        choices=run.choices | {"scored_views": len(scene) if is_near else scored, "scored_all": is_near},
         options=options.to_dict(), peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
     )  # fmt: skip

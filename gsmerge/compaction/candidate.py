@@ -10,7 +10,7 @@ from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.photos.row_colors import RENDERS
-from gsmerge.plan import Plan
+from gsmerge.plan import Plan, own_views
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
 from gsmerge.types import Cameras, Gaussians
 
@@ -41,7 +41,7 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
 
 def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
     """Replace a candidate's Gaussians by a subset of them, and measure its PSNR again."""
-    with record_part() as record:
+    with record_part(silent=True) as record:
         psnr, _ = _measure_candidate(gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan)
     choices = candidate.record.choices | record.choices
     return replace(candidate, gaussians=gaussians, psnr=psnr, record=replace(candidate.record, choices=choices))
@@ -60,7 +60,7 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tup
     measured = measure_result(gaussians, moved, plan, None if plan.before is None else plan.before.covered)
     if measured is None:
         return None, None
-    choose(scored_views=len(plan.scored_views))
+    choose(scored_views=len(plan.scored_views), scored_all=not plan.samples and plan.scored_views == own_views(moved))
     return measured.psnr, measured.psnr if covers_all(plan.before) else measured.covered_psnr
 
 

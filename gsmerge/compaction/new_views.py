@@ -36,9 +36,9 @@ MOST_VIEWS = 64
 # the result are relative to the usual share. The trial's share is the result's share to the power of LESS. On five
 # captures at 1 % this lowers the error of the estimated gain from 2.3 to 1.0 dB
 USUAL, LESS = parse_share(SHARE), 0.3
-# OWN is the weight of the gain of own photos, where depth is confirmed; the rest is the weight of the trial's gain. It
-# was chosen on ten captures. On these and five others 80 % of the results lie within SPREAD dB of the estimate
-# (docs/internals/notebook.md). Nothing is known about more than MOST_SHARE Gaussians for each pixel
+# OWN is the weight of the gain of own photos, where depth is confirmed; the rest is the weight of the trial's gain. New
+# views gain an amount between the two, or at most SPREAD dB outside, in 80 % of the results or more, of ten captures as
+# of five others (docs/internals/notebook.md). Nothing is known about more than MOST_SHARE Gaussians for each pixel
 OWN, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 
@@ -74,11 +74,11 @@ class Trial:
         ``confirmed`` is the share of confirmed depth. New views gain at most this share of the gain of own photos. From
         the input, new views are assumed to be worse than own photos by the same difference as in the trial.
         """
-        max_gain = confirmed * max(0.0, own_after - own_before)
-        gain = OWN * max_gain + (1 - OWN) * min(self.after - self.before, max_gain)
+        most = confirmed * max(0.0, own_after - own_before)
+        least = min(self.after - self.before, most)
         before = own_before + self.before - self.own_before
-        before, after, low, high = (round(psnr, 2) for psnr in (before, before + gain, gain - SPREAD, gain + SPREAD))
-        return NewViews(before, after, low, high, self.views)  # rounded as in files
+        after, low, high = before + OWN * most + (1 - OWN) * least, least - SPREAD, most + SPREAD
+        return NewViews(round(before, 2), round(after, 2), round(low, 2), round(high, 2), self.views)  # as in files
 
 
 def can_try(prepared: Prepared, count: int = 0) -> bool:
@@ -125,7 +125,7 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
         return None
     superpixels = max(1, round(share * small.pixels_per_view))
     short = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(STEPS, plan.fit.steps))
-    # no photo shows the views from outside, so these cannot change the score
+    # views from outside hardly change the score, nor does pruning (docs/internals/notebook.md)
     inside = replace(short.fit, tuning=replace(short.fit.tuning, outside_from=1.0))
     compacted = build(left_out.rest, replace(short, fit=inside, is_trial=True), None).gaussians
     drawn = small.file_gaussians, left_out.rows, compacted

@@ -12,7 +12,7 @@ from typing import Any
 from gsmerge.compaction.new_views import NewViews
 from gsmerge.errors import Doubt, list_doubts
 from gsmerge.measure.documents import document_head, note_entries, seconds_document, seconds_line, text_table, wrap_line
-from gsmerge.raster.metrics import psnr_words
+from gsmerge.raster.metrics import psnr_figure, psnr_words
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.values.words import count_words
 
@@ -62,8 +62,8 @@ class CompactReport:
         num_output: Gaussians in the result.
         seconds: Wall time of each stage.
         psnr_before: Mean PSNR (dB) of the input views rendered from the input; None if neither photos nor pixels are
-            known. Of many views only some are scored, and only a fixed quarter of each unless a quality was asked for;
-            :func:`gsmerge.evaluate` is exact.
+            known. Unless a quality was asked for, or the result may be worse, it is measured on a sample: a tenth of
+            the pixels of at most eight views. Then the gain is off by .3 dB (rms); :func:`gsmerge.evaluate` is exact.
         new_views: Expected PSNR of new views, estimated on photos that a short fit left out; None with fewer than four
             photos, in drafts, and in blocks.
         psnr_after: Like ``psnr_before``, rendered from the result; if a file is written that rounds positions visibly,
@@ -130,7 +130,8 @@ class CompactReport:
         if new := self.new_views:
             facts += [("PSNR of new views, expected", f"{new.low:+.1f} to {new.high:+.1f} dB from {new.before:.1f} dB")]
         if self.psnr_before is not None and self.psnr_after is not None:
-            facts += [("PSNR of its own views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
+            ends = (psnr_figure(psnr, self.choices) for psnr in (self.psnr_before, self.psnr_after))
+            facts += [("PSNR of its own views", " -> ".join(ends))]
         if fidelity := self.choices.get("fidelity"):
             facts += [("PSNR", f"{psnr_words(fidelity['psnr'])} {_describe_views(fidelity)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
@@ -210,14 +211,14 @@ def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Sequence[Pa
 
 def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     """List what a result is: name of a figure, its value before and after, and words about it."""
-    files, psnr = (document["input"], document["output"]), document["psnr_input_views"]
+    files, psnr, choices = (document["input"], document["output"]), document["psnr_input_views"], document["choices"]
     counts, sizes = [f"{file['num_gaussians']:,}" for file in files], [human_bytes(file["bytes"]) for file in files]
     rows = [("Gaussians", counts[0], counts[1], human_share(document["ratio"])), ("file", sizes[0], sizes[1], "")]
     if new := document["new_views"]:
         gain = f"{new['low']:+.1f} to {new['high']:+.1f} dB expected, from {new['views']} photos left out"
         rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", gain)]
     scores = {
-        f"a sample, of {document['choices'].get('scored_views')} of its views": None if None in psnr.values() else psnr,
+        "all of them" if choices.get("scored_all") else "by a sample": None if None in psnr.values() else psnr,
         "on the {:.0f} % that the input covers": document["psnr_covered"],
         "on its photos as their files have them": _scores_on_files(document),
         "on the {:.1f} % that are protected": document.get("psnr_protected"),
@@ -226,10 +227,10 @@ def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]
         if score:
             name = _own(document) if score is psnr else ""
             about = words.format(100 * score.get("share", 0))
-            rows += [(name, f"{score['before']:.2f} dB", f"{score['after']:.2f} dB", about)]
-    if fidelity := document["choices"].get("fidelity"):
+            rows += [(name, psnr_figure(score["before"], choices), psnr_figure(score["after"], choices), about)]
+    if fidelity := choices.get("fidelity"):
         rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_views(fidelity))]
-    if pruned := document["choices"].get("pruned"):
+    if pruned := choices.get("pruned"):
         rows += [("left out", "", f"{pruned:,}", "Gaussians that no view shows")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
@@ -261,9 +262,9 @@ def level_lines(document: Mapping[str, Any]) -> list[str]:
     """Return one line of text for each coarser level of detail."""
     return [
         f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
-        + (f"; {_own(document)} {level['psnr_input_views']:.2f} dB" if level["psnr_input_views"] is not None else "")
+        + (f"; {_own(document)} {psnr_figure(psnr, level['choices'])}" if psnr is not None else "")
         + f"; {level['seconds']:.1f} s"
-        for level in document["levels"]
+        for level, psnr in ((level, level["psnr_input_views"]) for level in document["levels"])
     ]
 
 

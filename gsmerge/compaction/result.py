@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from weakref import ReferenceType
 
-from gsmerge.compaction.candidate import Candidate, with_moved_views
+from gsmerge.compaction.candidate import Candidate, shrink, with_moved_views
 from gsmerge.compaction.distance import describe_far, is_far
-from gsmerge.compaction.new_views import SIDE, NewViews, Trial
+from gsmerge.compaction.new_views import SIDE, SPREAD, NewViews, Trial
 from gsmerge.compaction.outputs import write_result
 from gsmerge.compaction.report import CompactReport, compared_psnr
 from gsmerge.compaction.scores import PartScores, measure_parts, score_input
@@ -19,8 +19,8 @@ from gsmerge.compaction.search import SearchFacts
 from gsmerge.errors import Doubt
 from gsmerge.facts.prepare import Prepared
 from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
-from gsmerge.plan import Plan
-from gsmerge.raster.metrics import describe_distance, describe_loss
+from gsmerge.plan import Plan, own_views
+from gsmerge.raster.metrics import SPARE, describe_distance, describe_loss, is_worse
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene, number_views
@@ -133,16 +133,24 @@ def make_result(
 ) -> CompactResult:
     """Make the result from the best candidate and its coarser levels of detail, with a report.
 
-    The input is scored here, when memory is free again, unless the plan has its score. The report contains the seconds,
-    choices and notes of the current record, followed by those of the search and of the candidates.
+    The input is scored here, when memory is free again, unless the plan has its score. If a result may be worse by a
+    sample of the photos, input and results are scored again on all of them, which decides it. The report contains the
+    seconds, choices and notes of the current record, followed by those of the search and of the candidates.
     """
     run = current_record()
-    input_scores = score_input(prepared, plan)
+    input_scores, candidates = score_input(prepared, plan), (best, *levels)
     before = None if input_scores.photos is None else input_scores.photos.psnr
     part_scores = [
         measure_parts(input_scores, candidate.gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan)
-        for candidate in (best, *levels)
+        for candidate in candidates
     ]
+    if plan.samples and any(
+        is_worse(*compared_psnr(parts.covered, before, candidate.psnr), SPARE)
+        for parts, candidate in zip(part_scores, candidates, strict=True)
+    ):
+        plan = replace(plan, scored_views=own_views(prepared), samples=False)
+        best, *levels = (shrink(candidate, candidate.gaussians, prepared, plan) for candidate in candidates)
+        return make_result(best, levels, prepared, plan, search, trial)
     names = {**run.seconds, **search.seconds}
     seconds = {name: run.seconds.get(name, 0.0) + search.seconds.get(name, 0.0) for name in names}
     if "input" in seconds:
@@ -216,6 +224,6 @@ def _expect_new_views(
         return None, None
     expected = trial.predict(before, after, prepared.agreement.confirmed)
     is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= SIDE  # smaller pictures say little
-    if not is_large or main.worse is not None or expected.high >= 0:
+    if not is_large or main.worse is not None or expected.gain >= -SPREAD:
         return expected, None
     return expected, f"new views of the result are expected to be {-expected.gain:.1f} dB worse than those of the input"

@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.types import PER_PIXEL, Cameras, Pixels, Scene, SceneT
 
 MAX_SCORED_VIEWS = 24  # most scored views of a scene if a decision depends on the score
-REPORT_VIEWS = 4  # most scored views if only the report needs the score
+REPORT_VIEWS = 8  # most scored views if only the report needs the score
 BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of a scene with one part for each view
 
 

@@ -25,7 +25,9 @@ LEAST_OPACITY = 1 / 255  # rasterizers draw no smaller opacity
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
 # Gaussians. Larger scenes tile one view at a time, since a tiled view takes as much memory; threads share the view
 ONE_AT_A_TIME = 400_000
-BLOCK = 2  # tiles per side of the blocks that scored_tiles chooses among
+# The scored tiles of a sample are shifted by STEP columns from a line to the next. A view with up to SMALL tiles on its
+# shorter side is scored whole
+STEP, SMALL = 3, 6
 MASKED = np.float32(0.1)  # weight of pixels outside masks; with a weight of 0 the Gaussians there would drift
 COVERED = np.float32(0.5)  # transmittance below which a pixel counts as covered by Gaussians
 WHOLE = 0.98  # share of covered pixels from which on the whole view counts as covered
@@ -237,11 +239,11 @@ def score_photos(
     photos: Photos,
     views: Sequence[int],
     *,
-    quarter: bool = False,
+    every: int = 1,
     covered: Sequence[np.ndarray] | None = None,
     **settings: Any,
 ) -> PhotoScore:
-    """Score renders against the photos of ``views``, or a ``quarter`` of the tiles of each; see :func:`photo_errors`.
+    """Score renders against the photos of ``views``, or one of ``every`` so many tiles; see :func:`photo_errors`.
 
     ``covered`` is a mask ``[h,w]`` for each of the views. By default a pixel with an opacity of at least a half is
     covered.
@@ -249,10 +251,10 @@ def score_photos(
     masks = {} if covered is None else dict(zip(views, covered, strict=True))
 
     def tiles(view: int) -> np.ndarray | None:
-        return scored_tiles(view, photos.width, photos.height) if quarter else None
+        return scored_tiles(view, photos.width, photos.height, every)
 
     def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> RenderScore:
-        return _score_view(image, masks.get(view, transmittance < COVERED), photos, view, quarter=quarter)
+        return _score_view(image, masks.get(view, transmittance < COVERED), photos, view, every)
 
     return _mean_score(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings))
 
@@ -266,12 +268,12 @@ def _mean_score(scores: Sequence[RenderScore]) -> PhotoScore:
     return PhotoScore(mean, covered_mean, share, tuple(score.covered for score in scores))
 
 
-def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> RenderScore:
+def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, every: int) -> RenderScore:
     """Score a render ``[h,w,3]`` over all scored pixels and over ``covered [h,w]``; the render is clipped in place.
 
-    ``quarter`` is as in :func:`score_photos`.
+    ``every`` is as in :func:`score_photos`.
     """
-    mask = _scored_pixels(photos, view, quarter=quarter)
+    mask = _scored_pixels(photos, view, every)
     covered = covered if mask is None else covered & mask
     share = float(covered.sum() / (covered.size if mask is None else max(1, mask.sum())))
     masks = [mask, covered] if 0 < share < WHOLE else [mask]
@@ -279,34 +281,30 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
     return RenderScore(psnrs[0], psnrs[-1] if share else math.nan, share, covered)
 
 
-def _scored_pixels(photos: Photos, view: int, *, quarter: bool) -> np.ndarray | None:
+def _scored_pixels(photos: Photos, view: int, every: int) -> np.ndarray | None:
     """Select the pixels ``[h,w]`` inside the view's mask and its scored tiles; None: all.
 
     If no pixel is inside both, the mask alone selects; if the mask is empty, the tiles alone.
     """
-    tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
+    tiles = scored_tiles(view, photos.width, photos.height, every)
     in_tiles = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
     if photos.weights is None:
         return in_tiles
     unmasked = photos.weights[view] == 1
-    if not unmasked.any():
-        return in_tiles
-    if in_tiles is None or not (in_tiles & unmasked).any():
-        return unmasked
-    return in_tiles & unmasked
+    both = unmasked if in_tiles is None else in_tiles & unmasked
+    return next((mask for mask in (both, unmasked) if mask.any()), in_tiles)
 
 
-def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
-    """Select a quarter of a view's tiles as a mask ``[tile_height,tile_width]``; None, for all, in small views.
+def scored_tiles(view: int, width: int, height: int, every: int) -> np.ndarray | None:
+    """Select one of ``every`` so many tiles of a view as a mask ``[tile_height,tile_width]``; None: all of a small one.
 
-    One block of every 2 x 2 blocks is selected. Its position alternates between blocks and views.
+    The tiles are spread evenly, and are others in each view.
     """
     tile_height, tile_width = -(-height // TILE), -(-width // TILE)
-    if min(tile_height, tile_width) <= 3 * BLOCK:
+    if every == 1 or min(tile_height, tile_width) <= SMALL:
         return None
-    y, x = np.arange(tile_height)[:, None] // BLOCK, np.arange(tile_width) // BLOCK
-    position, selected_position = y % 2 * 2 + x % 2, (view + x // 2 + 2 * (y // 2)) % 4
-    return np.asarray(position == selected_position)
+    lines = view + np.arange(tile_height)[:, None]
+    return np.asarray((STEP * lines + np.arange(tile_width)) % every == 0)
 
 
 def render_photos(gaussians: Gaussians | Splats, photos: Photos, **settings: Any) -> list[np.ndarray]:

@@ -199,26 +199,27 @@ def hides_most(num_intersections: int, num_visible: int) -> bool:
     return num_intersections > max(CROWDED, CROWDED_EACH * num_visible)
 
 
-def _bin(
-    order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
-) -> tuple[Array, Array]:
-    """Return the tile lists and their starts."""
+def _bin(order: Array, boxes: Array, conics: Array, wanted: Array, threads: int) -> tuple[Array, Array]:
+    """Return the lists of the ``wanted [tile_height,tile_width]`` tiles and their starts; the other lists are empty."""
     # Boxes are gathered once in advance, 8 bytes each, since the loops below would wait for every cache miss
     boxes = boxes.view(np.uint64).reshape(-1).take(order).view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
-    counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], tile_height, tile_width), spans))
+    counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], *wanted.shape), spans))
     if hides_most(int(counts.sum()), len(order)):
-        return _bin_open(order, boxes, conics, tile_height, tile_width, threads)
-    isect_offsets = np.concatenate([[0], np.cumsum(counts.sum(0))])
-    cursors = isect_offsets[:-1] + np.cumsum(counts, 0) - counts
-    flatten_ids = np.empty(isect_offsets[-1], np.int32)
+        return _bin_open(order, boxes, conics, wanted.shape[0], wanted.shape[1], threads)
+    totals, is_wanted = counts.sum(0), wanted.reshape(-1)
+    isect_offsets = np.concatenate([[0], np.cumsum(totals * is_wanted)])
+    # the other lists stand behind these, and are cut off
+    ends = np.where(is_wanted, isect_offsets[1:], isect_offsets[-1] + np.cumsum(totals * ~is_wanted))
+    cursors = ends - totals + np.cumsum(counts, 0) - counts
+    flatten_ids = np.empty(totals.sum(), np.int32)
 
     def deal(piece: tuple[tuple[int, int], Array]) -> None:
         (start, end), tile_cursors = piece
-        deal_tiles(order[start:end], boxes[start:end], tile_width, tile_cursors, flatten_ids)
+        deal_tiles(order[start:end], boxes[start:end], wanted.shape[1], tile_cursors, flatten_ids)
 
     parallel_map(deal, zip(spans, cursors, strict=True))
-    return flatten_ids, isect_offsets
+    return flatten_ids[: isect_offsets[-1]], isect_offsets
 
 
 def _bin_open(
@@ -315,7 +316,8 @@ def tile_view(
             boxes[:, :2] = boxes[:, :2].clip(left, right)
             boxes[:, 2:] = boxes[:, 2:].clip(top, bottom)
         order = depth_order(depths.view(np.uint32))
-        flatten_ids, isect_offsets = _bin(order, boxes, conics, tile_height, tile_width, threads)
+        wanted = np.ones((tile_height, tile_width), bool) if tiles is None else tiles
+        flatten_ids, isect_offsets = _bin(order, boxes, conics, wanted, threads)
     eye, first_row = camera_centres(local_viewmat).astype(np.float32), top * projection.TILE
     return TiledView(
         splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width,

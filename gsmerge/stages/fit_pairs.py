@@ -31,7 +31,7 @@ def fit_pairs(starts: Sequence[Decoded], prepared: Prepared, options: FitOptions
     PSNR (dB).
     """
     photos, views = scene_photos(prepared.scene), prepared.reference.score_views
-    psnrs = [score_photos(start.gaussians, photos, views, quarter=True).psnr for start in starts]
+    psnrs = [score_photos(start.gaussians, photos, views, every=4).psnr for start in starts]
     best = int(np.argmax(psnrs))
     if options.fit == "none":
         return unfitted(starts[best], prepared)

@@ -19,7 +19,7 @@ from gsmerge import plan, types
 from gsmerge.cameras import poses as cameras_off
 from gsmerge.cameras import rows_first, score
 from gsmerge.cameras.registration import register
-from gsmerge.compaction import blocks, curve, left_out, new_views, partition, seams, search
+from gsmerge.compaction import blocks, curve, left_out, new_views, partition, scores, seams, search
 from gsmerge.facts import confirm_depths, holes, move_poses, scene_size
 from gsmerge.fit import outside, photo_sizes, schedule, stage
 from gsmerge.fit import report as fit_report
@@ -54,7 +54,7 @@ CONVENTIONS, EXPORTERS, FORMATS, REPORT = (
     f"docs/reference/{name}.md" for name in ("conventions", "exporters", "formats", "report")
 )
 NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
-FRACTIONS = {2: "half", 3: "third", 4: "quarter", 5: "fifth", 12: "twelfth"}
+FRACTIONS = {2: "half", 3: "third", 4: "quarter", 5: "fifth", 10: "tenth", 12: "twelfth"}
 
 
 def percent(share: float) -> str:
@@ -134,8 +134,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"moved by up to {cameras_off.MAX_PX:g} pixels",
         f"With more than {word(plan.USUAL_VIEWS)} views the fit takes more steps. Scenes of more than"
         f" {million(plan.WHOLE_GAUSSIANS)} Gaussians or {plan.WHOLE_VIEWS} views are compacted in blocks",
-        f"a quarter of the pixels of {word(views.REPORT_VIEWS)} photos (in drafts:"
-        f" {word(plan.EFFORTS['draft'].report_views)})",
+        f"{part(1 / scores.INPUT_EVERY)} of the input's pixels and {part(1 / scores.RESULT_EVERY)} of the result's in"
+        f" {word(views.REPORT_VIEWS)} photos (in drafts: {word(plan.EFFORTS['draft'].report_views)})",
     ),
     CONVERT: (
         f"at the upper border of at least {word(sky.LEAST_VIEWS)} photos and a {part(sky.LEAST_SHARE)} of all",

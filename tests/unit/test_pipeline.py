@@ -10,8 +10,7 @@ import scenes
 from gsmerge import Scene, compact
 from gsmerge.kernels import elementary
 from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.photos.views import pick_views
-from gsmerge.raster.photos import scene_pictures
+from gsmerge.raster.photos import scene_photos, scene_pictures, score_photos
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS
 from gsmerge.stages.prune import ROUNDING
@@ -69,15 +68,17 @@ def test_a_result_that_loses_what_the_input_covers_is_worse(scene: Scene) -> Non
     assert report.worse is not None
 
 
-def test_many_views_are_scored_by_some(scene: Scene) -> None:
-    """Of both the same ones, and it is said."""
-    result = scenes.compacted(scene, fit="none", effort="draft")
-    some = scenes.take_views(scene, pick_views(len(scene), 2))
-    assert result.report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, some), abs=0.1)
-    assert result.report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, some), abs=0.1)
-    assert result.report.choices["scored_views"] == 2 < len(scene)
-    better = scenes.compacted(scene, fit="none", effort="draft", quality="20dB")
-    assert better.report.choices["scored_views"] == len(scene)
+@pytest.mark.parametrize(("settings", "scored_all", "near"), [({}, False, 1.5), ({"budget": 9}, True, 1e-4)], ids=str)
+def test_a_sample_is_scored_unless_the_result_may_be_worse(settings: Any, scored_all: bool, near: float) -> None:
+    """Then all photos decide, and the report is exact."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(5, 160, 128), noise=0.3)
+    result = compact(scene, effort="draft", poses="fixed", **settings)
+    photos = scene_photos(scene)
+    exact = [score_photos(one, photos, range(5)).psnr for one in (scene.gaussians, result.gaussians)]
+    assert [result.report.psnr_before, result.report.psnr_after] == pytest.approx(exact, abs=near)
+    assert result.report.choices["scored_all"] is scored_all is (result.report.worse is not None)
+    assert result.report.choices["scored_views"] == (5 if scored_all else 3)
+    assert ("about" in repr(result.report)) is not scored_all
 
 
 def test_what_no_photo_shows_is_not_written(scene: Scene) -> None:

@@ -25,6 +25,7 @@ from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.networks.checkpoint import IN_PACKAGE
+from gsmerge.photos.views import REPORT_VIEWS
 from gsmerge.plan import (
     EFFORTS,
     FIDELITY_LOSS,
@@ -269,8 +270,12 @@ def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
 
 
 def test_more_views_are_scored_for_a_quality(scene: Scene) -> None:
-    wide = scenes.make_scene(scenes.room(), scenes.arc(6, 24, 16))
-    assert len(plan_of(wide).scored_views) < len(plan_of(wide, quality="20dB").scored_views) == 6
+    wide = scenes.make_scene(scenes.room(), scenes.arc(10, 112, 98))
+    some, every = plan_of(wide), plan_of(wide, quality="20dB")
+    assert (len(some.scored_views), some.samples) == (REPORT_VIEWS, True)
+    assert (len(every.scored_views), every.samples) == (10, False)
+    small = plan_of(scenes.make_scene(scenes.room(), scenes.arc(10, 24, 16)))
+    assert (len(small.scored_views), small.samples) == (10, False)
 
 
 def test_reports_say_what_was_settled(scene: Scene) -> None:

@@ -11,7 +11,7 @@ import scenes
 from messages import names, refuses
 from sweeps import sweep
 
-from gsmerge import CompactOptions, compact
+from gsmerge import CompactOptions, EvaluateOptions, compact, evaluate
 from gsmerge.compaction.seams import join_views
 from gsmerge.errors import UsageError
 from gsmerge.facts.scene_size import measure_size
@@ -128,6 +128,14 @@ def test_views_that_repeat_others(scene: Scene) -> None:
     result = compact(again, blocks=2, **SETTINGS)
     scenes.assert_invariants(result.gaussians, scene)
     assert result.report.choices["seams"]["views"] <= len(scene)
+
+
+def test_all_photos_decide_whether_blocks_are_worse() -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(4, 112, 98), noise=0.3)
+    result = compact(scene, blocks=2, **{**SETTINGS, "superpixels": 4})
+    exact = evaluate(scene, {"small": result}, options=EvaluateOptions(lpips=(), fog=False)).results[1].mean("context")
+    assert result.report.worse is not None
+    assert (result.report.choices["scored_all"], result.report.psnr_after) == (True, exact[0].psnr)
 
 
 def count_blocks(scene: Scene, **settings: Any) -> int:

@@ -55,7 +55,9 @@ def test_what_the_input_covers_stands_beside_all_pixels(files: tuple[Path, Path]
     document = make_document(files, covered=Covered(0.79, 26.1, 25.9))
     assert document["psnr_covered"] == {"share": 0.79, "before": 26.1, "after": 25.9}
     for text in ["\n".join(report.result_table(document))]:
-        assert all(part in text for part in ("79 %", "26.10", "25.90", "20.00", "24.50"))
+        assert all(
+            part in text for part in ("79 %", "about 26.1 dB", "about 25.9 dB", "about 20.0 dB", "about 24.5 dB")
+        )
     assert make_document(files)["psnr_covered"] is None
 
 

@@ -1,4 +1,4 @@
-"""The quarter of the input views that scenes are judged by."""
+"""The sample of the input views that scenes are judged by."""
 
 from __future__ import annotations
 
@@ -37,29 +37,37 @@ def test_wanted_tiles_are_drawn_as_in_the_whole(scene: Scene) -> None:
         tile_view(splats, **photos.camera(1), tiles=np.ones((8, 8), bool))
 
 
-def test_four_views_score_every_place_once() -> None:
-    tiles = [scored_tiles(view, 512, 384) for view in range(4)]
-    assert (np.sum(tiles, 0) == 1).all()
-    assert [one.mean() for one in tiles if one is not None] == [0.25] * 4
-    assert scored_tiles(0, 97, 1000) is not None
-    assert scored_tiles(0, 96, 1000) is None
+@pytest.mark.parametrize("every", [2, 4, 10])
+def test_so_many_views_score_every_place_once(every: int) -> None:
+    """And no two neighbouring tiles of a view."""
+    tiles = np.stack([scored_tiles(view, 320, 640, every) for view in range(every)])
+    assert (tiles.sum(0) == 1).all()
+    assert tiles.mean((1, 2)) == pytest.approx(1 / every)
+    assert not (tiles[:, 1:] & tiles[:, :-1]).any()
+    assert not (tiles[..., 1:] & tiles[..., :-1]).any()
+
+
+def test_small_views_are_scored_whole() -> None:
+    assert scored_tiles(0, 97, 1000, 10) is not None
+    assert scored_tiles(0, 96, 1000, 10) is None
+    assert scored_tiles(0, 640, 480, 1) is None
 
 
 @pytest.mark.parametrize(("width", "height"), [(97, 113), (131, 500), (1000, 97)])
-def test_odd_sizes_have_about_a_quarter(width: int, height: int) -> None:
+def test_odd_sizes_have_about_their_share(width: int, height: int) -> None:
     for view in range(4):
-        tiles = scored_tiles(view, width, height)
+        tiles = scored_tiles(view, width, height, 4)
         assert tiles.shape == (-(-height // 16), -(-width // 16))
         assert tiles.mean() == pytest.approx(0.25, abs=0.1)
 
 
-def test_quarter_is_near_the_whole(scene: Scene) -> None:
+def test_a_sample_is_near_the_whole(scene: Scene) -> None:
     photos, views = scene_photos(scene), range(len(scene))
-    whole, quarter = (
-        score_photos(scene.gaussians, photos, views, near=NEAR_PLANE, quarter=part).psnr for part in (False, True)
+    whole, sample = (
+        score_photos(scene.gaussians, photos, views, near=NEAR_PLANE, every=every).psnr for every in (1, 4)
     )
-    assert quarter == pytest.approx(whole, abs=0.5)
-    assert quarter != whole
+    assert sample == pytest.approx(whole, abs=0.5)
+    assert sample != whole
 
 
 def test_a_view_of_equal_pictures_hides_no_other(scene: Scene) -> None:
