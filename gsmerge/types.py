@@ -349,6 +349,7 @@ class Scene(ArrayFields):
         importance: ``[v,h,w]`` float32, weight of each pixel in a fit, as a number of pixels; None: one everywhere.
         filled: ``[n]`` bool, Gaussians that are not in the file and fill holes; None: none.
         region: Region outside of which the scene has nothing, as after a crop; None: everywhere.
+        notes: What reading its files had to say, for the report of a run; some are doubts.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -369,6 +370,7 @@ class Scene(ArrayFields):
     importance: np.ndarray | None = None
     filled: np.ndarray | None = None
     region: Region | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.cameras is None:

@@ -7,14 +7,13 @@ wrong is decided later, from the photos (``gsmerge/facts/move_poses.py``).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsmerge.cameras.frames import solve_pose
-from gsmerge.cameras.score import Correspondences, check_pairs, is_as_near, photo_colors, pixel_errors, pixel_limit
+from gsmerge.cameras.score import Correspondences, check_pairs, is_as_near, max_pixels, photo_colors, pixel_errors
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import camera_depths, is_inside, project_points, robust_weights
 from gsmerge.io.cameras.camera_file import (
@@ -31,7 +30,6 @@ from gsmerge.types import Cameras
 
 _SAME = 1e-6  # tolerance for equal poses, relative to the largest number in them
 
-MAX_PX, MAX_SHARE = 12.0, 0.05  # error up to which cameras are moved: pixels, and share of the side of small images
 NEAR_PX = 0.5  # cameras with smaller errors are not moved
 SAME_FOCAL = 0.01  # largest relative difference of focal lengths that count as equal
 CLEAR = 0.96  # the given poses are better if they reduce the disagreement between photos to this share
@@ -92,11 +90,6 @@ class MovedCameras:
                 " view were moved to its camera, since the photos agree better from there"
             )
         return f"{text}, {describe_moves(self.moves)}"
-
-
-def max_pixels(width: int, height: int) -> float:
-    """Return the largest median error, pixels, that moving a camera may correct."""
-    return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
 
 
 def move_cameras(

@@ -21,7 +21,7 @@ from gsmerge.cameras.estimate import estimate_cameras
 from gsmerge.cameras.frames import exporter_frames, fit_frame, own_poses, scale_by
 from gsmerge.cameras.grids import Grid, PlacedGrid, file_grids, photo_grid, with_photo_size, with_poses
 from gsmerge.cameras.layouts import ESTIMATED, NO_CAMERAS_USED, Layout
-from gsmerge.cameras.poses import max_pixels, move_cameras, other_conventions
+from gsmerge.cameras.poses import move_cameras, other_conventions
 from gsmerge.cameras.score import (
     AS_NEAR,
     AS_NEAR_PX,
@@ -29,6 +29,7 @@ from gsmerge.cameras.score import (
     Alignment,
     AlignmentInput,
     check_pairs,
+    max_pixels,
     pixel_errors,
 )
 from gsmerge.errors import SceneError

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ SHUFFLED_MARGIN = 5.0  # factor by which Gaussians must be nearer to their pixel
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
 SAMPLE_GAUSSIANS, MIN_SAMPLE_GAUSSIANS = 6000, 60  # Gaussians of a score: of all views, and least of each view
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
+MAX_PX, MAX_SHARE = 12.0, 0.05  # error up to which cameras are moved: pixels, and share of the side of small images
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some of them a little beyond
 
 
@@ -82,6 +84,7 @@ class Alignment:
     median_px: tuple[float, ...]
     share_in_front: float  # share of all checked Gaussians with positive depth in their own view
     share_within_1px: float  # share of all checked Gaussians at most one pixel from their pixel's centre
+    share_near: float  # share of all checked Gaussians with a distance up to that at which cameras are moved
     limit_px: float  # largest median that counts as aligned
     ok: bool  # True if every view's median is below the limit and most Gaussians are in front
 
@@ -104,6 +107,11 @@ def is_as_near(px: float, least: float) -> bool:
 def pixel_limit(width: int, height: int) -> float:
     """Return the largest median distance, pixels, at which Gaussians count as lying in their pixels."""
     return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
+
+
+def max_pixels(width: int, height: int) -> float:
+    """Return the largest median error, pixels, that moving a camera may correct."""
+    return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
 
 
 def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -149,6 +157,8 @@ def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
         for view_errors in np.split(errors, ends[:-1])
     )
     count = max(1, len(errors))
-    in_front, within_1px = float(np.isfinite(errors).sum()) / count, float((errors <= 1).sum()) / count
+    limits = sys.float_info.max, 1, max_pixels(cameras.width, cameras.height)
+    in_front, within_1px, near = (float((errors <= px).sum()) / count for px in limits)
     is_near = [median_px < limit for median_px in medians if not math.isnan(median_px)]
-    return Alignment(medians, in_front, within_1px, limit, bool(is_near) and all(is_near) and in_front > 0.5)
+    is_ok = bool(is_near) and all(is_near) and in_front > 0.5
+    return Alignment(medians, in_front, within_1px, near, limit, is_ok)

@@ -86,7 +86,13 @@ def compact(
         >>> len(result.gaussians)
         400
     """
-    options = (options or CompactOptions()).with_settings(settings)
+    result = compact_scene(scene, (options or CompactOptions()).with_settings(settings), progress)
+    _warn_of_doubts(result.report)
+    return result
+
+
+def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Progress | None = None) -> CompactResult:
+    """Replace a scene by a compact one as :func:`compact` does, without Python's warnings: the report has them."""
     with use_threads(options.threads), record_run(progress):
         # a reference, so that the result does not keep the scene in memory
         source: StrPath | ReferenceType[Scene] = scene if isinstance(scene, str | PathLike) else ref(scene)
@@ -94,7 +100,6 @@ def compact(
         if options.clean.crop is not None:
             scene = crop_scene(scene.numpy(), options.clean.crop)
         result = _compact_scene(scene, options)
-        _warn_of_doubts(result.report)
         if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
             result = result.to_single()
         return replace(result, scene=source, names=scene.names)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from gsmerge.compaction.compact import compact
+from gsmerge.compaction.compact import compact_scene
 from gsmerge.compaction.outputs import add_views, refuse_other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
-from gsmerge.errors import DoubtWarning, SceneError
+from gsmerge.errors import SceneError
 from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.columns import UNUSED, list_names
@@ -76,9 +75,7 @@ def compact_files(
         if cameras_path is not None and cameras_path.exists() and not outputs.overwrite:  # before the work is done
             refuse_other_cameras(cameras_path, load.scene.cameras[views], names, moved=True)
         read = perf_counter()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DoubtWarning)  # the report has them
-            result = compact(load.scene, settings, progress=progress)
+        result = compact_scene(load.scene, settings, progress)
         if len(result.gaussians) == 0:
             nothing = "expected Gaussians that show something, found none that remains after merging"
             raise SceneError(files.ply, nothing, "check its scales and opacities")

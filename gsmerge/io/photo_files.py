@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import struct
-import warnings
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +22,7 @@ from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.memory import free_pages, make_array
-from gsmerge.runtime.threads import parallel_map
+from gsmerge.runtime.threads import parallel_map, quiet_warnings
 from gsmerge.types import Cameras
 
 _FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads; that of PNG is read here
@@ -307,8 +306,7 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
     """Decode an image and return the result of ``choose``; SceneError if it cannot be decoded."""
     size, _ = _read_header(path)  # raises SceneError for a file that is no image or is too large
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with quiet_warnings():
             data = np.fromfile(path, np.uint8)
             pixels = _png_pixels(data) if data[: len(PNG)].tobytes() == PNG else data  # without texts of many MB
             if pixels is None:
@@ -359,8 +357,7 @@ def _read_header(path: Path) -> tuple[Size, float]:
 
 def orientation_turn(path: Path) -> int:
     """Return the turn by a photo's orientation tag, 0 to 7; see :func:`gsmerge.kernels.pictures.turn_picture`."""
-    with read_errors(path), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with read_errors(path), quiet_warnings():
         try:
             with path.open("rb") as file, _open_image(file, (*_FORMATS, "PNG")) as image:
                 return _TURNS.get(image.getexif().get(_ORIENTATION_TAG, 0), 0)
@@ -376,8 +373,7 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
         if start[:8] == PNG:  # Pillow refuses a PNG for damage outside its pixels as well
             width, height = struct.unpack(">II", start[16:24])
         else:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
+            with quiet_warnings():
                 image = _open_image(file, _FORMATS)
             pixel_bytes = _decoder_bytes(image)
             width, height = image.size

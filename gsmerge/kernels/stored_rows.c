@@ -11,8 +11,8 @@ static inline bool unit_quat(const float *q, float *out) {
   return squared > 1e-30f && squared < 1e30f;
 }
 
-API int64_t convert_rows(const float *rows, const int32_t *places, float most_harmonic, float most_log_scale,
-                         float *means, float *quats, float *scales, float *opacities, float *sh0, float *shN, int64_t n,
+API int64_t convert_rows(const float *rows, const int32_t *places, float most_position, float most_harmonic,
+                         float most_log_scale, float *means, float *quats, float *scales, float *opacities, float *sh0, float *shN, int64_t n,
                          int64_t columns, int64_t used, int64_t rest) {
   if (used != 14 + rest) return 0;
   const int32_t *of_sh0 = places + 3, *of_rest = places + 6, *of_scales = of_rest + rest, *of_quats = of_scales + 3;
@@ -27,7 +27,7 @@ API int64_t convert_rows(const float *rows, const int32_t *places, float most_ha
         mean[c] = row[places[c]];
         color[c] = row[of_sh0[c]];
         logs[3 * i + c] = row[of_scales[c]];
-        plain &= absf4(mean[c]) <= 3.4028234e38f && absf4(color[c]) <= most_harmonic;
+        plain &= absf4(mean[c]) <= most_position && absf4(color[c]) <= most_harmonic;
         plain &= absf4(logs[3 * i + c]) <= most_log_scale;
       }
       for (int64_t k = 0; k < rest; k++) {

@@ -6,15 +6,15 @@ from gsmerge.kernels.signature import f4, i4, i8, native
 
 
 @native(
-    i8(), rows=f4("n", "columns"), places=i4("used", least=0, below="columns"), most_harmonic=f4(),
-    most_log_scale=f4(), means=f4("n", 3, out=True), quats=f4("n", 4, out=True), scales=f4("n", 3, out=True),
-    opacities=f4("n", out=True), sh0=f4("n", 3, out=True), shN=f4("n", "rest", out=True),
+    i8(), rows=f4("n", "columns"), places=i4("used", least=0, below="columns"), most_position=f4(),
+    most_harmonic=f4(), most_log_scale=f4(), means=f4("n", 3, out=True), quats=f4("n", 4, out=True),
+    scales=f4("n", 3, out=True), opacities=f4("n", out=True), sh0=f4("n", 3, out=True), shN=f4("n", "rest", out=True),
 )  # fmt: skip
-def convert_rows(rows, places, most_harmonic, most_log_scale, means, quats, scales, opacities, sh0, shN):
+def convert_rows(rows, places, most_position, most_harmonic, most_log_scale, means, quats, scales, opacities, sh0, shN):
     """Convert rows, block by block, up to the first block with a row that is not plain; return the number converted.
 
     Later rows of the outputs are undefined. ``places`` are the columns of x, y, z, of the harmonics in the order of
     ``sh0`` and ``shN``, of the log scales, of the quaternions wxyz, and of the opacity, which is copied. A row is plain
-    if its values are finite, its harmonics and log scales are within the limits, and its quaternion has a length
-    between 1e-15 and 1e15. A block has 64 rows.
+    if its values are finite, its positions, harmonics and log scales are within the limits, and its quaternion has a
+    length between 1e-15 and 1e15. A block has 64 rows.
     """

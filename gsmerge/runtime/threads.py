@@ -13,10 +13,11 @@ import itertools
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 
@@ -26,6 +27,7 @@ from gsmerge.runtime import MOST_THREADS
 THREADS = "GSMERGE_THREADS"  # environment variable: the default number of threads
 T = TypeVar("T")
 R = TypeVar("R")
+LIBRARIES = r"(PIL|plyfile|numpy|gsmerge\.io)\b"  # modules whose warnings are about damage, which readers report
 AT_ONCE = 12  # number of results of in_turn in memory at the same time
 
 
@@ -50,6 +52,36 @@ class _Pool:
             self.work.put(None)
         for thread in self.threads:
             thread.join()
+
+
+@contextmanager
+def quiet_warnings() -> Iterator[None]:
+    """Ignore warnings of libraries in the block, which may run in several threads at once.
+
+    Python's own ``catch_warnings`` would leave the filters of one thread to all others for good. So the first block
+    sets the filter, and the last one restores the caller's.
+    """
+    with _Quiet.lock:
+        if not _Quiet.blocks:
+            _Quiet.saved = warnings.catch_warnings()
+            _Quiet.saved.__enter__()
+            warnings.filterwarnings("ignore", module=LIBRARIES)
+        _Quiet.blocks += 1
+    try:
+        yield
+    finally:
+        with _Quiet.lock:
+            _Quiet.blocks -= 1
+            if not _Quiet.blocks:
+                _Quiet.saved.__exit__(None, None, None)
+
+
+class _Quiet:
+    """State of :func:`quiet_warnings`, the same for all threads."""
+
+    lock = threading.Lock()
+    blocks = 0  # that are running
+    saved: Any = None  # the caller's filters
 
 
 class _Local(threading.local):

@@ -17,14 +17,14 @@ TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by so much
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
-    """Return a scene unchanged after a check, or read it from a path; notes describe unusual content of the file."""
+    """Return a scene unchanged after a check, or read it from a path; note what reading its files had to say."""
     if isinstance(scene, Scene):
         check_scene(scene)
-        return scene
-    load = load_scene(scene)
-    for text in load.notes:
+    else:
+        scene = load_scene(scene).noted_scene
+    for text in scene.notes:
         note(text)
-    return load.scene
+    return scene
 
 
 def check_scene(scene: Scene) -> None:

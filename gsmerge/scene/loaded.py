@@ -47,6 +47,11 @@ class Loaded:
         raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
 
     @property
+    def noted_scene(self) -> Scene:
+        """The scene with the notes on how it was read."""
+        return replace(self.scene, notes=self.notes)
+
+    @property
     def doubts(self) -> list[str]:
         """Those of the notes that make results doubtful, as on cameras and photos that are left out."""
         return list_doubts(self.notes)

@@ -14,7 +14,7 @@ from gsmerge.errors import Doubt, DoubtWarning, SceneError, name_notes
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
-from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.arrays import MAX_STRAY, RESULT_COMMENT
 from gsmerge.io.formats.color_units import RGB_NOTE
 from gsmerge.io.formats.read import GaussianFile, file_notes, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
@@ -111,7 +111,7 @@ def read_scene(
     )
     for doubt in load.doubts:
         warnings.warn(doubt, DoubtWarning, stacklevel=3)  # the caller: above this function and its decorator
-    return load.scene
+    return load.noted_scene
 
 
 def load_scene(
@@ -495,6 +495,10 @@ def _make_load(
     if recovery is not None and result.given is not None:
         scene = move_views(scene, result.given)
         result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
+    alignment, strays = None if recovery is None else check_pixels(scene), list[str]()
+    if alignment is not None and alignment.share_near < 1 - MAX_STRAY:
+        share = f"{100 * (1 - alignment.share_near):.0f} % of the Gaussians lie far from their own pixels"
+        strays = [Doubt(f"{share}, as rows of a damaged file do; copy or export it again")]
     source = "" if camera_file is None else camera_file.source
     order = "none" if recovery is None else recovery.layout.order
     return Loaded(
@@ -503,8 +507,8 @@ def _make_load(
         files=files,
         cameras=camera_file,
         exporters=choose_exporters(hints.exporter, ply.info, order, source),
-        notes=(*files.notes, *file_notes(ply.info), *notes, *faint_notes, *mask_notes),
-        alignment=None if recovery is None else check_pixels(scene),
+        notes=(*files.notes, *file_notes(ply.info), *strays, *notes, *faint_notes, *mask_notes),
+        alignment=alignment,
         recovery=recovery,
         problem=result.problem,
         moves=result.moves,

@@ -16,8 +16,8 @@ from scripts import load_script
 
 import gsmerge
 from gsmerge import plan, types
-from gsmerge.cameras import poses as cameras_off
 from gsmerge.cameras import rows_first, score
+from gsmerge.cameras import score as cameras_off
 from gsmerge.cameras.registration import register
 from gsmerge.compaction import blocks, curve, left_out, new_views, partition, scores, seams, search
 from gsmerge.facts import confirm_depths, holes, move_poses, scene_size

@@ -186,7 +186,7 @@ def _headers() -> dict[str, Damage]:
 def _values() -> dict[str, Damage]:
     means, colors, opacity, scales, quats = slice(0, 3), slice(6, 9), slice(9, 10), slice(10, 13), slice(13, 17)
     return {
-        "positions 1e38": refuse(fill(means, 1e38), place="transforms.json"),
+        "positions 1e38": refuse(fill(means, 1e38), "no scene has"),
         "half of the positions NaN": allow(fill(means, np.nan, slice(0, None, 2))),
         "one position 1e30": accept(fill(means, 1e30, slice(5, 6))),
         "colours 1e38": refuse(fill(colors, 1e38), "no scene has"),

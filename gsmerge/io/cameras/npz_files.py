@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import math
 import re
-import warnings
 import zipfile
 from collections.abc import Collection
 from contextlib import suppress
@@ -26,6 +25,7 @@ from gsmerge.io.bounds import check_file, check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, MAX_NORMALISED_FOCAL, ORDERS, StoredView, check_count
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.photo_files import PhotoArrays
+from gsmerge.runtime.threads import quiet_warnings
 
 _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of the arrays' names in ``cameras.npz`` of Lyra 2's scripts
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
@@ -184,8 +184,7 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise SceneError(path, "expected a readable .npz file, found something else")
     try:
-        with open_archive(path) as archive, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about headers in old styles
+        with open_archive(path) as archive, quiet_warnings():  # about headers in old styles
             members = {name: info for name, info in _members(archive).items() if name in names}
             budget.check_memory(sum(info.file_size for info in members.values()), "arrays")
             return {name: _read_array(path, archive, info) for name, info in members.items()}

@@ -22,6 +22,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
 from gsmerge.values.arrays import Array, as_array
 
+MAX_POSITION = 1e13  # no scene is larger, in any unit; float32 can square and sum positions and scales below
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
 LOGIT_COMMENT = "opacity: logit"  # states the encoding in files of gsmerge, so that no reader guesses it
 RESULT_COMMENT = "gsmerge result"  # replaces LOGIT_COMMENT in results of commands, and has the same length

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 import threading
-import warnings
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ from gsmerge.io.formats.columns import check_columns
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.runtime.threads import quiet_warnings
 from gsmerge.types import Gaussians
 
 _PACKED_ROWS = LazyFunction("gsmerge.io.formats.compressed", "packed_rows")
@@ -234,8 +234,7 @@ def open_ply(path: Path) -> PlyData:
         if start[:4] not in (b"ply\n", b"ply\r"):
             raise no_ply(path)
         end, text = _check_header(start, budget)
-        with _stream(path, end, text=text) as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of an empty list, or a number beyond the column's type
+        with _stream(path, end, text=text) as file, quiet_warnings():  # of an empty list, or too large a number
             data = PlyData.read(file, mmap="r")
         mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)  # Windows replaces no mapped file
         for element in data.elements:

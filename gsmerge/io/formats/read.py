@@ -206,9 +206,7 @@ def convert_files(
     if judgement.linear:
         parts = [_with_linear_scales(part) for part in parts]
         num_clipped, num_zero_quats = _fill_arrays(paths, parts, out)
-    if num_clipped:
-        out["valid"] &= (out["scales"] < exp(np.float32(arrays.MAX_LOG_SCALE))).all(1)
-        out["valid"] &= (np.abs(np.concatenate([out["sh0"], out["shN"]], 1)) < MAX_HARMONIC).all((1, 2))
+    damage = _set_aside_impossible(out) if num_clipped else ()
     empty = find_empty(path, out)
     units, color_note, open_units = _choose_colors(parts[0], out, colors)
     if units is not None:
@@ -243,7 +241,7 @@ def convert_files(
         color_units=units,
         color_note=color_note,
         open_units=open_units,
-        adapted=(*scale_notes, *stored.notes, *_describe_incomplete(out["valid"])),
+        adapted=(*scale_notes, *stored.notes, *damage, *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
@@ -370,7 +368,7 @@ def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
     column_ids = np.array([offset // np.dtype(np.float32).itemsize for offset in offsets], np.int32)
     values = rows.view(np.float32).reshape(len(rows), -1)
     sh0, shN = (out[name].reshape(len(rows), -1) for name in ("sh0", "shN"))
-    limits = MAX_HARMONIC, arrays.MAX_LOG_SCALE
+    limits = arrays.MAX_POSITION, MAX_HARMONIC, arrays.MAX_LOG_SCALE
     return convert_rows(
         values, column_ids, *limits, out["means"], out["quats"], out["scales"], out["opacities"], sh0, shN
     )
@@ -396,7 +394,8 @@ def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int,
         finite = [np.isfinite(values).all(1) for values in (means, colors, rest, quats)]
         out["valid"][:] = np.logical_and.reduce([*finite, ~np.isnan(opacities), (log_scales < np.inf).all(1)])
         limits = ((colors, MAX_HARMONIC), (rest, MAX_HARMONIC), (log_scales, arrays.MAX_LOG_SCALE))
-        is_clipped = np.logical_or.reduce([(np.abs(values) > limit).any(1) for values, limit in limits])
+        is_clipped = (np.abs(means) > arrays.MAX_POSITION).any(1)
+        is_clipped |= np.logical_or.reduce([(np.abs(values) > limit).any(1) for values, limit in limits])
         for values, limit in limits:
             np.clip(values, -limit, limit, out=values)
         for j, name in enumerate(arrays.MEANS):
@@ -557,6 +556,17 @@ def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
         out[name][rows] = out[name][previous]
     for name, value in {"quats": (1, 0, 0, 0), "opacities": 0, "sh0": 0, "shN": 0}.items():
         out[name][rows] = value
+
+
+def _set_aside_impossible(out: dict[str, np.ndarray]) -> list[str]:
+    """Make rows with numbers that no scene has invalid, in place; doubt a file in which these are more than strays."""
+    is_possible = (out["scales"] < exp(np.float32(arrays.MAX_LOG_SCALE))).all(1)
+    is_possible &= (np.abs(out["means"]) <= arrays.MAX_POSITION).all(1)
+    is_possible &= (np.abs(np.concatenate([out["sh0"], out["shN"]], 1)) < MAX_HARMONIC).all((1, 2))
+    count = np.count_nonzero(out["valid"] & ~is_possible)
+    out["valid"] &= is_possible
+    what = f"{count:,} of {len(is_possible):,} rows have numbers that no scene has, as in a damaged file"
+    return [Doubt(f"{what}; copy it again, in binary mode")] if count > arrays.MAX_STRAY * len(is_possible) else []
 
 
 def _describe_incomplete(valid: np.ndarray) -> tuple[str, ...]:

@@ -14,8 +14,8 @@ from messages import names, noted, refuses
 from saved_cameras import write_transforms
 from tiny_scene import Tiny, make_tiny
 
-from gsmerge.cameras.poses import max_pixels, move_cameras
-from gsmerge.cameras.score import sample_pixels
+from gsmerge.cameras.poses import move_cameras
+from gsmerge.cameras.score import max_pixels, sample_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import pose_changes, project_points
 from gsmerge.io import write_gaussians

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 import scenes
+from exports import export_rows, save_export, smooth_scene
+from messages import names
 
 import gsmerge
 from gsmerge.types import Scene
@@ -54,6 +56,18 @@ def test_reports_are_plain_values(result: gsmerge.CompactResult) -> None:
 def test_doubts_are_warned_of(scene: Scene) -> None:
     with pytest.warns(gsmerge.DoubtWarning, match="worse than the input"):
         gsmerge.compact(scene, effort="draft", budget=4, fit="none")
+
+
+@pytest.mark.parametrize("is_read", [False, True])
+def test_doubts_of_reading_are_in_the_report_of_a_run(is_read: bool, tmp_path: Path) -> None:
+    smooth = smooth_scene(56, 40)
+    folder = save_export(tmp_path / "scene", smooth, export_rows(smooth))
+    (folder / "transforms.json").write_text("{")
+    with pytest.warns(gsmerge.DoubtWarning, match="left out"):
+        scene = gsmerge.read_scene(folder)
+    with pytest.warns(gsmerge.DoubtWarning, match="left out"):
+        report = gsmerge.compact(scene if is_read else folder, effort="draft", budget=60).report
+    assert [names(doubt, "transforms.json", "left out") for doubt in report.doubts] == [True]
 
 
 def test_notes_are_logged(scene: Scene, caplog: pytest.LogCaptureFixture) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+import warnings
 import weakref
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ from typing import Any
 import cv2
 import pytest
 
-from gsmerge.runtime.threads import in_turn, parallel_map, use_threads, work_alone
+from gsmerge.runtime.threads import in_turn, parallel_map, quiet_warnings, use_threads, work_alone
 
 
 @pytest.fixture(autouse=True)
@@ -177,3 +178,16 @@ def test_the_error_of_the_first_item_comes_through() -> None:
 
     with use_threads(3), pytest.raises(KeyError, match="0"):
         parallel_map(fail, range(3))
+
+
+def test_blocks_without_warnings_that_overlap_leave_the_filters_as_they_were() -> None:
+    """With Python's own ``catch_warnings`` the filter of the second block would stay for good."""
+    first, second = quiet_warnings(), quiet_warnings()
+    before = list(warnings.filters)
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    with pytest.warns(UserWarning, match="of a user"):  # those of others are given
+        warnings.warn("of a user", stacklevel=1)
+    second.__exit__(None, None, None)
+    assert warnings.filters == before

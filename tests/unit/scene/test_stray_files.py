@@ -73,7 +73,7 @@ def read_once(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Loaded:
     monkeypatch.setattr("gsmerge.scene.read.load_scene", watched)
     scene = read_scene(folder)
     (loaded,) = seen
-    assert scene is loaded.scene
+    assert (scene.gaussians, scene.notes) == (loaded.scene.gaussians, loaded.notes)
     return loaded
 
 
@@ -202,3 +202,14 @@ def test_a_clip_is_no_film_of_the_capture(tiny_folder: Path, tiny: Tiny) -> None
     write_gaussians(small := tiny_folder / "small.spz", tiny.gaussians)
     write_inria(tiny_folder / "small.cameras.json", tiny)
     assert not noted(load_scene(small).notes, "film")
+
+
+@pytest.mark.parametrize(("share", "is_doubt"), [(0.005, False), (0.05, True)])
+def test_rows_far_from_their_pixels_are_doubted(tmp_path: Path, share: float, is_doubt: bool) -> None:
+    """As after a block of the file was replaced by another one."""
+    rows = export_rows(SMOOTH)
+    moved = np.random.default_rng(0).permutation(len(rows))[: int(share * len(rows))]
+    rows[moved] = rows[np.roll(moved, 1)]
+    loaded = load_scene(save_export(tmp_path / "scene", SMOOTH, rows))
+    assert loaded.scene.has_own_pixels
+    assert noted(loaded.doubts, "far from their own pixels", "copy or export it again") == is_doubt

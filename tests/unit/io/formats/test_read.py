@@ -13,7 +13,7 @@ from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
 from slow_readers import drawn, read_splat, read_spz
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, list_doubts
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.ply import header_content
@@ -502,6 +502,18 @@ def test_empty_rows_are_set_aside(tmp_path: Path, turned: bool) -> None:
     assert not actual.gaussians.opacities[[3, 7, 48]].any()
     assert not noted(file_notes(actual.info), "interrupted")
     assert noted(file_notes(actual.info), "3 empty rows")
+
+
+@pytest.mark.parametrize(("count", "is_doubt"), [(1, False), (2, True)])
+@pytest.mark.parametrize(("name", "value"), [("x", 1e14), ("scale_1", 40), ("f_dc_2", 1e7)])
+def test_files_with_more_than_stray_impossible_rows_are_doubted(
+    tmp_path: Path, name: str, value: float, count: int, is_doubt: bool
+) -> None:
+    rows = table_of(100)
+    rows[name][20 : 20 + count] = value
+    actual = read_ply(save(tmp_path / "a.ply", rows))
+    assert actual.info.num_nonfinite == count
+    assert noted(list_doubts(file_notes(actual.info)), f"{count} of 100 rows", "binary mode") == is_doubt
 
 
 @pytest.mark.parametrize(("last", "others", "broken"), [(30, 0, True), (30, 9, True), (3, 9, False), (1, 0, False)])
