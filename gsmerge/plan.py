@@ -192,7 +192,9 @@ def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | N
     size, asked, options, segment = prepared.size, filled.asked, filled.options, filled.segment
     keeps = keeps_fidelity(size, asked)
     target = FIDELITY_PSNR if keeps and size.rendered else asked.budget.target_psnr
-    choices = choose_for_scene(size, filled.counted, num_input=count_input(prepared), keeps=keeps)
+    has_repeats = len(prepared.scene) < len(prepared.input_scene)
+    num_input = prepared.input_scene.num_gaussians if has_repeats else None  # to which shares of a budget refer
+    choices = choose_for_scene(size, filled.counted, num_input=num_input, keeps=keeps)
     limits, pairs = choices.limits, checkpoint is None and choices.may_merge_pairs
     fit = _fit_photos(prepared, options, choices.fit)
     fit = _fit_renders(prepared, options, fit) if pairs else fit
@@ -232,11 +234,6 @@ def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | N
 def cuts_views(options: CompactOptions, size: SceneSize) -> bool:
     """Return whether a run cuts views into superpixels, which networks can correct; baselines use no networks."""
     return options.method == OURS and size.num_views > 0
-
-
-def count_input(prepared: Prepared) -> int | None:
-    """Return the number of Gaussians that shares of a budget refer to; None: that of the prepared scene."""
-    return prepared.input_scene.num_gaussians if len(prepared.scene) < len(prepared.input_scene) else None
 
 
 @dataclass(frozen=True)
@@ -283,13 +280,17 @@ def choose_for_scene(
     fit = replace(fit, fit_steps=steps, share=share, grow_steps=grow_steps)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
-    pairs = _can_merge_pairs(scene, options, networks)
+    # Neighbours are merged pair by pair, instead of superpixels, without views, or with no pictures other than renders.
+    # Settings of superpixels ask for superpixels, except for their number, which only says how many Gaussians there are
+    is_shown = scene.num_views > 0 and (not scene.rendered or options.changes_superpixels)
+    pairs = options.method == OURS and networks == "none" and not is_shown
     return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit, keeps, pairs)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     """Return the number of blocks for a scene; UsageError if it cannot be cut into the number that was asked for."""
-    problems = blocks_problems(scene, options)
+    shared = [] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]
+    problems = [*_uncut_settings(options), *shared]
     asked = wanted_blocks(options, scene.num_gaussians, scene.num_views)
     if options.blocks.blocks == "auto":
         asked = 1 if problems else min(scene.num_views, asked)
@@ -307,12 +308,6 @@ def usual_blocks(num_gaussians: int, num_views: int) -> int:
     if num_gaussians > WHOLE_GAUSSIANS:
         return -(-num_gaussians // BLOCK_GAUSSIANS)
     return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
-
-
-def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
-    """List the settings and facts that prevent cutting a scene into blocks."""
-    shared = [] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]
-    return [*_uncut_settings(options), *shared]
 
 
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
@@ -355,16 +350,6 @@ def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
         raise UsageError("drop sky: expected photos, which show where the sky is; name them with --images")
 
 
-def _can_merge_pairs(scene: SceneSize, options: CompactOptions, networks: str) -> bool:
-    """Return whether neighbours are merged pair by pair instead of superpixels.
-
-    They are if the scene has no views, or no pictures other than renders of it. Settings of superpixels ask for
-    superpixels, except for their number, which only says how many Gaussians there will be.
-    """
-    ours = options.method == OURS and networks == "none"
-    return ours and (scene.num_views == 0 or (scene.rendered and not options.changes_superpixels))
-
-
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:
     """Return whether a scene is merged by positions and colours only: it has no views, and no option needs any."""
     return len(scene) == 0 and not options.replaces_stages
@@ -395,16 +380,10 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
             f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
             " gsmerge lab train --preset paper makes them"
         )
-    require_children(options.decode.max_k, checkpoint)
-
-
-def require_children(count: int, checkpoint: Checkpoint | None) -> None:
-    """Raise UsageError if ``k`` exceeds the children that the networks make per group."""
-    if checkpoint is not None and count > checkpoint.networks.options.max_children:
-        raise UsageError(
-            f"k: expected at most {checkpoint.networks.options.max_children} with the absolute outputs of"
-            f" {checkpoint.path}, got {count}"
-        )
+    most, count = checkpoint.networks.options.max_children, options.decode.max_k
+    if count > most:
+        problem = f"k: expected at most {most} with the absolute outputs of {checkpoint.path}"
+        raise UsageError(f"{problem}, got {count}")
 
 
 def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:

@@ -188,7 +188,9 @@ def _shift(view: _View, columns: int) -> _View:
 
 def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _View:
     """Extend a view over the free rows before and after it, as long as its camera shows rows in the order of pixels."""
-    low, high = _free_range(free, view.rows)
+    first, last = view.rows[[0, -1]]
+    before, after = np.flatnonzero(~free[:first]), np.flatnonzero(~free[last:])
+    low, high = int(before[-1]) + 1 if len(before) else 0, int(last + after[0]) if len(after) else len(free)
     while True:
         top, lines = int(view.y.min()), int(np.ptp(view.y)) + 1
         reach = max(_MIN_AHEAD, int(_AHEAD * lines))
@@ -220,12 +222,6 @@ def follow_rows(
     ids, *scratch = (np.empty(size, dtype) for size, dtype in (*shapes, (views, np.int64), (views, np.int32)))
     follow_pixels(points, viewmats, Ks, ids, *scratch, width, height, int(mixed))
     return ids
-
-
-def _free_range(free: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
-    """Return the first row and the end of the free rows around ``rows``."""
-    before, after = np.flatnonzero(~free[: rows[0]]), np.flatnonzero(~free[rows[-1] :])
-    return int(before[-1]) + 1 if len(before) else 0, int(rows[-1] + after[0]) if len(after) else len(free)
 
 
 def _solve(points: np.ndarray, view: _View) -> _View:

@@ -22,10 +22,9 @@ from gsmerge.compaction.file_size import Rebuild, meet_bytes
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import can_try, try_new_views
-from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, search_count
-from gsmerge.errors import Doubt, DoubtWarning, TargetError, list_doubts
+from gsmerge.errors import Doubt, DoubtWarning, TargetError
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
@@ -87,7 +86,8 @@ def compact(
         400
     """
     result = compact_scene(scene, (options or CompactOptions()).with_settings(settings), progress)
-    _warn_of_doubts(result.report)
+    for text in filter(None, [*result.report.doubts, result.report.unmet]):
+        warnings.warn(text, DoubtWarning, stacklevel=3)  # the caller: above this function and its decorator
     return result
 
 
@@ -146,12 +146,6 @@ def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
     method = choose_method(options, scene)  # ours, ours for scenes without cameras, or a baseline
     prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses
     return compact_prepared(prepared, method, options).to(scene.gaussians.device)
-
-
-def _warn_of_doubts(report: CompactReport) -> None:
-    """Warn the caller of :func:`compact` of everything that makes the result doubtful."""
-    for text in filter(None, [*list_doubts(report.notes), report.unmet]):
-        warnings.warn(text, DoubtWarning, stacklevel=4)  # the caller: above this function, compact and its decorator
 
 
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:

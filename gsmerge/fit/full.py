@@ -49,7 +49,8 @@ def fit_full(
             score_fit(fit)
         renew_state(fit)
         take_step(fit)
-        report_step(fit)
+        if run.job.progress:
+            run.job.progress(fit.step, fit.steps, decibels(fit.error.mean), run.half_part)
     score_fit(fit)
     return end_fit(fit)
 
@@ -134,12 +135,6 @@ def take_step(fit: FullFit) -> None:
     fit.step, fit.last = step.number, progress
     if fit.step > fit.steps * (1 - run.job.options.tuning.average_share):
         fit.tail.add(fit.state.x)
-
-
-def report_step(fit: FullFit) -> None:
-    """Report progress after a step."""
-    if fit.run.job.progress:
-        fit.run.job.progress(fit.step, fit.steps, decibels(fit.error.mean), fit.run.half_part)
 
 
 def end_fit(fit: FullFit) -> FitResult:

@@ -455,7 +455,8 @@ def list_plys(folder: Path) -> list[Path]:
     6. a file with a usual name but without Gaussians, so that its reader reports what it lacks.
     """
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
-    plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
+    below = [] if plys else [place for place, names in _walk_down(folder, links=False) if names is None]
+    plys = plys or [ply for place in natural_order(below) for ply in _plys_in(place)]
     plys = plys or _results_in(folder)
     plys = plys or [path for path in [folder / META] if path.is_file() and may_hold_gaussians(path)]
     return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
@@ -464,11 +465,6 @@ def list_plys(folder: Path) -> list[Path]:
 def _plys_in(folder: Path) -> list[Path]:
     named = named_ply(folder)
     return other_plys(folder) if named is None else [named]
-
-
-def _scenes_below(folder: Path) -> list[Path]:
-    """List the folders of scenes below a folder, down to a limited depth; empty if there are too many entries."""
-    return natural_order(place for place, names in _walk_down(folder, links=False) if names is None)
 
 
 def list_folders(folder: Path) -> list[tuple[Path, list[str]]]:

@@ -183,7 +183,9 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
             return "GIF"
         if str(temporary).encode(errors="ignore") != os.fsencode(temporary):
             raise SceneError(path, "expected a folder whose name is UTF-8, as OpenCV needs it for videos", FOLDER)
-        even_frames = (_to_even(frame) for frame in frames)
+        even_frames = (
+            np.pad(frame, [(0, side % 2) for side in frame.shape[:2]] + [(0, 0)], mode="edge") for frame in frames
+        )
         first_frame = next(even_frames)
         writer, encoding = _open_writer(path, temporary, first_frame.shape, fps)
         written: list[Future[None]] = []
@@ -220,12 +222,6 @@ def _write_gif(path: Path, frames: Sequence[Picture], fps: float) -> None:
     paletted = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first_frame, *later_frames = paletted
     first_frame.save(path, "GIF", save_all=True, append_images=later_frames, duration=round(1000 / fps), loop=0)
-
-
-def _to_even(picture: Picture) -> Picture:
-    """Repeat the last row and column of a picture with odd sides."""
-    height, width = picture.shape[:2]
-    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
 def _open_writer(

@@ -7,7 +7,6 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -40,7 +39,8 @@ def view_page(data: ViewData) -> bytes:
     sources = _sources(data, has_photos)
     right = min(int(has_photos) + 1, len(sources) - 1)
     left = max(right - 1, 0)
-    stills = [_picture_uris((view.photo, *view.stills)[not has_photos :]) for view in data.shown]
+    pictures = [(view.photo, *view.stills)[not has_photos :] for view in data.shown]
+    stills = [[None if picture is None else data_uri(picture, "image/webp") for picture in row] for row in pictures]
     start_stills = stills[data.start]
     first = {source: start_stills[source] for source in (left, right)}  # in the HTML itself, to appear at once
     start_stills[left] = start_stills[right] = None
@@ -80,11 +80,6 @@ def view_page(data: ViewData) -> bytes:
         engine=base64_text(VIEWER.read_bytes()) if splats else None,
     )
     return page.encode()
-
-
-def _picture_uris(pictures: Sequence[bytes | None]) -> list[str | None]:
-    """Encode WebP pictures as ``data:`` addresses; None stays None."""
-    return [None if picture is None else data_uri(picture, "image/webp") for picture in pictures]
 
 
 def _sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:

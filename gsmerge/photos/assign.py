@@ -178,7 +178,9 @@ class Assigner:
         best = scores.best()[np.ix_(list(proposed), columns)]  # of each proposed view with each proposed photo
         own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)
         matched = _match(best)
-        least = _least_score(own[self.has_contrast[list(proposed)]])
+        # if the proposed photos together are right, half their median lies half-way from wrong pairs to right ones
+        with_contrast = own[self.has_contrast[list(proposed)]]
+        least = min(SIGNIFICANT, median(with_contrast) / 2) if _exceed_noise(with_contrast) else SIGNIFICANT
         for row, (view, assignment) in enumerate(proposed.items()):
             score, highest = own[row], max(best[row, row], best[row, matched[row]])
             correlation = scores.correlations[view, columns[row], assignment.orientation]
@@ -295,14 +297,6 @@ def assign_photos(
     for view in unknown:
         out[view] = results.get(view) or (out[view] if most_match else None)
     return out, are_alike
-
-
-def _least_score(scores: np.ndarray) -> float:
-    """Return the least score of a right photo, from the scores ``[n]`` of all proposed photos.
-
-    If the proposed photos together are right, it is half their median, half-way from wrong pairs to right pairs.
-    """
-    return min(SIGNIFICANT, median(scores) / 2) if _exceed_noise(scores) else SIGNIFICANT
 
 
 def _exceed_noise(scores: np.ndarray) -> bool:

@@ -115,7 +115,9 @@ def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
     def fit(group: Sequence[int]) -> None:
         group_pairs = pairs[group]
         shown = group_pairs.shown
-        toned[group] = _cross_fit(group_pairs.photos, shown.pictures, shown.weights, _tone_change)
+        toned[group] = _cross_fit(
+            group_pairs.photos, shown.pictures, shown.weights, lambda *pairs: partial(map_tones, fit_tones(*pairs))
+        )
 
     parallel_map(fit, groups)
     return cut_blocks(pairs.with_photos(toned))
@@ -123,7 +125,12 @@ def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
 
 def map_blocks(blocks: Blocks) -> Blocks:
     """Return blocks after a linear map of colours; see :func:`_cross_fit`."""
-    mapped = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _map_change)
+    mapped = _cross_fit(
+        blocks.photos,
+        blocks.pictures,
+        blocks.solid.astype(np.float32),
+        lambda *pairs: partial(map_colors, fit_map(*pairs)),
+    )
     return Blocks(mapped, blocks.pictures, blocks.solid)
 
 
@@ -131,14 +138,6 @@ def plain_blocks(blocks: Blocks) -> Blocks:
     """Return blocks of one colour, the mean colour of the Gaussians; see :func:`_cross_fit`."""
     plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _plain_change)
     return Blocks(plain, blocks.pictures, blocks.solid)
-
-
-def _tone_change(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:
-    return partial(map_tones, fit_tones(colors, targets, weights))
-
-
-def _map_change(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:
-    return partial(map_colors, fit_map(colors, targets, weights))
 
 
 def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:

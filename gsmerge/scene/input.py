@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +22,8 @@ def as_scene(scene: Scene | StrPath) -> Scene:
     if isinstance(scene, Scene):
         check_scene(scene)
     else:
-        scene = load_scene(scene).noted_scene
+        load = load_scene(scene)
+        scene = replace(load.scene, notes=load.notes)
     for text in scene.notes:
         note(text)
     return scene

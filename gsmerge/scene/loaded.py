@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.cameras import Alignment, Recovery
-from gsmerge.errors import SceneError, list_doubts
+from gsmerge.errors import list_doubts
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.arrays import FLAT_COMMENT
 from gsmerge.io.formats.read import FileInfo, kept_comments
@@ -39,17 +39,6 @@ class Loaded:
     stats: Mapping[Path, tuple[int, ...]] = field(default_factory=dict)  # of the files before they were read
     sha256: str | None = None  # of the files of Gaussians, one after the other; None if it was not asked for
     own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
-
-    def pixel_scene(self) -> Scene:
-        """Return the scene; SceneError with the reason if it does not have one Gaussian per pixel."""
-        if self.scene.has_own_pixels:
-            return self.scene
-        raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
-
-    @property
-    def noted_scene(self) -> Scene:
-        """The scene with the notes on how it was read."""
-        return replace(self.scene, notes=self.notes)
 
     @property
     def doubts(self) -> list[str]:

@@ -111,7 +111,7 @@ def read_scene(
     )
     for doubt in load.doubts:
         warnings.warn(doubt, DoubtWarning, stacklevel=3)  # the caller: above this function and its decorator
-    return load.noted_scene
+    return replace(load.scene, notes=load.notes)
 
 
 def load_scene(

@@ -10,9 +10,6 @@ def count_words(number: int, noun: str, rest: str = "") -> str:
         >>> count_words(1, "row"), count_words(1200, "row", "set aside")
         ('1 row', '1,200 rows set aside')
     """
-    return f"{number:,} {noun if number == 1 else _plural(noun)}" + (f" {rest}" if rest else "")
-
-
-def _plural(noun: str) -> str:
-    """Return the regular plural of a noun."""
-    return f"{noun}es" if noun.endswith("ch") else f"{noun}s"
+    return f"{number:,} {noun}{'' if number == 1 else 'es' if noun.endswith('ch') else 's'}" + (
+        f" {rest}" if rest else ""
+    )

@@ -216,7 +216,7 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
 
     if words.startswith("lab train --data"):
         pytest.importorskip("torch", reason="torch is not installed")
-    for name in ("compaction.files.compact", "pages.data.evaluate") if words not in NEED_THE_SCENE else ():
+    for name in ("compaction.files.compact_scene", "pages.data.evaluate") if words not in NEED_THE_SCENE else ():
         monkeypatch.setattr(f"gsmerge.{name}", work)
     monkeypatch.chdir(prepared)
     before = listing(prepared)

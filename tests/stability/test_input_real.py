@@ -42,4 +42,4 @@ def test_a_pruned_export_is_followed(exports: ModuleType, root: Path, tmp_path: 
     loaded = load_scene(ply)
     assert loaded.alignment.share_within_1px > 0.999
     assert loaded.recovery.frame.scale == pytest.approx(1 / 1.7, rel=2e-3)
-    assert loaded.pixel_scene().num_gaussians == loaded.info.count
+    assert loaded.scene.num_gaussians == loaded.info.count

@@ -55,7 +55,10 @@ def read_da3(source: CameraSource) -> StoredCameras:
     path = source.path
     size_names = () if holds_images(path) else _DEPTHS  # depths are read for their shape alone
     arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *size_names})
-    poses, Ks, images, depths = (_first(arrays, names) for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS))
+    poses, Ks, images, depths = (
+        next((arrays[name] for name in names if name in arrays), None)
+        for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS)
+    )
     if poses is None:
         raise _missing(path, [n for n, a in (("extrinsics", poses), ("intrinsics", Ks)) if a is None], arrays)
     poses = poses[0] if poses.ndim == 4 and len(poses) == 1 else poses
@@ -102,10 +105,6 @@ def holds_poses(path: Path) -> bool:
     """Return whether an npz holds poses and intrinsics; False if it cannot be read."""
     names = array_names(path)
     return {"c2w", "K"} <= names or not (names.isdisjoint(_EXTRINSICS) or names.isdisjoint(_INTRINSICS))
-
-
-def _first(arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray | None:
-    return next((arrays[name] for name in names if name in arrays), None)
 
 
 def _missing(path: Path, missing: list[str], arrays: dict[str, np.ndarray]) -> SceneError:

@@ -143,7 +143,8 @@ def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     blank = 1 - texture_mask(view.image)
     edge = edge_mask(depth)
     near_edge = cv2.dilate(edge, np.ones((3, 3), np.uint8))
-    bled = _bleed(depth, near_edge, noise)
+    smooth = blur(1 / depth, noise.bleed_width)
+    bled = 1 / (1 / depth + noise.bleed * near_edge * (smooth - 1 / depth))
     amplification = 1 + noise.blank * blank + 3 * is_beyond
     drift = noise.drift * smooth_noise(rng, height, width, int(rng.integers(3, 7)))
     patch = _wrong_patches(blank, noise, rng)
@@ -155,12 +156,6 @@ def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     doubt = 0.8 * near_edge + 0.5 * blank * noise.blank / 3 + 0.7 * patch * rng.uniform(0, 1) + 0.6 * is_beyond
     trust = noise.trust * np.clip(1 - doubt, 0, 1) + 0.06 * smooth_noise(rng, height, width, 9)
     return predicted.astype(np.float32), np.clip(np.where(floats, 0.5 * trust, trust), 0, 1).astype(np.float32)
-
-
-def _bleed(depth: Array, near_edge: Float, noise: Noise) -> Array:
-    """Blend inverse depth ``[h,w]`` at edges with its smoothed values; return depth."""
-    smooth = blur(1 / depth, noise.bleed_width)
-    return 1 / (1 / depth + noise.bleed * near_edge * (smooth - 1 / depth))
 
 
 def _wrong_patches(blank: Float, noise: Noise, rng: np.random.Generator) -> Float:

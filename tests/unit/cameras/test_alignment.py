@@ -38,7 +38,7 @@ def test_the_reading_that_fits_is_taken_and_said(tiny_folder: Path, tiny: Tiny, 
     rewrite_poses(tiny_folder, tiny, true)
     loaded = load_scene(tiny_folder, order="view-major")
     assert loaded.alignment.ok
-    assert np.allclose(loaded.pixel_scene().cameras.viewmats, tiny.w2c)
+    assert np.allclose(loaded.scene.cameras.viewmats, tiny.w2c)
     assert np.allclose(loaded.cameras.viewmats, tiny.w2c)
     assert loaded.cameras.convention == true
     assert loaded.notes == (
@@ -101,7 +101,7 @@ def test_rows_without_finite_positions_are_not_looked_at(tmp_path: Path, tiny: T
     start = data.index(b"end_header\n") + 11
     data[start + 5 * 68 : start + 5 * 68 + 4] = np.float32(np.nan).tobytes()
     (folder / "scene.ply").write_bytes(data)
-    assert load_scene(folder, order="view-major").pixel_scene().pixels.shown.sum() == 839
+    assert load_scene(folder, order="view-major").scene.pixels.shown.sum() == 839
 
 
 def test_poses_that_fit_in_no_reading(tmp_path: Path) -> None:

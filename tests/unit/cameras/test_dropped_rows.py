@@ -24,7 +24,7 @@ def test_dropped_pixels(tmp_path: Path, dropped: float | str, size: tuple[int, i
         kept = np.flatnonzero(tiny.gaussians.opacities > 0.1)
     else:
         kept = np.flatnonzero(np.random.default_rng(3).random(len(tiny.gaussians)) > float(dropped))
-    scene = load_scene(save_export(tmp_path, tiny, export_rows(tiny, kept))).pixel_scene()
+    scene = load_scene(save_export(tmp_path, tiny, export_rows(tiny, kept))).scene
     actual = np.flatnonzero(scene.pixels.shown.reshape(-1))
     assert len(np.setxor1d(actual, kept)) < 0.01 * len(kept)
     same = np.intersect1d(actual, kept)

@@ -52,7 +52,7 @@ def test_photos_larger_than_cameras_and_grid(tmp_path: Path) -> None:
         write_photos(folder, SMOOTH, photos)
         write_npz(folder / "results.npz", SMOOTH, image=None, depth=np.ones((3, 36, 48), np.float32))
         loaded = load_scene(folder, images=folder / "images", order="view-major")
-        scene = loaded.pixel_scene()
+        scene = loaded.scene
         assert np.abs(scene.images * 255 - SMOOTH.images).mean() < 8, name
         assert any(note.startswith("photos of 110 x ") for note in loaded.notes), name
 
@@ -62,7 +62,7 @@ def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
     SMOOTH.save(tmp_path)
     write_cameras(tmp_path, SMOOTH, K, (96, 54))
     loaded = load_scene(tmp_path, order="view-major")
-    assert np.allclose(loaded.pixel_scene().cameras.Ks, SMOOTH.K)
+    assert np.allclose(loaded.scene.cameras.Ks, SMOOTH.K)
     assert loaded.notes == ("cameras of 96 x 54 are resized and centre-cropped to 48 x 36, the images' size",)
 
 
@@ -84,7 +84,7 @@ def test_sizes_that_are_twice_a_principal_point(tmp_path: Path, tiny: Tiny) -> N
     folder = tiny.save(tmp_path / "scene")
     write_cameras(folder, tiny, tiny.K, (tiny.width + 1, tiny.height))
     loaded = load_scene(folder)
-    assert np.allclose(loaded.pixel_scene().cameras.Ks, tiny.K)
+    assert np.allclose(loaded.scene.cameras.Ks, tiny.K)
     assert not noted(loaded.notes, "scaled")
 
 
@@ -93,11 +93,11 @@ def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:
     folder = tiny.save(tmp_path / "scene")
     for size in ((20, 14), (0, 0)):
         write_cameras(folder, tiny, small, size)
-        assert np.allclose(load_scene(folder).pixel_scene().cameras.Ks, tiny.K)
+        assert np.allclose(load_scene(folder).scene.cameras.Ks, tiny.K)
     (folder / "transforms.json").unlink()
     (folder / "camera_poses.txt").write_text("\n".join(" ".join(map(str, p.reshape(-1))) for p in tiny.c2w))
     (folder / "intrinsic.txt").write_text(f"{small[0, 0]} {small[1, 1]} {small[0, 2]} {small[1, 2]}")
-    assert np.allclose(load_scene(folder).pixel_scene().cameras.Ks, tiny.K)
+    assert np.allclose(load_scene(folder).scene.cameras.Ks, tiny.K)
 
 
 def test_short_intrinsics_in_pixels_stay() -> None:

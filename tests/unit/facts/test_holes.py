@@ -163,7 +163,7 @@ def test_dropped_pixels_are_filled_with_cameras(tmp_path: Path, photos: bool) ->
     """Rows of Depth Anything 3 with cameras in the place of its depth maps, with photos or their own colours."""
     tiny = smooth_scene(96, 72)
     folder = save_export(tmp_path, tiny, export_rows(tiny, da3_rows(tiny)))
-    loaded = load_scene(folder).pixel_scene()
+    loaded = load_scene(folder).scene
     scene = loaded if photos else replace(loaded, images=None)
     assert np.array_equal(np.flatnonzero(scene.pixels.shown.reshape(-1)), da3_rows(tiny))
     with record_run() as record:

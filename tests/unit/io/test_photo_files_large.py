@@ -165,7 +165,7 @@ def test_memory_is_bounded_before_pixels_are_known(tmp_path: Path, monkeypatch: 
 def test_photos_that_may_be_the_grid_are_never_resized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 0)
     loaded = load_scene(save(tmp_path, shuffled=False, tiny=SMOOTH), max_side=16)
-    assert loaded.pixel_scene().pixels.shown.all()
+    assert loaded.scene.pixels.shown.all()
     assert loaded.notes == ()
 
 

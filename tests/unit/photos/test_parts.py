@@ -51,7 +51,7 @@ def test_a_part_that_fits_is_cut_out(tmp_path: Path, name: str) -> None:
     change, words = CASES[name]
     write_photos(tmp_path, change)
     loaded = load_scene(tmp_path)
-    images = loaded.pixel_scene().images
+    images = loaded.scene.images
     assert noted(loaded.notes, *words)
     assert images is not None
     assert np.abs(images * 255 - SMOOTH.images).mean() < 6
@@ -78,7 +78,7 @@ def test_photos_decide_whether_colors_are_rgb(tmp_path: Path, as_rgb: bool, leas
     path.write_bytes(path.read_bytes().replace(b"comment opacity: logit\n", b""))  # as of another program
     loaded = load_scene(tmp_path)
     assert noted(loaded.notes, "colors=sh") == as_rgb
-    shown = sh0_to_rgb(loaded.pixel_scene().gaussians.sh0).reshape(photos.shape)
+    shown = sh0_to_rgb(loaded.scene.gaussians.sh0).reshape(photos.shape)
     assert np.abs(255 * shown - photos).max() < 2
 
 
@@ -89,7 +89,7 @@ def test_masks_and_larger_photos_are_cut_alike(tmp_path: Path) -> None:
     mask[:, 144:] = 255  # the right half of the right picture
     for name in SMOOTH.names:
         assert cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), mask)
-    scene = load_scene(tmp_path).pixel_scene()
+    scene = load_scene(tmp_path).scene
     assert scene.masks is not None
     assert scene.masks[:, :, 24:].all()
     assert not scene.masks[:, :, :24].any()

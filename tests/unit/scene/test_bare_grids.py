@@ -45,7 +45,7 @@ def test_the_views_of_a_grid(tmp_path: Path, order: str, size: tuple[int, int]) 
     ids = np.arange(3 * width * height).reshape(3, height, width)
     kept = ORDERS[order](ids)
     loaded = read_bare(tmp_path, tiny, kept)
-    scene = loaded.pixel_scene()
+    scene = loaded.scene
     trim = 5 if order == "trimmed" else 8 if order.startswith("trimmed") else 0
     views = [1] if order == "one view" else [0, 1, 2]
     assert (scene.cameras.width, scene.cameras.height) == (width - 2 * trim, height - 2 * trim)
@@ -64,7 +64,7 @@ def test_intrinsics_as_complex_as_the_rows_show(tmp_path: Path, changed: tuple[f
     fx, fy, cx, cy = changed
     tiny = made(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     loaded = read_bare(tmp_path, tiny, np.arange(len(tiny.gaussians)))
-    Ks = loaded.pixel_scene().cameras.Ks
+    Ks = loaded.scene.cameras.Ks
     assert np.allclose(Ks[:, (0, 1, 0, 1), (0, 1, 2, 2)], changed, atol=0.6)
     assert (Ks == Ks[0]).all()
 
@@ -77,7 +77,7 @@ def test_focal_lengths_of_the_views_differ(tmp_path: Path) -> None:
     means[: WIDTH * HEIGHT] = made(longer).gaussians.means[: WIDTH * HEIGHT]
     tiny = replace(tiny, gaussians=replace(tiny.gaussians, means=means))
     loaded = read_bare(tmp_path, tiny, np.arange(len(means)))
-    assert np.allclose(loaded.pixel_scene().cameras.Ks[:, 0, 0], [130, 110, 110], rtol=0.01)
+    assert np.allclose(loaded.scene.cameras.Ks[:, 0, 0], [130, 110, 110], rtol=0.01)
     assert noted(loaded.notes, "focal", "differ")
 
 
@@ -86,7 +86,7 @@ def test_rows_that_are_no_numbers(tmp_path: Path) -> None:
     means = tiny.gaussians.means.copy()
     means[np.random.default_rng(0).random(len(means)) < 0.1] = np.nan
     loaded = read_bare(tmp_path, replace(tiny, gaussians=replace(tiny.gaussians, means=means)), np.arange(len(means)))
-    assert np.allclose(loaded.pixel_scene().cameras.Ks[:, 0, 0], 110, rtol=0.01)
+    assert np.allclose(loaded.scene.cameras.Ks[:, 0, 0], 110, rtol=0.01)
 
 
 def test_rows_that_are_no_grid(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_photos_of_any_size(tmp_path: Path, larger: int, margin: int, trim: int)
     tiny = made()
     ids = np.arange(3 * WIDTH * HEIGHT).reshape(3, HEIGHT, WIDTH)[:, trim : HEIGHT - trim, trim : WIDTH - trim]
     write_photos(tmp_path / "images", tiny, larger, margin)
-    scene = read_bare(tmp_path, tiny, ids).pixel_scene()
+    scene = read_bare(tmp_path, tiny, ids).scene
     assert scene.images is not None
     assert scene.images.shape == tiny.images.shape
     assert np.abs(scene.images * 255.0 - tiny.images).mean() < 2
@@ -144,7 +144,7 @@ def test_photos_are_told_by_their_colors(tmp_path: Path) -> None:
     write_photos(tmp_path / "images", tiny, 2, 10)
     noise = np.random.default_rng(0).integers(0, 256, (2 * HEIGHT, 2 * (WIDTH + 20), 3), np.uint8)
     cv2.imwrite(str(tmp_path / "images" / "00.png"), cv2.GaussianBlur(noise, (0, 0), 9))
-    scene = read_bare(tmp_path, tiny, np.arange(len(tiny.gaussians))).pixel_scene()
+    scene = read_bare(tmp_path, tiny, np.arange(len(tiny.gaussians))).scene
     assert scene.names == ("0.png", "1.png", "2.png")
 
 

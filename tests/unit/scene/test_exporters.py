@@ -31,8 +31,8 @@ def test_orders(tmp_path: Path, smooth: Tiny, order: str, axes: tuple[int, int, 
     path = save_export(tmp_path, smooth, export_rows(smooth, index.transpose(axes).reshape(-1)))
     loaded = load_scene(path)
     assert loaded.recovery.layout.order == order
-    assert home(loaded.pixel_scene(), smooth) == 1
-    assert home(load_scene(path, order=order).pixel_scene(), smooth) == 1
+    assert home(loaded.scene, smooth) == 1
+    assert home(load_scene(path, order=order).scene, smooth) == 1
 
 
 def test_columns_before_lines_have_cameras_alone(tmp_path: Path, smooth: Tiny) -> None:
@@ -48,7 +48,7 @@ def test_some_of_the_views(tmp_path: Path, smooth: Tiny, views: tuple[int, ...])
     """Cameras and photos of the others stay."""
     size = smooth.height * smooth.width
     index = np.concatenate([np.arange(size) + view * size for view in views])
-    scene = load_scene(save_export(tmp_path, smooth, export_rows(smooth, index))).pixel_scene()
+    scene = load_scene(save_export(tmp_path, smooth, export_rows(smooth, index))).scene
     assert np.array_equal(np.flatnonzero(scene.pixels.shown), index)
     assert len(scene.photo_views) == 3
 
@@ -61,7 +61,7 @@ def test_a_world_moved_by_any_similarity(tmp_path: Path, smooth: Tiny, layers: i
     rows = turned(export_rows(smooth, index), turn, scale=1 / 3, shift=np.array([0.3, 0.1, -0.2]))
     rows["opacity"] = smooth.gaussians.opacities[index]
     loaded = load_scene(save_export(tmp_path, smooth, rows))
-    assert home(loaded.pixel_scene(), smooth) == 1
+    assert home(loaded.scene, smooth) == 1
     assert loaded.recovery.frame.scale == pytest.approx(1 / 3, rel=5e-3)
     assert np.allclose(loaded.scene.cameras.viewmats[:, :3, :3], smooth.w2c[:, :3, :3] @ turn.T, atol=5e-3)
     assert noted(loaded.notes, "cameras", "rotated", "scaled")
@@ -139,7 +139,7 @@ def test_views_dumped_from_a_model(tmp_path: Path, smooth: Tiny, root: Path) -> 
     }
     for name, changes in forms.items():
         loaded = load_scene(dump_of(smooth, tmp_path / name, root, **changes))
-        scene = loaded.pixel_scene()
+        scene = loaded.scene
         assert home(scene, smooth) == 1, name
         assert loaded.cameras.source == "dump of a model"
         assert np.allclose(scene.cameras.Ks, smooth.K)

@@ -41,7 +41,7 @@ def test_poses_of_the_user(tmp_path: Path, aligned: bool) -> None:
     save_export(tmp_path / "gs_ply", tiny, rows, cameras=False, name="0000.ply")
     write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths.astype(np.float32))
     loaded = load_scene(tmp_path / "gs_ply/0000.ply")
-    scene = loaded.pixel_scene()
+    scene = loaded.scene
     same = np.abs(of_pixels(scene, "opacities") - tiny.gaussians.opacities) < 1e-5
     assert same[da3_rows(tiny)].mean() > 0.99
     assert loaded.alignment.worst_px < 0.5
@@ -54,7 +54,7 @@ def test_arrays_as_the_demo_names_them(tmp_path: Path) -> None:
     np.savez(tmp_path / "predictions.npz", images=tiny.images.transpose(0, 3, 1, 2) / 255.0, depths=tiny.depths,
              conf=tiny.depths, extrinsics=tiny.w2c[:, :3], intrinsics=np.tile(K, (3, 1, 1)))  # fmt: skip
     loaded = load_scene(tmp_path, cameras=tmp_path / "predictions.npz")
-    assert home(loaded.pixel_scene(), tiny) == 1
+    assert home(loaded.scene, tiny) == 1
     assert loaded.scene.images is not None
 
 
@@ -121,7 +121,7 @@ def test_all_elements_of_sharp(tmp_path: Path, legacy: bool) -> None:
     else:
         write_elements(tmp_path / "photo.ply", rows, pose.reshape(-1), K.reshape(-1), size)
     loaded = load_scene(tmp_path / "photo.ply")
-    scene = loaded.pixel_scene()
+    scene = loaded.scene
     assert scene.pixels.shown.shape == (1, 36, 36)
     assert np.allclose(scene.cameras.Ks[0], square.K, atol=1e-4)
     assert np.allclose(scene.cameras.viewmats, pose, atol=1e-6)
@@ -144,7 +144,7 @@ def test_sharp_turns_photos_upright(tmp_path: Path, tag: int) -> None:
     exif = Image.Exif()
     exif[274] = tag
     Image.fromarray(np.rot90(upright, turns).copy()).save(tmp_path / "photo.jpg", quality=100, subsampling=0, exif=exif)
-    scene = load_scene(tmp_path / "photo.ply").pixel_scene()
+    scene = load_scene(tmp_path / "photo.ply").scene
     small = cv2.resize(upright, (36, 36), interpolation=cv2.INTER_AREA)
     assert np.abs(scene.images[0] * 255 - small).mean() < 1.5
     large = scene.large_photos
@@ -153,7 +153,7 @@ def test_sharp_turns_photos_upright(tmp_path: Path, tag: int) -> None:
     # a photo that was turned already, whose tag was left as it was
     if tag in (6, 8):
         Image.fromarray(upright).save(tmp_path / "photo.jpg", quality=100, subsampling=0, exif=exif)
-        again = load_scene(tmp_path / "photo.ply").pixel_scene()
+        again = load_scene(tmp_path / "photo.ply").scene
         assert np.abs(again.images[0] * 255 - small).mean() < 1.5
 
 
@@ -169,7 +169,7 @@ def test_image_ids_in_another_order_than_names(tmp_path: Path) -> None:
     for number, entry in zip((12, 3, 9), entries, strict=True):
         entry[0] = " ".join([str(number), *entry[0].split(" ")[1:]])
     (tmp_path / "sparse/images.txt").write_text("\n".join(line for i in (1, 2, 0) for line in entries[i]) + "\n")
-    scene = load_scene(tmp_path).pixel_scene()
+    scene = load_scene(tmp_path).scene
     order = [SMOOTH.names.index(name) for name in scene.names]
     assert np.allclose(scene.cameras.viewmats, SMOOTH.w2c[order], atol=1e-6)
     assert np.array_equal((scene.images * 255).round(), SMOOTH.images[order])

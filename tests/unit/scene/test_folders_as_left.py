@@ -162,7 +162,7 @@ def test_long_lrm_s_folders(tmp_path: Path, frames: bool) -> None:
         save_export(export.path, export.scene, export.rows, cameras=False, name="gaussians_001.ply")
     loaded = load_scene(export.path, **options)
     if frames:
-        check_pixels(loaded.pixel_scene(), export)
+        check_pixels(loaded.scene, export)
     check_cameras(loaded.scene, export)
     assert loaded.alignment is not None
     assert loaded.alignment.worst_px < 0.5

@@ -51,7 +51,7 @@ def test_all_views_have_poses_and_photos(
 ) -> None:
     moved, write = kind
     loaded = read_with(tmp_path, registered(views, moved=moved), write, SMOOTH, index)
-    scene, missing = loaded.pixel_scene(), [name for view, name in enumerate(SMOOTH.names) if view not in views]
+    scene, missing = loaded.scene, [name for view, name in enumerate(SMOOTH.names) if view not in views]
     assert np.allclose(scene.cameras.centres, SMOOTH.c2w[:, :3, 3], atol=0.03)
     assert len(scene.photo_views) == 3
     assert not loaded.doubts
@@ -62,7 +62,7 @@ def test_all_views_have_poses_and_photos(
 @pytest.mark.parametrize("photos", [[0], []])
 def test_photos_of_these_views_may_be_missing_too(tmp_path: Path, photos: list[int]) -> None:
     loaded = read_with(tmp_path, registered([0]), write_transforms, registered(photos) if photos else None, ALL)
-    assert len(loaded.pixel_scene()) == 3
+    assert len(loaded.scene) == 3
     assert len(loaded.scene.photo_views) == len(photos)
     assert noted(loaded.notes, "2 of 3", "transforms.json", *(["view 1", "view 2"] if photos else []))
 
@@ -73,7 +73,7 @@ def test_cameras_of_another_scene_are_left_out(tmp_path: Path) -> None:
     other.c2w[:, :3, 3] += 50
     loaded = read_with(tmp_path, other, write_transforms, None, ALL)
     assert names(str(loaded.doubts), "transforms.json", "left out")
-    assert len(loaded.pixel_scene()) == 3
+    assert len(loaded.scene) == 3
 
 
 @pytest.mark.parametrize("views", [[0, 1], [0, 1, 2]])

@@ -70,7 +70,7 @@ def test_cameras_and_photos_of_all_views(tmp_path: Path, name: str) -> None:
     check_cameras(loaded.scene, export)
     assert MARKED.get(name, "") in {"", *(exporter.name for exporter in loaded.exporters)}
     if name in PIXELS:
-        check_pixels(loaded.pixel_scene(), export)
+        check_pixels(loaded.scene, export)
         return
     means = np.stack([export.rows[axis] for axis in "xyz"], 1)
     is_there = (export.opacities >= 1 / 255) & ~((means == 0).all(1) & (name == "VolSplat"))
@@ -83,7 +83,7 @@ def test_cameras_of_a_grid_without_photos(tmp_path: Path, name: str) -> None:
     export = MODELS[name](tmp_path / "out")
     loaded = load_scene(export.path, **export.options)
     ranks = np.unique(export.pixels, return_inverse=True)[1].reshape(-1)
-    check_pixels(loaded.pixel_scene(), replace(export, pixels=ranks))
+    check_pixels(loaded.scene, replace(export, pixels=ranks))
     assert loaded.alignment is not None
     assert loaded.alignment.worst_px < 0.5
 

@@ -115,7 +115,7 @@ def test_rows_with_nan_keep_the_order(tmp_path: Path, tiny: Tiny) -> None:
 def test_rows_in_the_order_of_the_names_of_views(tiny_folder: Path, tiny: Tiny) -> None:
     """2, 10, 11: numbers, not letters; cameras are in another order."""
     rewrite(tiny_folder / "transforms.json", lambda data: data["frames"].reverse())
-    scene = load_scene(tiny_folder).pixel_scene()
+    scene = load_scene(tiny_folder).scene
     assert scene.names == tuple(f"images/{n}" for n in tiny.names[::-1])
     assert np.allclose(scene.cameras.viewmats, tiny.w2c[::-1])
     assert np.array_equal((scene.images * 255).round(), tiny.images[::-1])

@@ -139,7 +139,7 @@ def test_photos_are_undistorted_and_it_is_said(tmp_path: Path, kind: str) -> Non
     else:
         write_colmap_binary(tmp_path / "sparse", SMOOTH, 4, tuple(coefficients))
     loaded = load_scene(tmp_path)
-    scene = loaded.pixel_scene()
+    scene = loaded.scene
     assert loaded.notes == ("the photos are undistorted (OPENCV); the intrinsics stay",)
     assert np.allclose(scene.cameras.Ks, SMOOTH.K)
     inner = np.s_[:, 6:-6, 6:-6]
