@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,11 +14,13 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import read_budget, read_lines
+from gsmerge.io.cameras.foreign import CAMERA_PLACES
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import natural_order
 from gsmerge.io.no_gaussians import find_remedy
 from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
+from gsmerge.runtime.record import list_some
 from gsmerge.values.words import count_words
 
 NamedScene = tuple[Path, Path | None]  # a scene, and the folder that the user named; None if that was the scene itself
@@ -26,6 +28,8 @@ MAX_FOLDERS = 100_000  # folders without a scene after the last scene; a link in
 _JOB_BYTES = 700  # memory for each scene of a list
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
+# Names in a folder that looks like a scene, without .ply; a folder with such a name is part of one
+_LOOKS = {place.split("/")[0].removesuffix(".ply") for place in (*PLY_PLACES, *IMAGE_PLACES, *CAMERA_PLACES)}
 
 
 def scene_plys(scene: Path) -> list[Path]:
@@ -50,15 +54,35 @@ def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
     return (scene for scene, _ in find_named_scenes(arguments, out))
 
 
-def find_named_scenes(arguments: Sequence[str], out: Path) -> Iterator[NamedScene]:
+def count_links(path: Path) -> int:
+    """Count the symbolic links in a path. Of several paths to a scene, that with the fewest names it."""
+    return sum(map(os.path.islink, (path.absolute(), *path.absolute().parents)))
+
+
+def describe_lost(looks: Sequence[str], scenes: Collection[str]) -> list[str]:
+    """Note the folders beside scenes with photos or cameras that look like them, but are none, nor have any below."""
+    above = {str(folder) for scene in scenes for folder in (Path(scene), *Path(scene).parents)}
+    beside = {os.path.dirname(folder) for folder in looks if folder in scenes}
+    lost = [
+        folder for folder in looks
+        if os.path.dirname(folder) in beside and folder not in above and os.path.basename(folder) not in _LOOKS
+    ]  # fmt: skip
+    return [
+        f"no Gaussians are read from {count_words(len(lost), 'folder')} beside the scenes: {list_some(lost)};"
+        " inspect says why"
+    ][: len(lost)]
+
+
+def find_named_scenes(arguments: Sequence[str], out: Path, looks: list[str] | None = None) -> Iterator[NamedScene]:
     """Yield the scenes of all arguments, in natural order within each argument; a scene may come twice.
 
-    A folder that cannot be read counts as a scene, so that reading it reports the reason. SceneError if an argument
-    does not exist, has no scene, or has too many folders without a scene; UsageError if it is the output folder.
+    A folder that cannot be read counts as a scene, so that reading it reports the reason. Links to folders come after
+    the folders. ``looks`` gets the folders that have photos, cameras or names of scenes. SceneError if an argument does
+    not exist, has no scene, or has too many folders without a scene; UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in arguments:
-        path, search = Path(argument), _Search(skip)
+        path, search = Path(argument), _Search(skip, [] if looks is None else looks)
         if path.is_dir():
             if os.path.realpath(path) == skip:
                 raise UsageError(
@@ -100,36 +124,41 @@ class _Search:
     """Search of one argument; it enters each folder once, even if several links lead to it."""
 
     skip: str  # real path of the output folder, which is not searched
+    looks: list[str]  # folders with photos or cameras, and others with files named like those of scenes
     seen: set[str] = field(default_factory=set)  # real paths of the folders entered so far
     num_empty: int = 0  # folders since the last scene
 
     def walk(self, top: Path) -> Iterator[NamedScene]:
         """Yield the scenes in a folder, or the folder itself if it has a scene file with a usual name."""
-        unreadable: list[NamedScene] = []  # reading such a folder reports the reason
-
-        def note_error(error: OSError) -> None:
-            unreadable.append((Path(error.filename), top))
-
-        for folder, folders, files in os.walk(top, followlinks=True, onerror=note_error):
-            yield from unreadable
-            unreadable.clear()
+        errors: list[OSError] = []  # reading such a folder reports the reason
+        starts = [top]  # links come after all folders
+        for folder, folders, files in (entry for start in starts for entry in os.walk(start, onerror=errors.append)):
+            yield from ((Path(error.filename), top) for error in errors)
+            errors.clear()
             current, names, real = Path(folder), [*folders, *files], os.path.realpath(folder)
             if real == self.skip or real in self.seen:
                 folders.clear()
                 continue
             self.seen.add(real)
-            self.num_empty += 1
-            if self.num_empty > MAX_FOLDERS:
-                problem = f"expected scenes, found more than {MAX_FOLDERS:,} folders without one"
-                raise SceneError(folder, problem, "name the folders of the scenes, or a list of them")
             is_scene = _is_scene(current, names)
-            omitted = SCENE_PARTS if is_scene else ()
-            folders[:] = natural_order(name for name in folders if not name.startswith(".") and name not in omitted)
+            folders[:] = natural_order(
+                name for name in folders if not name.startswith(".") and not (is_scene and name in SCENE_PARTS)
+            )
+            starts += [current / name for name in folders if os.path.islink(current / name)]
+            self.looks += [str(current)] * any(
+                (name if is_scene else name.lower().split(".ply")[0]) in _LOOKS
+                for name in names  # scene.ply.part
+            )
             scenes = [current] if is_scene else _other_scenes(current, names)
             scenes += [current / name for name in natural_order(files) if not is_scene and _is_packed(current / name)]
-            self.num_empty = 0 if scenes else self.num_empty
+            self.num_empty = 0 if scenes else self.num_empty + 1
+            if self.num_empty > MAX_FOLDERS:
+                raise SceneError(
+                    folder, f"expected scenes, found more than {MAX_FOLDERS:,} folders without one",
+                    "name the folders of the scenes, or a list of them",
+                )  # fmt: skip
             yield from ((scene, top) for scene in scenes)
-        yield from unreadable
+        yield from ((Path(error.filename), top) for error in errors)
 
 
 def _is_packed(path: Path) -> bool:
@@ -175,8 +204,8 @@ def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
     anchor = Path(pattern).anchor
     found = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
     named = Path(pattern).parts  # other parts with a dot in front are hidden
-    for name in natural_order(str(p) for p in found if all(part[:1] != "." or part in named for part in p.parts)):
-        path = Path(name)
+    shown = (str(p) for p in found if all(part[:1] != "." or part in named for part in p.parts))
+    for path in sorted(map(Path, natural_order(shown)), key=count_links):
         if path.is_dir():
             yield from search.walk(path)
         elif may_hold_gaussians(path) and search.skip not in map(str, Path(os.path.realpath(path)).parents):
@@ -195,10 +224,8 @@ def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:
             )
         lines[line.strip()] = None
         budget.check_memory(_JOB_BYTES * len(lines), count_words(len(lines), "scene"))
-    for entry in lines:
-        if not entry or entry.startswith("#"):
-            continue
-        path = file.parent / os.path.expanduser(entry)
+    paths = [file.parent / os.path.expanduser(entry) for entry in lines if entry and not entry.startswith("#")]
+    for path in sorted(paths, key=count_links):
         if not os.path.isdir(path):
             yield path, None
         elif os.path.realpath(path) not in search.seen:

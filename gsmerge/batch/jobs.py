@@ -9,7 +9,7 @@ from pathlib import Path
 from string import Formatter
 from typing import Any
 
-from gsmerge.batch.find import find_named_scenes, main_file, scene_plys
+from gsmerge.batch.find import count_links, find_named_scenes, main_file, scene_plys
 from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import OUTPUT_FORMATS
@@ -143,11 +143,19 @@ class Job:
         return find_scene_files(Path(self.scene), **places, within=self.within)
 
 
-def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, results: Collection[str] = ()) -> list[Job]:
+def find_jobs(
+    arguments: Sequence[str],
+    out: Path,
+    options: BatchOptions,
+    results: Collection[str] = (),
+    looks: list[str] | None = None,
+) -> list[Job]:
     """Find all scenes, each once, and name their results in the output folder.
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
-    line. ``results`` has the real paths of former results, which are not scenes. A result that would have the name of
+    line. ``results`` has the real paths of former results, which are not scenes. ``looks`` gets the folders
+    that look like scenes, for :func:`describe_lost`. A scene to which several paths lead is named by
+    that with the fewest links. A result that would have the name of
     another result or of a scene's file is a ``clash`` of its job. SceneError if an argument does not exist or has no
     scene, if cameras, photos or masks for all scenes do not exist, or if networks cannot be used.
     """
@@ -159,8 +167,9 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
     jobs: list[Job] = []
     owners: dict[str, list[str]] = {}  # scenes by the name of a result
     inputs: set[str] = set()
-    for scene, within in find_named_scenes(arguments, out):
-        real = os.path.realpath(main_file(scene))
+    found = [(main_file(scene), scene, within) for scene, within in find_named_scenes(arguments, out, looks)]
+    for file, scene, within in sorted(found, key=lambda entry: count_links(entry[0])):
+        real = os.path.realpath(file)
         if real in inputs or real in results:
             continue
         inputs.add(real)

@@ -27,6 +27,7 @@ class DoneResult:
     files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each file
     scene: str  # its path, as it was given
     doubts: tuple[str, ...] = ()  # notes that make it doubtful
+    unmet: str | None = None  # why a target is not met
 
     def holds(self, folder: Path, key: str) -> bool:
         """Return whether the result has this key and all its files are unchanged."""
@@ -71,8 +72,8 @@ class RecordIndex:
 def _read_result(line: Mapping[str, Any]) -> DoneResult:
     """Read a record of a result; KeyError, TypeError or AttributeError if it is damaged."""
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
-    doubts = tuple(map(_text, line.get("doubts", ())))
-    return DoneResult(_text(line["key"]), files, _text(line["scene"]), doubts)
+    doubts, unmet = tuple(map(_text, line.get("doubts", ()))), _text(line.get("unmet") or "") or None
+    return DoneResult(_text(line["key"]), files, _text(line["scene"]), doubts, unmet)
 
 
 def _text(value: Any) -> str:
@@ -84,7 +85,7 @@ def _text(value: Any) -> str:
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
     """Make a record of ``facts`` with all keys that a record has."""
-    blank: dict[str, Any] = {"key": None, "files": [], "error": None, "doubts": [], "report": None}
+    blank: dict[str, Any] = {"key": None, "files": [], "error": None, "doubts": [], "unmet": None, "report": None}
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **facts}
 
 

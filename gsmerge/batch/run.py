@@ -81,9 +81,18 @@ def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> li
             key = job.call.key(job.find_files())
             if options.overwrite or known is None or not known.holds(folder, key):
                 pending.append((job, refusal(job, folder, known, key, overwrite=options.overwrite)))
-        except SceneError as error:
-            pending.append((job, str(error)))
+        except Exception as error:  # as in the run, it fails alone
+            pending.append((job, _record_failure(job, folder, error_line(error))["error"]))
     return pending
+
+
+def _record_failure(job: Job, folder: Path, reason: str) -> dict[str, Any]:
+    """Make the record of a failure, which says if an earlier result of the scene stays."""
+    known = read_index(folder).read_on().results.get(job.output)
+    is_kept = known is not None and known.scene == job.scene and os.path.lexists(folder / job.output)
+    return record(
+        FAILED, job.scene, job.output, error=reason + f"; its earlier result {folder / job.output} stays" * is_kept
+    )
 
 
 def refusal(
@@ -91,7 +100,7 @@ def refusal(
 ) -> str | None:
     """Return why a result must not be made, or None; ``begun``: the existing file may be from a killed run."""
     names = () if known is None else [file["path"] for file in known.files]
-    foreign = [name for name in job.outputs if os.path.lexists(folder / name) and name not in names]
+    foreign = [folder / name for name in job.outputs if os.path.lexists(folder / name) and name not in names]
     (scene, _, settings), former = key.partition("."), ("" if known is None else known.key).partition(".")
     if job.clash and (foreign or former[0] != scene):
         return job.clash
@@ -99,8 +108,8 @@ def refusal(
         return None
     if foreign and not begun:
         return (
-            f"{folder / foreign[0]}: {describe_existing(folder / foreign[0])} and was not written by a batch;"
-            " pass --overwrite to replace it"
+            f"{foreign[0]}: {describe_existing(foreign[0])} and was not written by a batch;"
+            f" {'pass --overwrite to replace it' if foreign[0].is_file() or foreign[0].is_symlink() else 'rename it'}"
         )
     if known is None or not os.path.lexists(folder / job.output):
         return None
@@ -165,9 +174,9 @@ def make_result(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict
             return None
         _clean(job, run, begun)
         try:
-            line = _make(job, run, begun) if lost is None else record(FAILED, job.scene, job.output, error=lost)
+            line = _make(job, run, begun) if lost is None else _record_failure(job, run.folder, lost)
         except Exception as error:  # a bad scene must not end the batch
-            line = record(FAILED, job.scene, job.output, error=error_line(error))
+            line = _record_failure(job, run.folder, error_line(error))
         if line["status"] != SKIPPED:
             append_line(run.folder / RECORDS, line)
         if lost is None:
@@ -180,7 +189,9 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     files = job.find_files()
     key, known = job.call.key(files), read_index(run.folder).read_on().results.get(job.output)
     if known is not None and not run.overwrite and known.holds(run.folder, key):
-        return record(SKIPPED, job.scene, job.output, key=key, files=known.files, doubts=known.doubts)
+        return record(
+            SKIPPED, job.scene, job.output, key=key, files=known.files, doubts=known.doubts, unmet=known.unmet
+        )  # fmt: skip
     refused = refusal(job, run.folder, known, key, overwrite=run.overwrite, begun=begun.exists())
     if refused:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
@@ -200,7 +211,10 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
         | {"bytes": path.stat().st_size}
         for path in written
     ]
-    return record(DONE, job.scene, job.output, key=key, files=facts, doubts=document["doubts"], report=finite(document))
+    return record(
+        DONE, job.scene, job.output, key=key, files=facts,
+        doubts=document["doubts"], unmet=document["unmet"], report=finite(document),
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=1)

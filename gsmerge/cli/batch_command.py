@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -27,8 +27,11 @@ JOBS = Setting("", kind=int | Literal["auto"], least=1)
 MAX_LISTED = 20  # rows of the table, failures, and doubtful results
 HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
-# Key of a reason -> word before it
-REASONS = {"doubt": "warning", "lacking": "note", "error": "failed"}
+# Key of a reason -> word before it, and noun
+REASONS = {
+    "doubt": ("warning", "warning"), "unmet": ("missed target", "missed target"), "lacking": ("note", "note"),
+    "error": ("failed", "failure"),
+}  # fmt: skip
 
 
 @opt.command(
@@ -74,6 +77,7 @@ def batch(args: opt.Args) -> None:
         raise UsageError(f"--output: expected a folder, found the file {out}")
     hints = args.hints()
     from gsmerge.batch import BatchOptions, find_jobs
+    from gsmerge.batch.find import describe_lost
     from gsmerge.batch.records import RecordIndex
 
     settings, engine = args.make(CompactOptions, Engine)
@@ -88,80 +92,74 @@ def batch(args: opt.Args) -> None:
         from gsmerge.runtime.work import require_ray
 
         require_ray()
-    jobs = find_jobs(args.scenes, out, options, set(RecordIndex(out).read_on().paths()))
+    looks: list[str] = []
+    jobs = find_jobs(args.scenes, out, options, set(RecordIndex(out).read_on().paths()), looks)
+    notes = describe_lost(looks, {job.scene for job in jobs})
     if args.dry_run:
-        _print_plan(args, jobs, options)
+        _print_plan(args, jobs, options, notes)
     else:
-        _run(args, jobs, options)
+        _run(args, jobs, options, notes)
 
 
-def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
+def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, notes: Sequence[str]) -> None:
     """Compact all scenes, report each one, and print a summary."""
     from gsmerge.batch.run import choose_concurrency
 
-    totals, stdout = Totals(len(jobs)), sys.stdout
+    totals = Totals(len(jobs))
     say(f"{count_words(len(jobs), 'scene')}, {choose_concurrency(jobs, options)}", quiet=args.silent)
 
-    def add(record: dict[str, Any]) -> None:
-        totals.add(record)
-        if args.json:
-            print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
-
-    interrupted = False
     try:
-        _run_jobs(args, jobs, options, add)
-    except KeyboardInterrupt:
-        interrupted = True
-        raise
+        _run_jobs(args, jobs, options, totals)
     finally:
-        if (totals.counts or interrupted) and not args.silent:
-            print_document({}, totals.lines(terminal_columns(sys.stdout)), as_json=False)
-    doubtful = totals.reasons["doubt"]
-    first = _first_reason(doubtful, listed=not args.silent) if doubtful else ""
-    problem = f"{len(doubtful)} of {totals.total} results are doubtful{first}"
+        if not args.silent:
+            print_document(
+                {}, [*totals.lines(terminal_columns(sys.stdout)), *map("note: {}".format, notes)], as_json=False
+            )
+    doubtful, results = totals.reasons["doubt"], count_words(totals.total - len(totals.reasons["error"]), "result")
+    problem = (
+        f"{len(doubtful)} of {results} {'is' if len(doubtful) == 1 else 'are'} doubtful"
+        f"{_first_reason(doubtful, listed=not args.silent)}"
+    )
     if doubtful and not args.strict:
         say(problem, kind="warning", quiet=args.silent)
-    check_failures(totals.reasons["error"], len(jobs), "scenes", listed=not args.silent)
-    if totals.counts["unmet"]:
-        raise TargetError(f"{totals.counts['unmet']} of {totals.total} results miss the target")
+    check_failures(totals.reasons["error"], len(jobs), "scene", listed=not args.silent)
+    if unmet := totals.reasons["unmet"]:
+        raise TargetError(f"{len(unmet)} of {results} missed the target{_first_reason(unmet, listed=not args.silent)}")
     if doubtful and args.strict:
         raise TargetError(problem)
 
 
-def _run_jobs(
-    args: opt.Args, jobs: Sequence[Job], options: BatchOptions, add: Callable[[dict[str, Any]], None]
-) -> None:
-    """Run jobs, show progress, and pass each record to ``add``."""
+def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals: Totals) -> None:
+    """Run jobs, show progress, count each record, and print it with ``--json``."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.records import FAILED, SKIPPED
 
-    num_failed = num_skipped = 0
+    stdout = sys.stdout
     with (
         separate_stdout(options.engine, quiet=args.silent),
         closing(run_batch(jobs, args.output, options)) as records,
         total_progress(len(jobs), quiet=args.silent) as progress,
     ):
         for num_ended, record in enumerate(records, 1):
-            add(record)
-            failure = record["error"] or ""
-            num_failed += record["status"] == FAILED
-            num_skipped += record["status"] == SKIPPED
+            totals.add(record)
+            if args.json:
+                print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
+            failure, num_skipped = record["error"] or "", totals.counts[SKIPPED]
             share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
             report = record["report"] or {"notes": record["doubts"]}  # a result that was done before has no report
             notes = [Doubt(note) if note in record["doubts"] else note for note in report["notes"]]
-            progress(RunEnd(record["scene"], record["status"], num_ended, failure, num_failed, share, notes))
+            progress(RunEnd(record["scene"], record["status"], num_ended, failure, totals.counts[FAILED], share, notes))
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
     """Raise BatchError if jobs ``failed`` (name, reason); give the first reason unless all were ``listed``."""
     if failed:
-        raise BatchError(f"{len(failed)} of {total} {unit} failed{_first_reason(failed, listed=listed)}")
+        raise BatchError(f"{len(failed)} of {count_words(total, unit)} failed{_first_reason(failed, listed=listed)}")
 
 
 def _first_reason(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
-    """Return the first scene and its reason, for the end of a message; "" if all were ``listed`` before."""
-    scene, reason = reasons[0]
-    return "" if listed else f"; the first: {scene}: {reason}"
+    """Return the first scene and its reason, for the end of a message; "" if none, or all were ``listed`` before."""
+    return "" if listed or not reasons else "; the first: {}: {}".format(*reasons[0])
 
 
 @dataclass
@@ -169,25 +167,24 @@ class Totals:
     """Results of a run, for the lines at its end."""
 
     total: int  # scenes
-    counts: Counter[str] = field(default_factory=Counter)  # scenes by status; Gaussians in and out; missed targets
+    counts: Counter[str] = field(default_factory=Counter)  # scenes by status; Gaussians in and out
     rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results
-    # Scenes and reasons: doubts, also of skipped results; lacking files; failures
+    # Scenes and reasons: doubts and missed targets, also of skipped results; lacking files; failures
     reasons: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: {name: [] for name in REASONS})
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Count the record of one scene."""
         report = record["report"]
-        found = {"doubt": "; also ".join(record["doubts"]), "lacking": "", "error": record["error"]}
+        found = {"doubt": "; also ".join(record["doubts"]), "lacking": "", **record}
         if report and not report["input"]["num_photos"] and {*record["doubts"]} <= {report["worse"]}:
             found["lacking"] = _describe_lack(report)
         for name, reason in found.items():
-            if reason:
+            if reason and name in REASONS:
                 self.reasons[name].append((record["scene"], reason))
         self.counts[record["status"]] += 1
         if report:
             self.counts["in"] += report["input"]["num_gaussians"]
             self.counts["out"] += report["output"]["num_gaussians"]
-            self.counts["unmet"] += bool(report["unmet"])
             if len(self.rows) < MAX_LISTED:
                 self.rows.append(_row(record["output"], report))
 
@@ -201,20 +198,20 @@ class Totals:
         rows = [HEADER, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
         lines = text_table(rows, columns=columns, least=list(map(HEADER.index, OMITTED_FIRST))) if self.rows else []
         lines += [f"... and {self.counts[DONE] - len(self.rows):,} more"] * (self.counts[DONE] > len(self.rows))
-        for name, status in REASONS.items():
+        for name, (word, noun) in REASONS.items():
             grouped = _list_reasons(self.reasons[name])
-            lines += [f"{status}: {line}" for line in grouped[:MAX_LISTED]]
-            lines += [f"... and {len(grouped) - MAX_LISTED:,} more {status}"] * (len(grouped) > MAX_LISTED)
-        statuses = [status for status in (DONE, SKIPPED, FAILED) if self.counts[status] or status == DONE]
-        parts = [f"{self.counts[status]:,} {status}" for status in statuses]
-        num_left = self.total - sum(self.counts[status] for status in statuses)
+            lines += [f"{word}: {line}" for line in grouped[:MAX_LISTED]]
+            lines += [f"... and {count_words(len(grouped) - MAX_LISTED, f'more {noun}')}"] * (len(grouped) > MAX_LISTED)
+        ends = {status: self.counts[status] for status in (DONE, SKIPPED, FAILED)}
+        parts = [f"{count:,} {status}" for status, count in ends.items() if count or status == DONE]
+        num_left = self.total - sum(ends.values())
         line = f"{count_words(self.total, 'scene')}: {', '.join([*parts, *[f'{num_left:,} left'] * (num_left > 0)])}"
         if num_input := self.counts["in"]:
             share = human_share(self.counts["out"] / num_input)
             line += f"; {num_input:,} -> {self.counts['out']:,} Gaussians ({share})"
-        line += f"; {self.counts['unmet']:,} missed the target" if self.counts["unmet"] else ""
-        num_doubtful = len(self.reasons["doubt"])
-        return [*lines, line + (f"; {num_doubtful:,} doubtful" if num_doubtful else "")]
+        for name, words in (("unmet", "missed the target"), ("doubt", "doubtful")):
+            line += f"; {len(self.reasons[name]):,} {words}" if self.reasons[name] else ""
+        return [*lines, line]
 
 
 def _list_reasons(reasons: Sequence[tuple[str, str]]) -> list[str]:
@@ -257,7 +254,7 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
     return output, *counts, human_share(report["ratio"]), gain, *quality, f"{report['total_seconds']:.1f}"
 
 
-def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
+def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, notes: Sequence[str]) -> None:
     """Print which scenes a run would do."""
     from gsmerge.batch.run import choose_concurrency, pending_jobs
     from gsmerge.measure.documents import document_head, note_entries
@@ -286,10 +283,16 @@ def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> N
             for job in jobs
         ],
         "options": options.settings.to_dict(),
-        **note_entries([]),
+        **note_entries(notes),
     }
     lines = [f"{job.scene} -> {f'refused: {refusal}' if refusal else out / job.output}" for job, refusal in pending]
-    lines.append(f"would write {out}: {num_pending:,} of {len(jobs):,} scenes to do, {concurrency}")
+    lines += [
+        f"would write {out}: {num_pending:,} of {count_words(len(jobs), 'scene')} to do, {concurrency}",
+        *map("note: {}".format, notes),
+    ]
     print_document(document, lines, as_json=args.json)
     if num_refused:
-        raise BatchError(f"{num_refused:,} of {count_words(len(jobs), 'scene')} would fail")
+        raise BatchError(
+            f"{num_refused:,} of {count_words(len(jobs), 'scene')} would fail;"
+            " faults inside their files show only in the run"
+        )

@@ -87,8 +87,11 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool, reports: b
     except (OSError, ValueError) as error:  # ValueError: the name has a zero byte
         reason = getattr(error, "strerror", None) or error
         raise SceneError(output, f"cannot be written ({reason})", "choose another name") from error
-    if output.is_dir():
-        raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
+    if output.exists() and not output.is_file():
+        raise UsageError(
+            f"{output}: expected a file to write, found"
+            f" {'a folder; name a file in it' if output.is_dir() else 'a pipe or a device; name a file'}"
+        )
     target = Path(os.path.realpath(output))
     is_read = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
     if str(target) in inputs or (is_read and str(target.parent) in inputs):

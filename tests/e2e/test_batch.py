@@ -113,10 +113,11 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path,
     outcome = batch(run, rooms, out, "--dry-run")
     assert outcome.code == 0
     assert f"{rooms / 'bad'} -> {out / 'bad.ply'}" in outcome.out
+    assert "note: " not in outcome.out
     assert "1 of 3 scenes" in outcome.out
     refused = batch(run, rooms, out, "--dry-run", "--json", "--seed", 1, "--jobs", 3)
     assert refused.code == 5
-    assert names(refused.err, "2 of 3 scenes")
+    assert names(refused.err, "2 of 3 scenes", "in the run")
     plan = json.loads(refused.out)
     assert (plan["dry_run"], plan["num_scenes"], plan["num_pending"], plan["jobs"]) == (True, 3, 1, 3)
     assert [scene["num_gaussians"] for scene in plan["scenes"]] == [0, 3 * 24 * 16, 3 * 24 * 16]  # one is cut
@@ -143,15 +144,25 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
         totals.add(record("done", f"{number}", f"{number}.ply", report=report))
         totals.add(record("failed", f"{number}", f"{number}.ply", error=f"no {number}"))
         totals.add(record("skipped", f"{number}", f"{number}.ply"))
-    totals.add(record("done", "x", "x.ply", report={**report, "unmet": "too few"}))
+    totals.add(record("skipped", "x", "x.ply", unmet="too few"))
     *table, last = totals.lines()
     header = ["result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds"]
     assert table[0].split() == " ".join(header).split()
-    assert len(table) == 1 + 20 + 1 + 20 + 1
-    assert [line for line in table if "more" in line] == ["... and 281 more", "... and 280 more failed"]
-    counts = "1,000 scenes: 301 done, 300 skipped, 300 failed, 99 left; 30,100 -> 1,204 Gaussians (4.00 %)"
+    assert len(table) == 1 + 20 + 1 + 1 + 20 + 1
+    assert "missed target: x: too few" in table
+    assert [line for line in table if "more" in line] == ["... and 280 more", "... and 280 more failures"]
+    counts = "1,000 scenes: 300 done, 301 skipped, 300 failed, 99 left; 30,000 -> 1,200 Gaussians (4.00 %)"
     assert last == f"{counts}; 1 missed the target"
     assert Totals(0).lines() == ["0 scenes: 0 done"]
+
+
+def test_folders_that_drop_out_are_named(rooms: Path, tmp_path: Path, run: Run) -> None:
+    top = Path(shutil.copytree(rooms / "room0", tmp_path / "rooms" / "room0")).parent
+    shutil.copytree(top / "room0", top / "room1")
+    (top / "room1/scene.ply").unlink()
+    for options in (["--dry-run"], FAST):
+        outcome = run("batch", top, "--output", tmp_path / "out", *options, code=0)
+        assert names(outcome.out, f"note: no Gaussians are read from 1 folder beside the scenes: {top / 'room1'}")
 
 
 def test_what_a_scene_lacks_is_said(rooms: Path, tmp_path: Path, run: Run) -> None:
@@ -179,6 +190,8 @@ def test_what_a_scene_lacks_is_said(rooms: Path, tmp_path: Path, run: Run) -> No
 
 def test_a_missed_target_ends_with_4_and_keeps_the_result(rooms: Path, tmp_path: Path, run: Run) -> None:
     arguments = ("--effort", "draft", "--quality", "90dB", "--set", "superpixels=1%", "--jobs", 1)
-    outcome = run("batch", rooms / "room0", "--output", tmp_path, *arguments, code=4)
-    assert names(outcome.err, "1 of 1", "target")
+    for status in ("done", "skipped"):
+        outcome = run("batch", rooms / "room0", "--output", tmp_path, *arguments, code=4)
+        assert names(outcome.err, "1 of 1 result", "target")
+        assert names(outcome.out, f"missed target: {rooms / 'room0'}: quality: 90 dB", f"1 {status}")
     assert (tmp_path / "room0.ply").exists()

@@ -54,7 +54,7 @@ def test_a_batch_says_so_again_where_it_is_done(stray: Path, run: Run) -> None:
         outcome = run(*words, code=0)
         assert outcome.out.count("left out") == 1
     outcome = run(*words, "--strict", code=4)
-    assert outcome.err.endswith(f"{ERROR}1 of 1 results are doubtful\n")
+    assert outcome.err.endswith(f"{ERROR}1 of 1 result is doubtful\n")
     assert "left out" not in run(*words, "--cameras", "none", "--strict").out
 
 
@@ -70,7 +70,7 @@ def test_photos_that_do_not_show_the_scene_are_a_doubt_too(smallest_copy: Path, 
     assert outcome.err == f"{ERROR}{note}\n"
     words = ("batch", smallest_copy, "-o", smallest_copy.parent / "out", *FEW[:2], "--set", "fit=none", *FEW[4:])
     assert note in run(*words, code=0).out
-    assert run(*words, "--strict", code=4).err.endswith("1 of 1 results are doubtful\n")
+    assert run(*words, "--strict", code=4).err.endswith("1 of 1 result is doubtful\n")
 
 
 @pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")], ids=str)

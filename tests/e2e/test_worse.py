@@ -126,12 +126,12 @@ def test_a_batch_names_worse_results(
     said = run(*call, code=0)
     assert f"warning: {smallest_scene}: " in said.out
     assert said.out.splitlines()[-1].endswith("; 1 doubtful")
-    assert "warning: 1 of 1 results " in said.err
+    assert "warning: 1 of 1 result is doubtful" in said.err
     (record,) = records(out)
     assert SAID in record["report"]["worse"]
     again = run(*call, "--strict", code=4)
     assert "1 skipped" in again.out
-    assert again.err.endswith("1 of 1 results are doubtful\n")
+    assert again.err.endswith("1 of 1 result is doubtful\n")
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -67,6 +68,7 @@ USAGE = {
     "compact room --budget quest": "budget*'quest'*perhaps quest3",
     "compact room --set match=aab": "--set match*'aab'*perhaps aabb",
     "compact room -o -": "--output*got -",
+    f"compact room -o {os.devnull}": f"{os.devnull}*pipe or a device",
     "compact room -o a.ksplat": "a.ksplat*.ply*lod-meta.json",
     "convert room a.usda": "a.usda*ends in*.spz*.glb",
     "compact room --set checkpoint=none --set require_checkpoint=true": 'require_checkpoint*"none"',

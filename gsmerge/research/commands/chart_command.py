@@ -77,7 +77,7 @@ def chart(args: opt.Args) -> None:
     say_notes(notes, quiet=args.silent)
     failed = _run_all(args, pending, measured)
     _draw(args, notes, len(pending))
-    check_failures(failed, len(pending), "runs")
+    check_failures(failed, len(pending), "run")
 
 
 def _plan_runs(

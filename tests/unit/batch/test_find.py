@@ -13,7 +13,7 @@ import pytest
 from batches import touch
 from messages import refuses
 
-from gsmerge.batch.find import find_scenes
+from gsmerge.batch.find import describe_lost, find_named_scenes, find_scenes
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.scene_files import find_scene_files
 
@@ -112,6 +112,35 @@ def test_folders_are_entered_once_whatever_links_lead_to_them() -> None:
     touch(f"{folder}/x.ply")
     assert actual("all") == [f"{folder}/x.ply"]
     assert actual("all/**/*.ply") == [f"{folder}/x.ply"]
+
+
+@pytest.mark.parametrize("given", ["all", "all/*", "all/list.txt"])
+def test_links_come_after_folders(given: str) -> None:
+    """The folder is entered under its own name, whichever comes first."""
+    touch("all/room/scene.ply", "all/z/deep/hall/scene.ply")
+    link("all/latest", "room")
+    link("all/a", "z/deep")
+    Path("all/list.txt").write_text("latest\na\nroom\nz\n")
+    assert actual(given) == ["all/room", "all/z/deep/hall"]
+
+
+@pytest.mark.parametrize(
+    ("files", "is_lost"),
+    [
+        (["x/images/1.png"], True), (["x/transforms.json"], True), (["x/SCENE.PLY"], True),
+        (["x/scene.ply.part"], True), (["x/sparse/0/cameras.bin", "x/images/1.png"], True),
+        ([], False), (["x/notes.txt"], False), (["x/1.png"], False), (["x/a.compact.ply"], False),
+        (["images/a/images/1.png"], False), (["colmap/sparse/0/cameras.bin"], False), (["out/images/1.png"], False),
+        (["x/images/1.png", "x/deep/scene.ply"], False), (["x/images/1.png", "x/y.ply"], False),
+        (["bare/data/images/1.png", "bare/output/point_cloud.ply"], False), (["a/data/images/1.png"], False),
+    ],
+)  # fmt: skip
+def test_folders_that_look_like_the_scenes_beside_them(files: list[str], is_lost: bool) -> None:
+    touch("all/a/scene.ply", "all/a/images/1.png", "all/b/scene.ply", *(f"all/{file}" for file in files))
+    looks: list[str] = []
+    scenes = {str(scene) for scene, _ in find_named_scenes(["all"], Path("all/out"), looks)}
+    found = describe_lost(looks, scenes)
+    assert [str(Path("all/x")) in note for note in found] == [True] * is_lost
 
 
 def test_a_pattern_enters_folders_of_every_depth() -> None:

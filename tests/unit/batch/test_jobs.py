@@ -61,6 +61,16 @@ def test_each_scene_comes_once() -> None:
     assert outputs("s", "s/a/scene.ply", "s/*", "s/b.ply") == {"b.ply": "s/b.ply", "a.ply": "s/a"}
 
 
+@pytest.mark.parametrize("given", [["all/b", "all/a"], ["all/link.ply", "all/a"], ["all/*/*.ply"], ["linked/all"]])
+def test_a_scene_is_named_by_the_path_with_the_fewest_links(given: list[str]) -> None:
+    touch("all/room/scene.ply")
+    for path, target in (("all/a", "room"), ("all/b", "room"), ("all/link.ply", "room/scene.ply"), ("linked", ".")):
+        Path(path).symlink_to(target)
+    expected = {"all/*/*.ply": "all/room/scene.ply", "linked/all": "linked/all/room"}.get(given[0], given[0])
+    assert list(outputs(*given, options=BatchOptions(output="{parent}/{stem}.ply")).values()) == [expected]
+    assert [*outputs("all/b", "all/link.ply", "linked/all", "all/room").values()] == ["all/room"]
+
+
 def test_two_scenes_are_not_written_to_one_file() -> None:
     touch("s/a/scene.ply", "t/a/scene.ply")
     touch("t/b/scene.ply")

@@ -21,14 +21,14 @@ FILES = [{"path": "a.ply", "sha256": SHA, "bytes": 3}]
 
 def done(output: str, key: str = "k") -> dict[str, Any]:
     files = [{"path": output, "sha256": SHA, "bytes": 3}]
-    return record(DONE, f"in/{output}", output, key=key, files=files, report={"worse": None})
+    return record(DONE, f"in/{output}", output, key=key, files=files, report={"worse": None}, unmet="too few")
 
 
 def test_results_are_known_by_what_they_were_made_of_and_what_they_are(tmp_path: Path) -> None:
     append_line(tmp_path / RECORDS, done("a.ply"))
     index = RecordIndex(tmp_path).read_on()
     known = index.results["a.ply"]
-    assert known == DoneResult("k", FILES, "in/a.ply")
+    assert known == DoneResult("k", FILES, "in/a.ply", unmet="too few")
     assert not known.holds(tmp_path, "k")  # there is no file
     (tmp_path / "a.ply").write_bytes(b"abc")
     assert known.holds(tmp_path, "k")
@@ -69,7 +69,7 @@ def foreign_lines() -> list[bytes]:
     """Lines that are no records: every entry of one with every odd value, and without it."""
     whole = done("a.ply")
     lines = [b"[" * 100_000, b'{"a":' * 100_000, b"9" * 10_000, b"[]", b"{}", b'{"status":"done"}']
-    for key in ("status", "scene", "output", "files", "key", "report"):
+    for key in ("status", "scene", "output", "files", "key", "report", "unmet"):
         lines += [json.dumps({**whole, key: value}).encode() for value in WRONG.values()]
         lines.append(json.dumps({name: value for name, value in whole.items() if name != key}).encode())
     for key in whole["report"]:

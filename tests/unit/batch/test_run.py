@@ -198,6 +198,30 @@ def test_unexpected_errors_are_recorded(scene: Path, out: Path, monkeypatch: pyt
     assert run(scene, out)["error"].startswith("out of memory")
 
 
+def test_a_failure_leaves_an_earlier_result_and_says_so(
+    scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the run and in the plan, whatever the error; there is nothing to say before the first result."""
+    ply = (scene / "scene.ply").read_bytes()
+    (scene / "scene.ply").write_bytes(ply[:-9])
+    assert "stays" not in run(scene, out)["error"]
+    (scene / "scene.ply").write_bytes(ply)
+    run(scene, out)
+    (scene / "scene.ply").write_bytes(ply[:-9])
+    assert says(run(scene, out)["error"], "scene.ply", f"its earlier result {out / 'room.ply'} stays")
+
+    def refuse(*_: Any) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(scene / "scene.ply"))
+
+    monkeypatch.setattr(calls, "content_hash", refuse)
+    job, started = one_job(scene, out)
+    [(_, foreseen)] = pending_jobs([job], out, QUICK)
+    ended = make_result(job, started, wait=False)
+    assert ended is not None
+    assert foreseen == ended["error"]
+    assert says(foreseen, "scene.ply", "Permission denied", "stays")
+
+
 def test_the_result_of_another_scene_is_kept(scene: Path, out: Path) -> None:
     """Also one whose name comes a night later, by itself or beside the first; each on its own."""
     other = Path(shutil.copytree(scene, scene.parent / "later" / "room"))
@@ -241,6 +265,10 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
     (out / "room.ply").symlink_to("nowhere")
     assert says(run(scene, out)["error"], out / "room.ply", "link to nowhere", "--overwrite")
     (out / "room.ply").unlink()
+    (out / "room.ply").mkdir()
+    assert says(run(scene, out)["error"], out / "room.ply", "rename it")
+    assert "--overwrite" not in run(scene, out)["error"]
+    (out / "room.ply").rmdir()
     (out / "room.cameras.json").write_bytes(b"mine")  # or those of a result in another format
     assert [file["path"] for file in run(scene, out)["files"]] == ["room.ply"]
     assert (out / "room.cameras.json").read_bytes() == b"mine"
