@@ -243,7 +243,11 @@ def convert_files(
         color_units=units,
         color_note=color_note,
         open_units=open_units,
-        adapted=(*scale_notes, *stored.notes, *_describe_incomplete(out["valid"])),
+        adapted=(
+            *scale_notes,
+            *dict.fromkeys(note for part in parts for note in part.notes),
+            *_describe_incomplete(out["valid"]),
+        ),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
