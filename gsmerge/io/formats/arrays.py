@@ -127,16 +127,8 @@ def read_new_views(comments: Sequence[object]) -> ExpectedScores | None:
 
 def note_surplus(num_bytes: int, least: int) -> tuple[Doubt, ...]:
     """Doubt a file with bytes after its last row; fewer than ``least``, a row or a header, may be padding."""
-    return (
-        ()
-        if num_bytes < least
-        else (
-            Doubt(
-                f"{num_bytes:,} bytes follow the last row, as if the header's count were too small or another file were"
-                " appended"
-            ),
-        )
-    )
+    reason = "as if the header's count were too small or another file were appended"
+    return (Doubt(f"{num_bytes:,} bytes follow the last row, {reason}"),) if num_bytes >= least else ()
 
 
 def color_columns(names: Collection[str] | None) -> tuple[str, ...]:

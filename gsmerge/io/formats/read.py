@@ -243,11 +243,7 @@ def convert_files(
         color_units=units,
         color_note=color_note,
         open_units=open_units,
-        adapted=(
-            *scale_notes,
-            *dict.fromkeys(note for part in parts for note in part.notes),
-            *_describe_incomplete(out["valid"]),
-        ),
+        adapted=(*scale_notes, *dict.fromkeys(n for p in parts for n in p.notes), *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 

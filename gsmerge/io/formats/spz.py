@@ -170,26 +170,27 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np
     path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,))
     sizes = [header.count * width for width in header.widths if width]
     table_start, ends = _read_table(path, packed, header, sizes)
-    unpacker, streams = zstandard.ZstdDecompressor(), [packed[start:end] for start, end in pairwise(ends)]
+    streams = [packed[start:end] for start, end in pairwise(ends)]
     try:  # only whole streams, with their checksums if there are any; a stream may not state its size
         if any(
             zstandard.frame_content_size(stream) not in (-1, size) for stream, size in zip(streams, sizes, strict=True)
         ):
             raise zstandard.ZstdError("streams of other sizes")
         columns = [
-            unpacker.decompress(stream, size, allow_extra_data=False)
+            zstandard.ZstdDecompressor().decompress(stream, size, allow_extra_data=False)
             for stream, size in zip(streams, sizes, strict=True)
         ]
         if [len(column) for column in columns] != sizes:
             raise zstandard.ZstdError("streams of other sizes")
     except zstandard.ZstdError as error:
         raise SceneError(
-            path, "damaged: expected whole Zstandard streams of .spz version 4, found others", AGAIN
+            path,
+            "truncated or damaged: expected whole Zstandard streams with the sizes of its table, found others",
+            AGAIN,
         ) from error
     columns += [b""] * (len(header.widths) - len(columns))
     parts = [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
-    extensions = packed[HEADER.size + TABLE_START.size : table_start][:_MAX_EXTENSIONS]
-    return header, parts, extensions, len(packed) - int(ends[-1])
+    return header, parts, packed[HEADER.size + TABLE_START.size : table_start][:_MAX_EXTENSIONS], len(packed) - ends[-1]
 
 
 def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) -> tuple[int, np.ndarray]:

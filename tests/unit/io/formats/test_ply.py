@@ -16,7 +16,7 @@ from plyfile import PlyData
 from gsmerge.errors import SceneError, list_doubts
 from gsmerge.io import read_gaussians, read_ply
 from gsmerge.io.formats.ply import header_counts, open_ply, open_rows
-from gsmerge.io.formats.read import file_notes
+from gsmerge.io.formats.read import file_notes, read_parts
 from gsmerge.io.formats.table import estimate_counts
 
 from .test_read import columns, save
@@ -100,6 +100,13 @@ def test_bytes_after_the_last_row(tmp_path: Path, kind: str, more: str, is_doubt
     path.write_bytes(content + added)
     doubts = [doubt for doubt in list_doubts(file_notes(read_ply(path).info)) if "bytes follow" in doubt]
     assert [doubt.split()[0] for doubt in doubts] == [f"{len(added.strip()):,}"] * is_doubtful
+
+
+def test_bytes_after_any_of_several_parts(tmp_path: Path) -> None:
+    """Not only by the first one."""
+    paths = [save(tmp_path / f"{name}.ply", columns(50)) for name in "ab"]
+    paths[1].write_bytes(paths[1].read_bytes() + bytes(100))
+    assert any("100 bytes follow" in note for note in list_doubts(file_notes(read_parts(paths).info)))
 
 
 def resident(path: str) -> int:
