@@ -44,6 +44,7 @@ from gsmerge.photos.scene_photos import (
     stored_photos,
     without_photo,
 )
+from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
     NO_HINTS,
@@ -491,14 +492,18 @@ def _make_load(
     photos = result.images if len(result.images) else None
     names = () if camera_file is None else camera_file.names
     scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)
+    last_rows = () if pixels is None else pixels.fronts.max((1, 2))  # of each view, -1 for none
+    bare = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
+    have = f"{len(bare)} of {len(scene)} views {'has' if len(bare) == 1 else 'have'} no Gaussians: {list_some(bare)}"
+    doubts = [Doubt(have)] if bare else []
     scene = read_rotations(scene, hints.quats)
     if recovery is not None and result.given is not None:
         scene = move_views(scene, result.given)
         result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
-    alignment, strays = None if recovery is None else check_pixels(scene), list[str]()
+    alignment = None if recovery is None else check_pixels(scene)
     if alignment is not None and alignment.share_near < 1 - MAX_STRAY:
         share = f"{100 * (1 - alignment.share_near):.0f} % of the Gaussians lie far from their own pixels"
-        strays = [Doubt(f"{share}, as rows of a damaged file do; copy or export it again")]
+        doubts.append(Doubt(f"{share}, as rows of a damaged file do; copy or export it again"))
     source = "" if camera_file is None else camera_file.source
     order = "none" if recovery is None else recovery.layout.order
     return Loaded(
@@ -507,7 +512,7 @@ def _make_load(
         files=files,
         cameras=camera_file,
         exporters=choose_exporters(hints.exporter, ply.info, order, source),
-        notes=(*files.notes, *file_notes(ply.info), *strays, *notes, *faint_notes, *mask_notes),
+        notes=(*files.notes, *file_notes(ply.info), *doubts, *notes, *faint_notes, *mask_notes),
         alignment=alignment,
         recovery=recovery,
         problem=result.problem,

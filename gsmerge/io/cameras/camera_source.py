@@ -46,7 +46,7 @@ class CameraSource:
     @cached_property
     def ply(self) -> PlyData:
         """Elements of a PLY file."""
-        return open_ply(self.path)
+        return open_ply(self.path)[0]
 
 
 def check_objects(path: Path, entries: Sequence[Any], place: str = "the file") -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from gsmerge.errors import Doubt
 from gsmerge.geometry.transforms import (
     apply_harmonics_rotation,
     harmonics_rotation,
@@ -123,6 +124,12 @@ def read_new_views(comments: Sequence[object]) -> ExpectedScores | None:
     matches = (pattern.fullmatch(comment) for comment in comments if isinstance(comment, str))
     match = next(filter(None, matches), None)
     return None if match is None else ExpectedScores(*map(float, match.groups()))
+
+
+def note_surplus(num_bytes: int, least: int) -> tuple[Doubt, ...]:
+    """Doubt a file with bytes after its last row; fewer than ``least``, a row or a header, may be padding."""
+    reason = "as if the header's count were too small or another file were appended"
+    return (Doubt(f"{num_bytes:,} bytes follow the last row, {reason}"),) if num_bytes >= least else ()
 
 
 def color_columns(names: Collection[str] | None) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from gsmerge.io.formats.arrays import (
     Packed,
     StoredRows,
     are_logarithms,
+    note_surplus,
     to_bytes,
     to_columns,
     to_stored,
@@ -130,7 +131,7 @@ def holds_gaussians(path: Path) -> bool:
     """
     try:
         with _damage(path), path.open("rb") as file:
-            return NAME in str(_read_document(file, read_budget(path)).get("extensionsUsed"))
+            return NAME in str(_read_document(file, read_budget(path))[0].get("extensionsUsed"))
     except SceneError:
         return True
 
@@ -139,15 +140,19 @@ def read_rows(path: Path) -> StoredRows:
     """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if it has none or is damaged."""
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
     with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
-        document = _read_document(file, budget)
-        content = _Content(budget, file, document, file.tell(), budget.file_bytes)
+        document, total = _read_document(file, budget)
+        content = _Content(budget, file, document, file.tell(), total)
         for primitive, transform in _walk_splats(document, budget):
             budget.check_steps(_STEPS_PER_PART * len(parts), "steps for meshes")
             parts.append(_read_splats(content, primitive, transform, sizes))
     if not parts:
         problem = f"expected Gaussians ({NAME}), found a .glb of points or a mesh"
         raise SceneError(path, problem, "name the .ply that the model wrote beside it")
-    return replace(to_stored(parts, ".glb", sizes), format="binary little-endian")
+    return replace(
+        to_stored(parts, ".glb", sizes),
+        format="binary little-endian",
+        notes=note_surplus(budget.file_bytes - total, _HEADER.size),
+    )
 
 
 @contextmanager
@@ -212,8 +217,8 @@ class _Content:
         return _Values(np.ascontiguousarray(rows), np.iinfo(dtype).max if accessor.get("normalized") else 1)
 
 
-def _read_document(file: IO[bytes], budget: ReadBudget) -> dict[str, Any]:
-    """Read the JSON of a ``.glb``, and move to the start of its binary chunk."""
+def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any], int]:
+    """Read the JSON of a ``.glb`` and the length that its header states, and move to the start of its binary chunk."""
     size = budget.file_bytes
     start = file.read(_HEADER.size + _CHUNK.size)
     if len(start) < _HEADER.size + _CHUNK.size:
@@ -230,7 +235,7 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> dict[str, Any]:
     if missing and NAME in str(document.get("extensionsUsed")):
         raise _ForeignError(f"one that requires {', '.join(sorted(map(str, missing)))}, which is not supported")
     file.read(_CHUNK.size)
-    return document
+    return document, total
 
 
 def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple[dict[str, Any], np.ndarray]]:

@@ -59,7 +59,7 @@ _SIZES = {
 
 def read_rows(path: Path) -> arrays.StoredRows:
     """Open the rows of a PLY file for :func:`open_rows`; SceneError if it holds no Gaussians."""
-    data = open_ply(path)
+    data, num_left = open_ply(path)
     elements = {element.name: {column.name for column in element.properties} for element in data.elements}
     compressed = "chunk" in elements and elements.get("vertex", set()) >= set(arrays.PACKED)
     rows, prefix = (_PACKED_ROWS(path, data), "") if compressed else _vertex_rows(path, data)
@@ -80,7 +80,12 @@ def read_rows(path: Path) -> arrays.StoredRows:
         sizes=_bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
         extra_elements=extra_elements,
-        notes=(*notes, *([_PREFIXED.format(prefix)] if prefix else []), *unused),
+        notes=(
+            *notes,
+            *([_PREFIXED.format(prefix)] if prefix else []),
+            *unused,
+            *arrays.note_surplus(num_left, data["vertex"].data.dtype.itemsize),
+        ),
         adapt=partial(_adapt_rows, white=white) if notes else None,
     )
 
@@ -222,9 +227,10 @@ def no_ply(path: Path) -> SceneError:
     return SceneError(path, problem, "name a .ply of Gaussians")
 
 
-def open_ply(path: Path) -> PlyData:
-    """Open a PLY file; binary vertices that are not packed are mapped for :func:`open_rows`.
+def open_ply(path: Path) -> tuple[PlyData, int]:
+    """Open a PLY file, and count the bytes after its last element.
 
+    Binary vertices that are not packed are mapped for :func:`open_rows`.
     SceneError if it is no PLY file, is truncated or damaged, or is shorter than its header says.
     """
     budget = read_budget(path)
@@ -236,12 +242,13 @@ def open_ply(path: Path) -> PlyData:
         end, text = _check_header(start, budget)
         with _stream(path, end, text=text) as file, quiet_warnings():  # of an empty list, or too large a number
             data = PlyData.read(file, mmap="r")
+            num_left = len(file.read().strip()) if text else budget.file_bytes - file.tell()
         mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)  # Windows replaces no mapped file
         for element in data.elements:
             if isinstance(element.data, np.memmap) and element.name not in mapped:
                 with open_rows(path, element.data) as read:
                     element.data = read(slice(None))
-        return data
+        return data, num_left
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
     except PlyElementParseError as error:

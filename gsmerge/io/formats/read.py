@@ -219,6 +219,7 @@ def convert_files(
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
     used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS}
+    part_notes = dict.fromkeys(note for part in parts for note in part.notes)
     info = FileInfo(
         path=str(path),
         layout=stored.layout,
@@ -241,7 +242,7 @@ def convert_files(
         color_units=units,
         color_note=color_note,
         open_units=open_units,
-        adapted=(*scale_notes, *stored.notes, *damage, *_describe_incomplete(out["valid"])),
+        adapted=(*scale_notes, *part_notes, *damage, *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 

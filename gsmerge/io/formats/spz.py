@@ -91,7 +91,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
             file.seek(0)
             packed = file.read()
     read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
-    header, parts, extensions = read(ReadBudget(path, len(packed)), packed)
+    header, parts, extensions, num_left = read(ReadBudget(path, len(packed)), packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     axes = _stored_axes(path, extensions) if header.flags & EXTENSIONS_FLAG else PLY_AXES
     rotate = arrays.turner(_axes_rotation(axes), header.num_higher)
@@ -100,8 +100,8 @@ def read_rows(path: Path) -> arrays.StoredRows:
     )
     mode = arrays.MIP if header.flags & MIP_FLAG else None
     stored = arrays.to_stored([rows], f".spz version {header.version}", sizes, mode)
-    notes = (f"Gaussians are turned from the file's axes {axes} to those of a .ply, {PLY_AXES}",)
-    return stored if axes == PLY_AXES else replace(stored, notes=notes)
+    turned = f"Gaussians are turned from the file's axes {axes} to those of a .ply, {PLY_AXES}"
+    return replace(stored, notes=(*([turned] if axes != PLY_AXES else []), *arrays.note_surplus(num_left, HEADER.size)))
 
 
 def _stored_axes(path: Path, extensions: bytes) -> str:
@@ -144,47 +144,53 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
     return header
 
 
-def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes]:
-    """Read the header, the columns ``[n,width]`` uint8 and the extensions of versions 1 to 3."""
+def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
+    """Read versions 1 to 3: header, columns ``[n,width]`` uint8, extensions, and number of bytes after the stream."""
     path = budget.path
     stream = zlib.decompressobj(wbits=31)
     try:
         header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
-        extended = header.flags & EXTENSIONS_FLAG
-        extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS) if extended else b""
+        # This also checks the checksum; at the end, what is left would count twice as unused
+        extensions = stream.decompress(b"" if stream.eof else stream.unconsumed_tail, _MAX_EXTENSIONS)
     except zlib.error as error:
         raise SceneError(path, "expected a gzip stream of .spz, found another or damaged file", AGAIN) from error
     ends = np.cumsum([0, *header.widths]) * header.count
-    if len(data) < ends[-1]:
+    if len(data) < ends[-1] or not stream.eof:
         problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(data)}"
-        raise SceneError(path, problem, AGAIN)
+        raise SceneError(path, f"{problem}{'' if stream.eof else ' and no end of the stream'}", AGAIN)
     parts = [np.frombuffer(data, np.uint8, end - at, at).reshape(header.count, -1) for at, end in pairwise(ends)]
-    return header, parts, extensions
+    return header, parts, extensions, len(stream.unused_data)
 
 
-def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes]:
-    """Read the header, the columns ``[n,width]`` uint8 and the extensions of version 4."""
+def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
+    """Read version 4: header, columns ``[n,width]`` uint8, extensions, and number of bytes after the streams."""
     import zstandard  # few files need it
 
     path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,))
     sizes = [header.count * width for width in header.widths if width]
     table_start, ends = _read_table(path, packed, header, sizes)
-    unpacker = zstandard.ZstdDecompressor()
-    try:  # unpacks at most one byte more than expected, whatever size a stream states
+    streams = [packed[start:end] for start, end in pairwise(ends)]
+    try:  # only whole streams, with their checksums if there are any; a stream may not state its size
+        if any(
+            zstandard.frame_content_size(stream) not in (-1, size) for stream, size in zip(streams, sizes, strict=True)
+        ):
+            raise zstandard.ZstdError("streams of other sizes")
         columns = [
-            unpacker.stream_reader(packed[start:end]).read(size + 1)
-            for (start, end), size in zip(pairwise(ends), sizes, strict=True)
+            zstandard.ZstdDecompressor().decompress(stream, size, allow_extra_data=False)
+            for stream, size in zip(streams, sizes, strict=True)
         ]
+        if [len(column) for column in columns] != sizes:
+            raise zstandard.ZstdError("streams of other sizes")
     except zstandard.ZstdError as error:
-        raise SceneError(path, "damaged: expected Zstandard streams of .spz version 4, found others", AGAIN) from error
-    if [len(column) for column in columns] != sizes:
-        problem = "truncated or damaged: expected columns of .spz version 4 with the sizes of its table, found others"
-        raise SceneError(path, problem, AGAIN)
+        raise SceneError(
+            path,
+            "truncated or damaged: expected whole Zstandard streams with the sizes of its table, found others",
+            AGAIN,
+        ) from error
     columns += [b""] * (len(header.widths) - len(columns))
     parts = [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
-    start = HEADER.size + TABLE_START.size
-    return header, parts, packed[start : min(table_start, start + _MAX_EXTENSIONS)]
+    return header, parts, packed[HEADER.size + TABLE_START.size : table_start][:_MAX_EXTENSIONS], len(packed) - ends[-1]
 
 
 def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) -> tuple[int, np.ndarray]:

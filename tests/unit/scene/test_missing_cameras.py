@@ -83,3 +83,22 @@ def test_of_rows_without_pixels_photos_without_a_camera_are_named(tmp_path: Path
     spare = [name.rpartition("/")[2] for view, name in enumerate(SMOOTH.names) if view not in views]
     assert not loaded.scene.has_own_pixels
     assert noted(loaded.notes, f"{len(spare)} of 3 photos", "no camera", *spare) == bool(spare)
+
+
+@pytest.mark.parametrize("lost", ["cut", "no numbers", "half", "nothing"])
+@pytest.mark.parametrize("photos", [[0, 1, 2], [0, 1]], ids=["photos", "no photo of the last view"])
+def test_views_without_any_row_are_doubted(tmp_path: Path, lost: str, photos: list[int]) -> None:
+    """Once: a view without a photo is named already."""
+    last = ALL[2 * len(ALL) // 3 :]
+    rows = export_rows(SMOOTH, np.setdiff1d(ALL, {"cut": last, "half": last[::2]}.get(lost, last[:0])))
+    if lost == "no numbers":
+        rows["x"][last] = np.nan
+    folder = save_export(tmp_path, SMOOTH, rows, cameras=False)
+    write_transforms(folder / "transforms.json", SMOOTH)
+    write_images(folder / "images", registered(photos))
+    doubts = [doubt for doubt in load_scene(folder).doubts if SMOOTH.names[2] in doubt]
+    is_bare = lost in ("cut", "no numbers") and len(photos) == 3
+    assert [doubt.split(":")[0] for doubt in doubts if "photos" not in doubt] == [
+        "1 of 3 views has no Gaussians"
+    ] * is_bare
+    assert len(doubts) == (is_bare or len(photos) < 3)

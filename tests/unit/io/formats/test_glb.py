@@ -13,9 +13,11 @@ import scenes
 from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
+from gsmerge.errors import list_doubts
 from gsmerge.geometry.transforms import multiply_quats, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import holds_gaussians
+from gsmerge.io.formats.read import file_notes
 
 NAME = "KHR_gaussian_splatting"
 NUMBERS = {"<f4": 5126, "|i1": 5120, "|u1": 5121, "<i2": 5122, "<u2": 5123}
@@ -156,3 +158,12 @@ def test_whether_it_holds_gaussians(scene: Scene, tmp_path: Path) -> None:
     assert not holds_gaussians(tmp_path / "a.glb")
     (tmp_path / "a.glb").write_bytes(b"glTF")
     assert holds_gaussians(tmp_path / "a.glb")  # its reader says what is wrong with it
+
+
+@pytest.mark.parametrize(("num_more", "is_doubtful"), [(3, False), (12, True)])
+def test_bytes_beyond_the_stated_length(scene: Scene, tmp_path: Path, num_more: int, is_doubtful: bool) -> None:
+    write_gaussians(tmp_path / "a.glb", scene.gaussians)
+    with (tmp_path / "a.glb").open("ab") as file:
+        file.write(bytes(num_more))
+    doubts = list_doubts(file_notes(read_gaussians(tmp_path / "a.glb").info))
+    assert [doubt.startswith("12 bytes follow") for doubt in doubts] == [True] * is_doubtful

@@ -13,9 +13,10 @@ from former_formats import compressed_bytes
 from messages import refuses
 from plyfile import PlyData
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, list_doubts
 from gsmerge.io import read_gaussians, read_ply
 from gsmerge.io.formats.ply import header_counts, open_ply, open_rows
+from gsmerge.io.formats.read import file_notes, read_parts
 from gsmerge.io.formats.table import estimate_counts
 
 from .test_read import columns, save
@@ -68,7 +69,7 @@ def test_a_file_that_shrinks_while_it_is_read(
 @pytest.mark.parametrize("block", [slice(0, 7), slice(7, 12_345), slice(12_345, 20_000), slice(None)], ids=str)
 def test_rows_are_those_of_the_file(tmp_path: Path, block: slice) -> None:
     rows, path = columns(20_000), tmp_path / "a.ply"
-    stored = open_ply(save(path, rows))["vertex"].data
+    stored = open_ply(save(path, rows))[0]["vertex"].data
     assert isinstance(stored, np.memmap) == (sys.platform != "win32")
     for some in (stored, rows):  # of no file: as they are
         with open_rows(path, some) as read:
@@ -78,10 +79,34 @@ def test_rows_are_those_of_the_file(tmp_path: Path, block: slice) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="needs Linux")
 def test_a_file_that_was_read_takes_no_memory(tmp_path: Path) -> None:
     path = save(tmp_path / "large.ply", columns(100_000))
-    stored = open_ply(path)["vertex"].data
+    stored = open_ply(path)[0]["vertex"].data
     with open_rows(path, stored) as read:
         assert float(read(slice(None))["x"].sum()) != 0
     assert resident(stored.filename) < 0.1 * stored.nbytes
+
+
+@pytest.mark.parametrize("kind", ["binary", "text", "packed"])
+@pytest.mark.parametrize(
+    ("more", "is_doubtful"), [("none", False), ("newline", False), ("padding", False), ("row", True), ("file", True)]
+)
+def test_bytes_after_the_last_row(tmp_path: Path, kind: str, more: str, is_doubtful: bool) -> None:
+    """Elements after the vertices are none: the packed harmonics follow them."""
+    path = save(tmp_path / "a.ply", columns(300, num_rest=45), text=kind == "text")
+    if kind == "packed":
+        path.write_bytes(compressed_bytes(read_ply(path).gaussians))
+    content = path.read_bytes()
+    row = content[-16:] if kind == "packed" else content[-62 * 4 :] if kind == "binary" else content.splitlines()[-1]
+    added = {"none": b"", "newline": b"\n", "padding": b"\n" * 7, "row": row, "file": content}[more]
+    path.write_bytes(content + added)
+    doubts = [doubt for doubt in list_doubts(file_notes(read_ply(path).info)) if "bytes follow" in doubt]
+    assert [doubt.split()[0] for doubt in doubts] == [f"{len(added.strip()):,}"] * is_doubtful
+
+
+def test_bytes_after_any_of_several_parts(tmp_path: Path) -> None:
+    """Not only by the first one."""
+    paths = [save(tmp_path / f"{name}.ply", columns(50)) for name in "ab"]
+    paths[1].write_bytes(paths[1].read_bytes() + bytes(100))
+    assert any("100 bytes follow" in note for note in list_doubts(file_notes(read_parts(paths).info)))
 
 
 def resident(path: str) -> int:

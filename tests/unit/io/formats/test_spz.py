@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from damage.gaussians import add_record, axes_record
 from former_formats import spz4_bytes
 from slow_readers import corners
 
-from gsmerge import Gaussians
+from gsmerge import Gaussians, SceneError
+from gsmerge.errors import list_doubts
 from gsmerge.geometry.transforms import covariances, rotate_harmonics
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.read import file_notes
@@ -137,3 +139,32 @@ def test_a_wrong_version_leaks_no_warning(tmp_path: Path) -> None:
     data = gzip.decompress(spz_bytes(some(0, 2000)))
     (tmp_path / "a.spz").write_bytes(gzip.compress(data[:4] + struct.pack("<I", 1) + data[8:]))
     assert 0 < read_gaussians(tmp_path / "a.spz").info.num_nonfinite < 2000  # warnings are errors in tests
+
+
+def checked_spz4(gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch) -> bytes:
+    """Return a ``.spz`` of version 4 whose streams have checksums."""
+    compressor = zstandard.ZstdCompressor
+    monkeypatch.setattr(zstandard, "ZstdCompressor", lambda level: compressor(level=level, write_checksum=True))
+    return spz4_bytes(gaussians)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_what_a_checksum_sees_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int) -> None:
+    """One wrong bit anywhere in the compressed columns, or a stream without its end."""
+    content = spz_bytes(some(0)) if version == 3 else checked_spz4(some(0), monkeypatch)
+    start = 10 if version == 3 else 32 + 5 * 16  # of what is compressed
+    flipped = [content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :] for at in range(start, len(content))]
+    for damaged in (*flipped, content[:-1], content[:-4], content[:-8]):
+        (tmp_path / "a.spz").write_bytes(damaged)
+        with pytest.raises(SceneError):
+            read_gaussians(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
+@pytest.mark.parametrize(("num_more", "is_doubtful"), [(15, False), (16, True)])
+def test_bytes_after_the_streams(
+    tmp_path: Path, write: Callable[[Gaussians], bytes], num_more: int, is_doubtful: bool
+) -> None:
+    (tmp_path / "a.spz").write_bytes(write(some(0)) + bytes(num_more))
+    notes = file_notes(read_gaussians(tmp_path / "a.spz").info)
+    assert [note.startswith("16 bytes follow") for note in list_doubts(notes)] == [True] * is_doubtful
