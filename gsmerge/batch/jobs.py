@@ -176,7 +176,10 @@ def find_jobs(
         outputs = _output_names(options, scene, len(jobs))
         for name in outputs:
             owners.setdefault(os.path.normcase(name), []).append(str(scene))  # on Windows A.ply and a.ply are one file
-        paths = _paths_beside(options, scene)
+        patterns = {name: getattr(options, name) for name in PLACES}
+        paths: dict[str, Any] = {
+            name: pattern if pattern == NONE else fill_template(pattern, scene) for name, pattern in patterns.items()
+        }
         jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), **paths, within=within))
     return [replace(job, clash=_find_clash(job, out, owners, inputs)) for job in jobs]
 
@@ -208,12 +211,6 @@ def _output_names(options: BatchOptions, scene: Path, index: int) -> tuple[str, 
     name = output_name(options, scene, index)
     levels = range(1, options.settings.budget.levels)
     return name, *(level_output(Path(name), level).as_posix() for level in levels)
-
-
-def _paths_beside(options: BatchOptions, scene: Path) -> dict[str, Any]:
-    """Return the paths of a scene's cameras, photos and masks by option, with its names filled into patterns."""
-    patterns = {name: getattr(options, name) for name in PLACES}
-    return {name: pattern if pattern == NONE else fill_template(pattern, scene) for name, pattern in patterns.items()}
 
 
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:

@@ -457,7 +457,11 @@ def list_plys(folder: Path) -> list[Path]:
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
     below = [] if plys else [place for place, names in _walk_down(folder, links=False) if names is None]
     plys = plys or [ply for place in natural_order(below) for ply in _plys_in(place)]
-    plys = plys or _results_in(folder)
+    plys = plys or [
+        path
+        for path in natural_order(folder.glob("[!.]*.ply"))[:_MAX_HEADERS]
+        if _RESULT.search(path.name) or header_content(path) == "result"
+    ]
     plys = plys or [path for path in [folder / META] if path.is_file() and may_hold_gaussians(path)]
     return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
 
@@ -558,11 +562,6 @@ def other_plys(folder: Path) -> list[Path]:
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
     packed = [] if scenes else [p for p in folder.glob("[!.]*") if p.suffix in _PACKED]
     return packed if len(packed) == 1 and may_hold_gaussians(packed[0]) else scenes
-
-
-def _results_in(folder: Path) -> list[Path]:
-    plys = natural_order(folder.glob("[!.]*.ply"))[:_MAX_HEADERS]
-    return [path for path in plys if _RESULT.search(path.name) or header_content(path) == "result"]
 
 
 def _is_scene(path: Path) -> bool:

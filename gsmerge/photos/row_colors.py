@@ -96,7 +96,9 @@ def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
     row_picture, opacity = _blend_layers(layers, colors.clip(0, 1))
     alpha = 1 - transmittance
     drawn = (drawing / np.maximum(alpha, np.float32(1e-3))[..., None]).clip(0, 1)
-    agree = _blurred_difference(row_picture, drawn, np.minimum(opacity, alpha)) < DISAGREE
+    weights = np.minimum(opacity, alpha)  # of the difference of both pictures, which are blurred; a mean over channels
+    red, green, blue = np.moveaxis(np.abs(blur((row_picture - drawn) * weights[..., None], BLUR)), -1, 0)
+    agree = (red + green + blue) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6))) < DISAGREE
     solid = transmittance < COVERED
     by_row = (opacity > 0) & ~(solid & ((opacity < FAINT) | ~agree))
     known = by_row | solid
@@ -120,12 +122,6 @@ def _blend_layers(layers: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.nda
         transmittance -= weight
     opacity = 1 - transmittance
     return total / np.maximum(opacity, np.float32(1e-6))[..., None], opacity
-
-
-def _blurred_difference(picture: np.ndarray, drawing: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Blur two pictures ``[h,w,3]`` with ``weights [h,w]``; return their difference ``[h,w]``, a mean over channels."""
-    red, green, blue = np.moveaxis(np.abs(blur((picture - drawing) * weights[..., None], BLUR)), -1, 0)
-    return (red + green + blue) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6)))
 
 
 def fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -38,7 +38,8 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
     shared: dict[int, dict[str, Any]] = {}  # values that views share, by id; converted once, since they may be large
     cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
     for i, entry in enumerate(entries):
-        path, name = entry.path or source.path, entry.name or _find_name(entry.values, layout.name) or f"view {i}"
+        named = (entry.values[name] for name in _alternatives(layout.name) if entry.values.get(name) not in (None, ""))
+        path, name = entry.path or source.path, entry.name or str(next(named, f"view {i}"))
         _check_keys(path, name, layout, entry)
         if id(entry.shared) not in shared:
             with number_errors(path, "expected numbers"):
@@ -78,11 +79,6 @@ def _alternatives(key: Key) -> tuple[str, ...]:
 def _find_value(values: Mapping[str, Any], key: Key) -> Any:
     """Return the value of the first alternative of a key that has a value; None if no alternative has a value."""
     return next((values[name] for name in _alternatives(key) if values.get(name) is not None), None)
-
-
-def _find_name(values: Mapping[str, Any], key: Key) -> str:
-    """Return the name of a view's image, "" if it has none."""
-    return str(next((values[name] for name in _alternatives(key) if values.get(name) not in (None, "")), ""))
 
 
 def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None:

@@ -94,7 +94,9 @@ def read_rows(path: Path) -> arrays.StoredRows:
     header, parts, extensions, num_left = read(ReadBudget(path, len(packed)), packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     axes = _stored_axes(path, extensions) if header.flags & EXTENSIONS_FLAG else PLY_AXES
-    rotate = arrays.turner(_axes_rotation(axes), header.num_higher)
+    # from these axes to those of a .ply; it mirrors if the handedness differs
+    rotation = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
+    rotate = arrays.turner(rotation * (1, -1, -1) if axes in _REVERSED else rotation, header.num_higher)
     rows = arrays.Packed(
         header.count, header.num_higher, lambda block: rotate(_unpack([part[block] for part in parts], header))
     )
@@ -119,12 +121,6 @@ def _stored_axes(path: Path, extensions: bytes) -> str:
                 raise SceneError(path, problem, "export it again without this extension")
             return AXES[number - 1] if number else PLY_AXES
     return PLY_AXES
-
-
-def _axes_rotation(axes: str) -> np.ndarray:
-    """Return the matrix ``[3,3]`` from axes to those of a ``.ply``; it mirrors if the handedness differs."""
-    rotation = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
-    return rotation * (1, -1, -1) if axes in _REVERSED else rotation
 
 
 def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int]) -> Header:

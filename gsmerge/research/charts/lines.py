@@ -191,7 +191,9 @@ def make_lines(records: Sequence[RunRecord], x: str, y: str) -> list[Line]:
     intervals = _intervals(list(by_cell.values()))
     points: dict[LineKey, list[Point]] = {}
     for ((key, size), by_scene), interval in zip(by_cell.items(), intervals, strict=True):
-        points.setdefault(key, []).append(Point(size, _mean_cost(by_scene), interval, by_scene))
+        costs = [cost for cost, _ in by_scene.values()]  # their geometric mean, which is exact if all are equal
+        mean_cost = costs[0] if min(costs) == max(costs) else float(np.exp(np.mean(np.log(costs))))
+        points.setdefault(key, []).append(Point(size, mean_cost, interval, by_scene))
     names = line_names(list(points))
     keys = sorted(points, key=lambda key: (key[0] != OURS, len(key[1])))
     return [Line(names[key], key[0] == OURS, tuple(points[key])) for key in keys]
@@ -207,12 +209,6 @@ def keep_common(scenes: Mapping[K, set[str]]) -> dict[K, set[str]]:
     covering = {name: scene_names for name, scene_names in scenes.items() if len(scene_names) >= fewest}
     common = set.intersection(*covering.values()) if covering else set()
     return {name: common or scene_names for name, scene_names in covering.items()}
-
-
-def _mean_cost(points: ByScene) -> float:
-    """Compute the geometric mean of positive costs; it is exact if all costs are equal."""
-    costs = [x for x, _ in points.values()]
-    return costs[0] if min(costs) == max(costs) else float(np.exp(np.mean(np.log(costs))))
 
 
 def _intervals(columns: Sequence[ByScene]) -> list[Interval]:

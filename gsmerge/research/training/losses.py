@@ -165,7 +165,11 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     scales, quats = teacher.scales, teacher.quats
     orders = nearest_axes(quats, g.quats)
     scales = (scales[:, None] @ orders.abs())[:, 0]
-    angles = _rotation_angles(quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats) @ orders)
+    rotations = quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats) @ orders
+    cosines = (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    angles = torch.atan2(
+        (skew_vectors(rotations).square().sum(1) + 1e-12).sqrt(), cosines
+    )  # finite gradients at 0, too
     sizes = gaussian_sizes(scales)
     distances = (g.means - teacher.means).abs() / sizes[:, None]
     stretches = (torch.log(g.scales) - torch.log(scales)).abs()
@@ -187,12 +191,6 @@ def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
     with torch.no_grad():
         between = quat_to_rotmat(reference).transpose(1, 2) @ quat_to_rotmat(quats)
         return proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
-
-
-def _rotation_angles(rotations: Tensor) -> Tensor:
-    """Compute the angles ``[n]`` of rotations ``[n,3,3]``, with a finite gradient at an angle of 0, too."""
-    cosines = (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
-    return torch.atan2((skew_vectors(rotations).square().sum(1) + 1e-12).sqrt(), cosines)
 
 
 GOAL = 0.5  # overlap of the boxes of two children at which the loss is 0
