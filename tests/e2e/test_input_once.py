@@ -68,7 +68,8 @@ def test_a_file_that_broke_off_is_a_doubt_everywhere(smallest_copy: Path, run: R
     ply.write_bytes(content.tobytes())
     doubts = json.loads(run("inspect", smallest_copy, "--json", code=0).out)["doubts"]
     assert names(doubts[0], "rows are no Gaussians", "interrupted")
-    assert "; ".join(doubts) in run("compact", smallest_copy, "-o", out.with_suffix(".ply"), *FAST, "--strict", code=4).err
+    outcome = run("compact", smallest_copy, "-o", out.with_suffix(".ply"), *FAST, "--strict", code=4)
+    assert "; ".join(doubts) in outcome.err
     for options, code in ((), 0), (("--strict",), 4):  # done, then skipped
         outcome = run("batch", smallest_copy, "-o", out, *FAST, *options, code=code)
         assert outcome.out.count("; also ".join(doubts)) == 1
