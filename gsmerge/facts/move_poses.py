@@ -5,6 +5,9 @@ itself but not with other views. The pixels of a view, at their depths, are proj
 All poses are moved at once until the greys agree. This is direct image alignment (Engel et al., "Direct Sparse
 Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. Scenes with right poses stay unchanged
 bit for bit, after one step at the smallest size.
+
+Highlights move over their surfaces with the camera, as points do under wrong poses. What harmonics say of this is part
+of the comparison, and a move that was found on greys must not spoil how far the detail of the photos agrees.
 """
 
 from __future__ import annotations
