@@ -5,6 +5,9 @@ itself but not with other views. The pixels of a view, at their depths, are proj
 All poses are moved at once until the greys agree. This is direct image alignment (Engel et al., "Direct Sparse
 Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. Scenes with right poses stay unchanged
 bit for bit, after one step at the smallest size.
+
+Highlights move over their surfaces with the camera, as points do under wrong poses. What harmonics say of this is part
+of the comparison, and a move that was found on greys must not spoil how far the detail of the photos agrees.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from gsmerge.geometry.transforms import (
 from gsmerge.kernels.compare_views import COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur
+from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.kernels.reproject import see_points
 from gsmerge.raster.photos import NEAR_PLANE, photos_of
 from gsmerge.runtime.threads import parallel_map
@@ -45,6 +49,9 @@ EARLY_PX = 1.0  # poses are considered right if the first step moves all views b
 TOGETHER = 16  # pairs per task
 ENOUGH = 1e-4  # a smaller step, in radians and canonical units, is the last
 BLUR = 0.7  # blur of the photos, standard deviation in pixels
+# Detail of photos is finer than this blur, in pixels. Highlights are smooth, and move with the camera as if its pose
+# were wrong. If poses follow them, what is drawn on the surfaces agrees less, by more than CHANCE standard errors
+DETAIL, CHANCE = 2.0, 2.0
 # Prior error of a pose, radians and canonical units, and the weight of this prior
 PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
 LIMIT_PX = 1.5  # a pose counts as wrong if it moves by more than this, in pixels of the views
@@ -64,7 +71,7 @@ class _Level:
     Ks: np.ndarray  # [v,3,3]
     scale: float  # Pixels of the views per pixel
     points: np.ndarray  # [n,3] float64, sampled points of all views, in their cameras' frames
-    greys: np.ndarray  # [n] float32, grey of each point
+    greys: np.ndarray  # [p,m] float32, greys that the second view of a pair should show at the points of the first
     starts: np.ndarray  # [v+1] first point of each view
     depths: np.ndarray  # [v,h,w] depths of the Gaussians at the pixels' middles, canonical units; NaN without one
     start: np.ndarray  # [v,4,4] poses as they were given
@@ -87,7 +94,8 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
     The photos of ``views`` show the scene; other views are not moved. With ``always`` even small errors are corrected.
-    The median motion of the views is subtracted. Returns None if no pose is wrong, or if the photos cannot decide.
+    The median motion of the views is subtracted. Returns None if no pose is wrong, if the photos cannot decide, or if
+    their detail disagrees after the move.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
@@ -99,10 +107,14 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     for side in sides:
         check = side == sides[0] != sides[-1] and not always
         level = _make_level(scene, pairs, largest / side, FIRST_PIXELS if check else SAMPLE_PIXELS)
-        viewmats, initial, final = _descend(level, viewmats, check=check)
-        before = initial if side == sides[0] else _compare(level, start)
+        viewmats, final = _descend(level, viewmats, check=check)
+        before = _compare(level, start)
         if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, final, end=side == sides[-1])):
             return None
+    detail = _make_level(scene, pairs, largest / sides[-1], SAMPLE_PIXELS, detail=True)
+    worse = _compare(detail, viewmats).costs - _compare(detail, start).costs
+    if not always and worse.sum() > CHANCE * np.sqrt((worse * worse).sum()):
+        return None
     moved = np.unique(pairs)  # all other views keep their poses
     viewmats[moved] = without_common_motion(start[moved], viewmats[moved], np.median)
     return move_views(scene, viewmats)
@@ -128,8 +140,11 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     return np.array(sorted(pairs), np.int64)
 
 
-def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: int) -> _Level:
-    """Shrink the photos by ``level``, and sample the pixels of each photo with the largest gradients."""
+def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: int, *, detail: bool = False) -> _Level:
+    """Shrink the photos by ``level``, and sample the pixels of each photo with the largest gradients.
+
+    With ``detail`` photos are their differences from a blurred copy.
+    """
     photos = photos_of(scene.images, scene.cameras, level)
     shape = photos.height, photos.width
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)
@@ -138,8 +153,9 @@ def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: 
     spread = 0.5 + np.random.default_rng(0).random(shape)  # so that the pixels do not all lie on one edge
     spread[:BORDER] = spread[-BORDER:] = spread[:, :BORDER] = spread[:, -BORDER:] = 0
 
-    def sample_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        grey = blur(photos.images[view].mean(-1, dtype=np.float32), BLUR)
+    def sample_view(view: int) -> tuple[np.ndarray, ...]:
+        grey = photos.images[view].mean(-1, dtype=np.float32)
+        grey = blur(grey, BLUR) - (blur(grey, DETAIL) if detail else np.float32(0))
         down, right = np.gradient(grey)
         rows = fronts[view][nearest]
         depth = camera_depths(means[rows], scene.cameras.viewmats[view])
@@ -150,32 +166,50 @@ def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: 
         y, x = np.divmod(ids, photos.width)
         pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
         points = matmul(pixels, invert(photos.Ks[view]).T) * depth.ravel()[ids, None]
-        return np.stack([grey, right, down], -1), points, grey.ravel()[ids], depth
+        return np.stack([grey, right, down], -1), points, grey.ravel()[ids], rows.ravel()[ids], depth
 
-    pictures, points, greys, depths = zip(*parallel_map(sample_view, range(len(scene))), strict=True)
+    pictures, points, greys, ids, depths = zip(*parallel_map(sample_view, range(len(scene))), strict=True)
     return _Level(
         np.stack(pictures), photos.Ks.astype(np.float64), scene.cameras.width / photos.width,
-        np.concatenate(points), np.concatenate(greys), np.cumsum([0, *map(len, greys)]),
+        np.concatenate(points), _expect_greys(scene, pairs, greys, ids), np.cumsum([0, *map(len, greys)]),
         np.stack(depths), scene.cameras.viewmats.astype(np.float64), pairs,
     )  # fmt: skip
 
 
-def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, _Evidence, _Evidence]:
-    """Improve poses by Gauss-Newton steps at one size; return the poses, and the evidence before and after.
+def _expect_greys(
+    scene: PicturedScene, pairs: np.ndarray, greys: Sequence[np.ndarray], rows: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Return the greys that the second view of each pair should show: those of the first, changed by harmonics.
+
+    A highlight moves over its surface with the camera, as if the pose were wrong.
+    """
+    g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
+    look = g.means.astype(np.float32, copy=False), g.sh0, g.shN
+    expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)
+    for pair, (view, other) in zip(expected, pairs, strict=True):
+        ids = rows[view].astype(np.int32)
+        here, there = np.empty((2, len(ids), 3), np.float32)
+        view_colors(*look, ids, eyes[view], 0, len(ids), here)
+        view_colors(*look, ids, eyes[other], 0, len(ids), there)
+        pair[: len(ids)] = greys[view] + (there.clip(max=1) - here.clip(max=1)).mean(1)  # photos show nothing brighter
+    return expected
+
+
+def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, _Evidence]:
+    """Improve poses by Gauss-Newton steps at one size; return the poses, and the evidence for them.
 
     ``check``: take few steps, and only one step if it moves no view far.
     """
-    initial = evidence = _compare(level, viewmats)
     max_steps = FIRST_STEPS if check else STEPS
     for step in range(max_steps + 1):
-        evidence = _compare(level, viewmats) if step else initial
+        evidence = _compare(level, viewmats)
         if step == max_steps or (check and step == 1 and _flows(level, evidence).max() < EARLY_PX):
             break
         change = _solve_step(level, viewmats, evidence)
         viewmats = matmul(viewmats, motion_matrices(change))
         if np.abs(change).max() < ENOUGH:
             break
-    return viewmats, initial, evidence
+    return viewmats, evidence
 
 
 def _solve_step(level: _Level, viewmats: np.ndarray, evidence: _Evidence) -> np.ndarray:
@@ -195,7 +229,7 @@ def _solve_step(level: _Level, viewmats: np.ndarray, evidence: _Evidence) -> np.
 
 def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
     """Compare the pixels of the first view of each pair with the photo of the second view, for the given poses."""
-    count, max_points = len(level.pairs), int(np.diff(level.starts).max())
+    count, max_points = level.greys.shape
     evidence = _Evidence(np.empty((count, 6, 6)), np.empty((count, 6)), np.empty(count), np.empty(count))
 
     def compare_pairs(begin: int) -> None:

@@ -352,8 +352,8 @@ def harmonics_rotation(num: int, rotation: np.ndarray) -> np.ndarray:
     Each degree is fitted to the same colours in rotated directions, which is exact.
     """
     directions = normalize(np.random.default_rng(0).normal(size=(DIRECTIONS, 3)))
-    before = _harmonics_in(matmul(directions, rotation), num)
-    after = _harmonics_in(directions, num)
+    before = harmonics_in(matmul(directions, rotation), num)
+    after = harmonics_in(directions, num)
     return solve(matmul(after.T, after), matmul(after.T, before))
 
 
@@ -363,7 +363,7 @@ def apply_harmonics_rotation(shN: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows.reshape(-1, 3, len(matrix)).swapaxes(1, 2), shN.dtype)
 
 
-def _harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
+def harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
     """Evaluate the higher harmonics in directions ``[d,3]``; return ``[d,num]`` float64."""
     means = directions.astype(np.float32)
     count = len(means)

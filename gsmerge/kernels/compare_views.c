@@ -78,8 +78,8 @@ API int32_t compare_views(const double *points, const float *greys, const int64_
                           const double *viewmats, const double *given, const double *Ks, const float *pictures,
                           const double *depths, double near, double border, double scale, int64_t first, int64_t last,
                           double *scratch, int64_t *order, double *curvatures, double *slopes, double *costs,
-                          double *flows, int64_t n, int64_t ends, int64_t p, int64_t v, int64_t h, int64_t w,
-                          int64_t columns, int64_t room) {
+                          double *flows, int64_t n, int64_t p, int64_t room, int64_t ends, int64_t v, int64_t h,
+                          int64_t w, int64_t columns) {
   (void)n, (void)p;
   if (ends != v + 1 || columns != COLUMNS) return OUTSIDE;
   Columns s = {.order = order};
@@ -104,7 +104,7 @@ API int32_t compare_views(const double *points, const float *greys, const int64_
       for (int c = 0; c < 3; c++) s.world[c][m] = now.world[c];
       s.x[m] = now.x, s.y[m] = now.y, s.z[m] = now.z;
       s.right[m] = (double)sample[1] * K[0] / now.z, s.down[m] = (double)sample[2] * K[4] / now.z;
-      s.residual[m] = (double)sample[0] - greys[i];
+      s.residual[m] = (double)sample[0] - greys[k * room + i - begin];
       s.value[m++] = sqrtf8(times(du, du, dv, dv));
     }
     costs[k] = flows[k] = 0.0;

@@ -10,7 +10,7 @@ COLUMNS = 10  # values of scratch per pixel
 
 
 @native(
-    STATUS, points=f8("n", 3), greys=f4("n"), starts=i8("ends", least=0, most="n", ascending=True),
+    STATUS, points=f8("n", 3), greys=f4("p", "room"), starts=i8("ends", least=0, most="n", ascending=True),
     pairs=i8("p", 2, least=0, below="v"), viewmats=f8("v", 4, 4), given=f8("v", 4, 4), Ks=f8("v", 3, 3),
     pictures=f4("v", "h", "w", 3),
     depths=f8("v", "h", "w"), near=f8(), border=f8(), scale=f8(), first=i8(least=0), last=i8(most="p"),
@@ -23,10 +23,11 @@ def compare_views(
 ):  # fmt: skip
     """Compare pixels of one view with the photo of another, for the pairs of views ``first`` to ``last``.
 
-    Pixels are given as ``points`` in the frame of their camera, with their ``greys``. The pixels of view i have the
-    rows ``starts[i]`` to ``starts[i + 1]``.
+    Pixels are given as ``points`` in the frame of their camera. The pixels of view i have the rows ``starts[i]`` to
+    ``starts[i + 1]``.
 
     Args:
+        greys: For each pair, the grey levels that the second view should show at the pixels of the first.
         pictures: Grey level, and its derivatives to the right and down; pixels nearer than ``border`` to the edge of a
             picture are not used.
         depths: Depths of the Gaussians at the pixels' centres; NaN without any.

@@ -12,15 +12,24 @@ import scenes
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.compact import build_cleaned
 from gsmerge.compaction.make_plan import make_plan
-from gsmerge.facts.move_poses import move_poses
+from gsmerge.facts.move_poses import CHANCE, move_poses
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
-from gsmerge.geometry.transforms import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
+from gsmerge.geometry.transforms import (
+    harmonics_in,
+    motion_matrices,
+    motion_vectors,
+    normalize,
+    pose_changes,
+    project,
+    quat_to_rotmat,
+)
 from gsmerge.geometry.transforms import without_common_motion as without_common
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
 
 VIEWS = range(5)
+GLOSS = 0.2  # strength of a highlight's harmonics
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +51,17 @@ def worst_error(scene: Scene, truth: Scene) -> tuple[float, float]:
     return float(degrees.max()), float(distances.max())
 
 
+def with_highlight(scene: Scene) -> Scene:
+    """The scene with harmonics of degree 3, brightest where a wall at right angles to z mirrors a lamp."""
+    g, eyes = scene.gaussians, scene.cameras.centres.repeat(scene.pixels_per_view, 0)
+    lamp = np.array([0.0, -0.2, 2 * np.median(g.means[:, 2]) - np.median(eyes[:, 2])])  # in the mirror
+    lobes, seen = (harmonics_in(normalize(away), 15) for away in (lamp - g.means, g.means - eyes))
+    lobes *= GLOSS
+    bright = (lobes * seen).sum(1).reshape(*scene.images.shape[:3], 1)
+    shiny = replace(g, shN=lobes[:, :, None].repeat(3, 2).astype(np.float32))
+    return replace(scene, gaussians=shiny, images=(scene.images + bright).clip(0, 1).astype(np.float32))
+
+
 def test_moved_gaussians_stay_at_their_pixels(scene: Scene) -> None:
     moved = motions.disagreeing(scene)
     for view in VIEWS:
@@ -57,6 +77,20 @@ def test_moved_gaussians_stay_at_their_pixels(scene: Scene) -> None:
 
 def test_views_that_agree_are_left_alone(scene: Scene) -> None:
     assert move_poses(scene, VIEWS) is None
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["harmonics", "none"])
+def test_highlights_are_no_wrong_poses(known: bool, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wall mirrors a lamp, whose image moves with the camera; only detail tells if Gaussians have no harmonics."""
+    glossy = with_highlight(scene)
+    seen = glossy if known else replace(glossy, gaussians=replace(glossy.gaussians, shN=scene.gaussians.shN))
+    monkeypatch.setattr("gsmerge.facts.move_poses.CHANCE", np.inf if known else CHANCE)
+    assert move_poses(seen, VIEWS) is None
+
+
+def test_wrong_poses_of_views_with_highlights_are_mended(scene: Scene) -> None:
+    wrong = motions.disagreeing(with_highlight(scene))
+    assert worst_error(move_poses(wrong, VIEWS), scene)[0] < 0.1 * worst_error(wrong, scene)[0]
 
 
 @pytest.mark.parametrize("views", [slice(None), slice(1, 2)], ids=["all", "one"])
