@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gsmerge.facts.place_cameras import place_inside, place_viewpoints, stand_inside
+from gsmerge.kernels.elementary import cos, sin
 from gsmerge.runtime.record import record_run
 from gsmerge.types import NO_CAMERAS, Gaussians, make_scene
 
@@ -20,9 +21,9 @@ def scene_around(share: float = 1.0, power: float = 1.0, count: int = 6000) -> G
     i = np.arange(count) + 0.5
     heights, angles = 1 - 2 * share * i / count, np.pi * (1 + 5**0.5) * i
     radii = np.sqrt(1 - heights**2)
-    directions = np.stack([radii * np.cos(angles), -heights, radii * np.sin(angles)], 1)
+    directions = np.stack([radii * cos(angles), -heights, radii * sin(angles)], 1)
     distances = np.where(heights > 0, 200.0, np.minimum(1.6 / np.maximum(-heights, 1e-3), 60.0))
-    sizes = 0.01 * distances**power * np.random.default_rng(0).uniform(0.8, 1.25, count)
+    sizes = 0.01 * (distances if power else 1.0) * np.random.default_rng(0).uniform(0.8, 1.25, count)
     quats = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
     scales = np.repeat(sizes[:, None], 3, 1).astype(np.float32)
     sh0 = np.random.default_rng(1).normal(0, 0.5, (count, 1, 3)).astype(np.float32)
