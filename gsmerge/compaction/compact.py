@@ -26,6 +26,7 @@ from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, search_count
 from gsmerge.errors import Doubt, DoubtWarning, TargetError
 from gsmerge.facts.crop import crop_scene
+from gsmerge.facts.place_cameras import stand_inside
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
@@ -99,7 +100,7 @@ def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Pro
         scene = as_scene(scene)
         if options.clean.crop is not None:
             scene = crop_scene(scene.numpy(), options.clean.crop)
-        result = _compact_scene(scene, options)
+        result = _compact_scene(stand_inside(scene), options)
         if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
             result = result.to_single()
         return replace(result, scene=source, names=scene.names)

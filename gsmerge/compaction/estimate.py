@@ -13,6 +13,7 @@ from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.crop import crop_scene
+from gsmerge.facts.place_cameras import stand_inside
 from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.geometry.frame import canonicalise
@@ -45,7 +46,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """
     if options.clean.crop is not None:
         scene = crop_scene(scene.numpy(), options.clean.crop)
-    num_input, (scene, *_) = scene.num_gaussians, without_repeats(scene)
+    num_input, (scene, *_) = scene.num_gaussians, without_repeats(stand_inside(scene))
     size = measure_size(scene)
     if (options.budget.auto or options.budget.is_limit) and scene.has_own_pixels:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))

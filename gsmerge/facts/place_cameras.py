@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.facts.viewer import GOLDEN, find_viewer, sphere
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices, motion_vectors, nearest_views, normalize
-from gsmerge.kernels.elementary import cos, sin
+from gsmerge.kernels.elementary import cos, power, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.photos.views import concat_cameras, resize_cameras, take_rows
 from gsmerge.raster import contributions, make_splats, render, tile_view
@@ -29,9 +30,9 @@ ABOVE = -0.25  # height of the ring of viewpoints, in its radii; y points down
 FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
 WALKED = 0.6  # length of a walk to each side of the median, as a share of the longest half axis
-GOLDEN = np.pi * (1 + math.sqrt(5))  # angle between successive directions that spreads them evenly
 DIRECTIONS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length
+WIDE, PIXEL = 5 / 3, 1.5  # field of cameras that look from inside (80 degrees), and their pixel in standard deviations
 PROBE = 96  # pixels per side of the pictures for choosing candidates
 SMALLEST, LARGEST = 96, 640  # pixels per side
 CLEAR = 0.02  # near plane, as a share of the scene's radius
@@ -47,6 +48,9 @@ OUTSIDE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share of al
 NEAREST, FARTHEST = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
 
+STANDING = (
+    "no cameras: the scene was made around a viewer, from whose place it is fitted and scored; --cameras names others"
+)
 PLACED_VIEWS = "no cameras: views are placed around and inside the scene"
 NO_VIEWS = (
     f"{PLACED_VIEWS}, and the result cannot be better than its input;"
@@ -66,8 +70,32 @@ def add_views(scene: Scene, *, shown: bool = False) -> Scene:
     return scene
 
 
+def stand_inside(scene: Scene) -> Scene:
+    """Place cameras where the viewer of a scene without cameras stands, with a note, if it was made around a viewer."""
+    cameras = place_inside(scene.gaussians.numpy()) if len(scene) == 0 and len(scene.gaussians) else None
+    if cameras is None:
+        return scene
+    note(STANDING)
+    return _with_cameras(scene.numpy(), cameras)
+
+
+def place_inside(gaussians: Gaussians) -> Cameras | None:
+    """Place cameras to all sides where the viewer of a scene stands; None if it was not made around a viewer."""
+    viewer = find_viewer(gaussians[:: -(-len(gaussians) // SAMPLE_GAUSSIANS)])
+    if viewer is None:
+        return None
+    size = int(np.clip(round(WIDE / (PIXEL * viewer.angle)), SMALLEST, LARGEST))
+    radii = viewer.free * power(np.arange(NUM_VIEWS) * GOLDEN / np.pi % 1, 1 / 3)  # even in the free ball
+    eyes = viewer.place + radii[:, None] * sphere(NUM_VIEWS)[::-1]
+    viewmats = np.stack([_look(eye, direction) for eye, direction in zip(eyes, sphere(NUM_VIEWS), strict=True)])
+    return Cameras(viewmats, np.repeat(_lens(size, WIDE)[None], NUM_VIEWS, 0), size, size)
+
+
 def place_viewpoints(gaussians: Gaussians) -> Cameras:
-    """Place cameras for people to look from: first on a ring around the scene, for objects, then inside, for rooms."""
+    """Place cameras for people to look from: where a viewer stands; or else first around the scene, then inside."""
+    standing = place_inside(gaussians)
+    if standing is not None:
+        return standing
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
     centre, half = _extent(thin_out(gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64))
     angles = 2 * np.pi * np.arange(len(inside)) / len(inside)
@@ -107,7 +135,7 @@ def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
     """
     means = thin_out(scene.gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64)
     centre, half = _extent(means)
-    outside = [_around(centre, half, radii, _sphere(count)) for radii in (FAR_RADII, NEAR_RADII)]
+    outside = [_around(centre, half, radii, sphere(count)) for radii in (FAR_RADII, NEAR_RADII)]
     within = [_walk(np.median(means, axis=0), half, count // 2), place_cameras(scene.gaussians, count).viewmats]
     viewmats = np.concatenate([*outside, *within])
     more = replace(scene.cameras, viewmats=viewmats, Ks=np.repeat(scene.cameras.Ks[:1], len(viewmats), 0))
@@ -194,9 +222,9 @@ def place_cameras(
     return Cameras(viewmats[best], np.repeat(_lens(size)[None], len(best), 0), size, size)
 
 
-def _lens(size: int) -> np.ndarray:
+def _lens(size: int, field: float = FIELD) -> np.ndarray:
     """Return the intrinsics ``[3,3]`` of a placed camera with images of ``size`` pixels per side."""
-    return np.array([[size / FIELD, 0, size / 2], [0, size / FIELD, size / 2], [0, 0, 1]])
+    return np.array([[size / field, 0, size / 2], [0, size / field, size / 2], [0, 0, 1]])
 
 
 def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -207,19 +235,11 @@ def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (low + high) / 2, np.maximum(half, 1e-3 * widest)
 
 
-def _sphere(count: int) -> np.ndarray:
-    """Return directions ``[count,3]`` spread evenly over the sphere (golden spiral)."""
-    i = np.arange(count) + 0.5
-    height, angle = 1 - 2 * i / count, GOLDEN * i
-    radius = np.sqrt(1 - height**2)
-    return np.stack([radius * cos(angle), height, radius * sin(angle)], 1)
-
-
 def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
-    inside = [_look(centre + position * half, direction) for position in grid for direction in _sphere(DIRECTIONS)]
-    return np.concatenate([_around(centre, half, FAR_RADII, _sphere(AROUND)), inside])
+    inside = [_look(centre + position * half, direction) for position in grid for direction in sphere(DIRECTIONS)]
+    return np.concatenate([_around(centre, half, FAR_RADII, sphere(AROUND)), inside])
 
 
 def _around(centre: np.ndarray, half: np.ndarray, radii: float, directions: np.ndarray) -> np.ndarray:

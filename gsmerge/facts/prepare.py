@@ -15,6 +15,7 @@ from gsmerge.facts.move_poses import move_poses
 from gsmerge.facts.pixels import raise_sizes, with_pixels
 from gsmerge.facts.place_cameras import (
     NO_VIEWS,
+    STANDING,
     add_scored_views,
     add_views,
     blank_pictures,
@@ -22,6 +23,7 @@ from gsmerge.facts.place_cameras import (
     draw_pictures,
     draw_placed,
     keep_finite,
+    place_inside,
 )
 from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
 from gsmerge.geometry.frame import Frame, canonicalise, sample_rows
@@ -247,7 +249,7 @@ def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:
 def views_notes(scene: Scene) -> list[str]:
     """Return the notes of a run about repeated views and about missing views or photos, without comparing colours."""
     if len(scene) == 0:
-        return [NO_VIEWS]
+        return [NO_VIEWS if place_inside(scene.gaussians) is None else STANDING]
     shows_rows = scene.images is None and scene.is_shown and len(scene) > 0  # the rows' own colours replace photos
     return [*without_repeats(scene)[2], *([NO_PHOTOS] if shows_rows else [])]
 

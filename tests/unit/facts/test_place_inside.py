@@ -1,0 +1,66 @@
+"""Cameras of a scene without cameras stand where its viewer stands, if it was made around one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmerge.facts.place_cameras import place_inside, place_viewpoints, stand_inside
+from gsmerge.kernels.elementary import cos, sin
+from gsmerge.runtime.record import record_run
+from gsmerge.types import NO_CAMERAS, Gaussians, make_scene
+
+PLACE = np.array([3.0, -2.0, 5.0])
+
+
+def scene_around(share: float = 1.0, power: float = 1.0, count: int = 6000) -> Gaussians:
+    """Gaussians in directions from a place, down to a height that leaves a ``share`` of them; sky and near ground.
+
+    Sizes grow with the distance to a ``power``.
+    """
+    i = np.arange(count) + 0.5
+    heights, angles = 1 - 2 * share * i / count, np.pi * (1 + 5**0.5) * i
+    radii = np.sqrt(1 - heights**2)
+    directions = np.stack([radii * cos(angles), -heights, radii * sin(angles)], 1)
+    distances = np.where(heights > 0, 200.0, np.minimum(1.6 / np.maximum(-heights, 1e-3), 60.0))
+    sizes = 0.01 * (distances if power else 1.0) * np.random.default_rng(0).uniform(0.8, 1.25, count)
+    quats = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+    scales = np.repeat(sizes[:, None], 3, 1).astype(np.float32)
+    sh0 = np.random.default_rng(1).normal(0, 0.5, (count, 1, 3)).astype(np.float32)
+    means = (PLACE + distances[:, None] * directions).astype(np.float32)
+    return Gaussians(means, quats, scales, np.full(count, 0.9, np.float32), sh0, np.zeros((count, 0, 3), np.float32))
+
+
+def test_cameras_stand_near_the_place_and_look_to_all_sides() -> None:
+    cameras = place_inside(scene_around())
+    assert cameras is not None
+    assert np.linalg.norm(cameras.centres - PLACE, axis=1).max() < 0.5  # what is nearest is 1.6 away
+    forward = cameras.viewmats[:, 2, :3]
+    assert np.linalg.norm(forward.mean(0)) < 0.1
+    assert (place_viewpoints(scene_around()).viewmats == cameras.viewmats).all()
+
+
+@pytest.mark.parametrize(
+    ("share", "power"), [(0.3, 1.0), (1.0, 0.0)], ids=["a part of the directions", "sizes of one object"]
+)
+def test_other_scenes_are_seen_from_elsewhere(share: float, power: float) -> None:
+    gaussians = scene_around(share, power)
+    assert place_inside(gaussians) is None
+    scene = make_scene(gaussians, NO_CAMERAS)
+    assert stand_inside(scene) is scene
+
+
+def test_outliers_do_not_move_the_place() -> None:
+    gaussians = scene_around()
+    means = gaussians.means.copy()
+    means[::20] += np.random.default_rng(2).normal(0, 500, (len(means[::20]), 3)).astype(np.float32)
+    cameras = place_inside(Gaussians(**{**vars(gaussians), "means": means}))
+    assert cameras is not None
+    assert np.linalg.norm(cameras.centres - PLACE, axis=1).max() < 0.6
+
+
+def test_the_note_says_so_once() -> None:
+    with record_run() as record:
+        assert len(stand_inside(make_scene(scene_around(), NO_CAMERAS))) == 24
+    assert len(record.notes) == 1
+    assert "around a viewer" in record.notes[0]
