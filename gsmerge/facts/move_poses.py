@@ -184,10 +184,10 @@ def _expect_greys(
     A highlight moves over its surface with the camera, as if the pose were wrong.
     """
     g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
-    look = g.means.astype(np.float32, copy=False), g.sh0, g.shN
     expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)
     for pair, (view, other) in zip(expected, pairs, strict=True):
-        ids = rows[view].astype(np.int32)
+        look = [np.ascontiguousarray(values[rows[view]], np.float32) for values in (g.means, g.sh0, g.shN)]
+        ids = np.arange(len(rows[view]), dtype=np.int32)
         here, there = np.empty((2, len(ids), 3), np.float32)
         view_colors(*look, ids, eyes[view], 0, len(ids), here)
         view_colors(*look, ids, eyes[other], 0, len(ids), there)
