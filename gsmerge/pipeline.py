@@ -76,7 +76,7 @@ def encode_views(
 def fit(starts: list[Decoded], prepared: Prepared, plan: Plan) -> Fitted:
     """Fit Gaussians to the pictures of the views; of several ``starts``, return the best result."""
     if plan.merges_pairs:
-        return fit_pairs(starts, prepared, plan.fit, plan.seed, plan.target_psnr or 0.0)
+        return fit_pairs(starts, prepared, plan.fit, plan.seed)
     [start] = starts
     if start.is_input and prepared.reference.name == RENDERS:  # the pictures show exactly these Gaussians
         return unfitted(start, prepared)

@@ -17,26 +17,16 @@ from gsmerge.types import Decoded, Gaussians
 FITTED = 16  # views of each kind for a fit without cameras, and half as many on a walk
 FITTED_LONG, LONG = 48, 600  # views of each kind for a long fit; a fit is long from LONG steps on
 
-# PSNR (dB) that a fit may lose in a view that it was not trained on, for each of the powers of masses in
-# :data:`gsmerge.stages.pair_merge.POWERS`. It is larger for objects, because few people view them from inside
-TOLERANCES = 0.0, 3.0
-NEAR_INPUT = 36.0  # PSNR (dB) against renders of the input; nobody sees further gains of a fit
 
+def fit_pairs(starts: Sequence[Decoded], prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
+    """Fit the best of several starts to renders of the input.
 
-def fit_pairs(starts: Sequence[Decoded], prepared: Prepared, options: FitOptions, seed: int, target: float) -> Fitted:
-    """Fit the best of several starts to renders of the input, unless it looks like the input already.
-
-    ``starts`` were merged by the powers of masses in :data:`gsmerge.stages.pair_merge.POWERS`, in this order. If the
-    scene has no views of its own, each start is fitted, and the best result is returned. ``target`` is the requested
-    PSNR (dB).
+    If the scene has no views of its own, each start is fitted, and the best result is returned.
     """
     photos, views = scene_photos(prepared.scene), prepared.reference.score_views
     psnrs = [score_photos(start.gaussians, photos, views, every=4).psnr for start in starts]
     best = int(np.argmax(psnrs))
     if options.fit == "none":
-        return unfitted(starts[best], prepared)
-    if psnrs[best] >= max(NEAR_INPUT, target):
-        note("there is no fit, because the merged Gaussians look like the input already")
         return unfitted(starts[best], prepared)
     if prepared.reference.placed:
         return fit_to_placed(starts, best, prepared, options, seed)
@@ -61,9 +51,8 @@ def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: in
 def fit_to_placed(starts: Sequence[Decoded], best: int, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
     """Fit each start to renders from placed views, and return the result with the best score in held-out views.
 
-    ``best`` is the start with the best score before the fits. A start is returned unfitted, with a note, if no fit was
-    accepted, or if the best fit does not gain on average or lowers the score of a held-out view by more than the
-    tolerance.
+    ``best`` is the start with the best score before the fits. It is returned unfitted, with a note, if no fit was
+    accepted, or if the best fit does not gain on average.
     """
     scene = prepared.scene_placed(FITTED_LONG if options.steps >= LONG else FITTED)
     placed = range(len(prepared.scene), len(scene))
@@ -73,7 +62,7 @@ def fit_to_placed(starts: Sequence[Decoded], best: int, prepared: Prepared, opti
     if any(accepted):
         best = int(np.argmax([psnrs.mean() for psnrs in after]))
     gains = after[best] - score_views(starts[best].gaussians, prepared)
-    if accepted[best] and gains.mean() > 0 and gains.min() >= -TOLERANCES[best]:
+    if accepted[best] and gains.mean() > 0:
         return replace(fits[best], cameras=prepared.scene.cameras)
     note("there is no fit, because a fit to placed views shows held-out views worse; --cameras allows a better fit")
     return unfitted(starts[best], prepared)

@@ -41,7 +41,6 @@ from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions, Tuning
 from gsmerge.settings.stages import MAX_CHILDREN, SHARE, MatchOptions
 from gsmerge.stages import sky
-from gsmerge.stages.fit_pairs import NEAR_INPUT
 
 ROOT = Path(__file__).parents[2]
 FIT, RATES, PAPER = FitOptions(), Tuning(), RECIPES["paper"]
@@ -118,7 +117,6 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"samples for {FIT.half_res_part:g} of the steps".replace(" 0.", " ."),
         f"a weight that grows from 0 to {RATES.edge_weight:g} over the run",
         f"(**kept**: every {word(RATES.outside_every, ordinal=True)}, {outside.PLACES})",
-        f"no fit from {NEAR_INPUT:g} dB on",
         f"step sizes {plan.RENDERS_STEPS:g} times the usual",
     ),
     COMPACT: (
