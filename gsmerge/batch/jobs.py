@@ -153,11 +153,11 @@ def find_jobs(
     """Find all scenes, each once, and name their results in the output folder.
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
-    line. ``results`` has the real paths of former results, which are not scenes. ``looks`` gets the folders
-    that look like scenes, for :func:`describe_lost`. A scene to which several paths lead is named by
-    that with the fewest links. A result that would have the name of
-    another result or of a scene's file is a ``clash`` of its job. SceneError if an argument does not exist or has no
-    scene, if cameras, photos or masks for all scenes do not exist, or if networks cannot be used.
+    line. ``results`` has the real paths of former results, which are not scenes. ``looks`` gets the folders that look
+    like scenes, for :func:`describe_lost`. A scene to which several paths lead is named by that with the fewest links.
+    A result that would have the name of another result or of a scene's file is a ``clash`` of its job. SceneError if an
+    argument does not exist or has no scene, if cameras, photos or masks for all scenes do not exist, or if networks
+    cannot be used.
     """
     if options.settings.checkpoint not in CHECKPOINTS:
         load_checkpoint(options.settings.checkpoint)  # fail once, not for each scene

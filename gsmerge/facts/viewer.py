@@ -42,10 +42,8 @@ def find_viewer(gaussians: Gaussians) -> Viewer | None:
     if not sizes.all() or _spread(sizes) == 0:
         return None
     order = np.argsort(sizes, kind="stable")
-    starts = (
-        np.median(means[order[: (len(means) + 1) // 2]], 0),
-        _solve_squares(means, sizes),
-    )  # the nearer half is smaller
+    # Gaussians of the nearer half are smaller
+    starts = np.median(means[order[: (len(means) + 1) // 2]], 0), _solve_squares(means, sizes)
     solutions = [_solve(means, sizes, start) for start in starts]
     least = min(error for _, error in solutions)
     views = [_look_around(means, place) for place, error in solutions if error <= LIKELY * least]

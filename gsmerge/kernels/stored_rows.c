@@ -12,8 +12,8 @@ static inline bool unit_quat(const float *q, float *out) {
 }
 
 API int64_t convert_rows(const float *rows, const int32_t *places, float most_position, float most_harmonic,
-                         float most_log_scale, float *means, float *quats, float *scales, float *opacities, float *sh0, float *shN, int64_t n,
-                         int64_t columns, int64_t used, int64_t rest) {
+                         float most_log_scale, float *means, float *quats, float *scales, float *opacities, float *sh0,
+                         float *shN, int64_t n, int64_t columns, int64_t used, int64_t rest) {
   if (used != 14 + rest) return 0;
   const int32_t *of_sh0 = places + 3, *of_rest = places + 6, *of_scales = of_rest + rest, *of_quats = of_scales + 3;
   for (int64_t first = 0; first < n; first += LINE) {

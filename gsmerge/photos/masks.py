@@ -23,7 +23,7 @@ from gsmerge.io.photo_files import (
     image_size,
     limit_size,
     same_shape,
-)  # fmt: skip
+)
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.photos.offsets import SIDE

@@ -493,9 +493,9 @@ def _make_load(
     names = () if camera_file is None else camera_file.names
     scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)
     last_rows = () if pixels is None else pixels.fronts.max((1, 2))  # of each view, -1 for none
-    bare = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
-    have = f"{len(bare)} of {len(scene)} views {'has' if len(bare) == 1 else 'have'} no Gaussians: {list_some(bare)}"
-    doubts = [Doubt(have)] if bare else []
+    empty = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
+    number = f"{len(empty)} of {len(scene)} views {'has' if len(empty) == 1 else 'have'}"
+    doubts = [Doubt(f"{number} no Gaussians: {list_some(empty)}")] if empty else []
     scene = read_rotations(scene, hints.quats)
     if recovery is not None and result.given is not None:
         scene = move_views(scene, result.given)

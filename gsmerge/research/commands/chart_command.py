@@ -15,7 +15,7 @@ from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import write_texts
 from gsmerge.errors import UsageError
-from gsmerge.measure.documents import note_entries
+from gsmerge.measure.documents import document_head, note_entries
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS
 from gsmerge.settings.setting import Settings, flat_settings, setting
@@ -114,7 +114,6 @@ def _run_all(args: opt.Args, runs: Sequence[Run], measured: EvaluateOptions) -> 
 
 def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     """Draw charts, page and table of all runs in the folder, and print a summary; ``notes`` were printed before."""
-    from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.research.charts.chart_page import list_held_out_notes, make_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures
     from gsmerge.research.charts.lines import Results
