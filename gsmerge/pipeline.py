@@ -19,10 +19,9 @@ from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_corrector
 from gsmerge.stages.fill import fill_between
-from gsmerge.stages.fit_pairs import fit_pairs, unfitted
+from gsmerge.stages.fit_pairs import fit_around, merge_pairs
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge
-from gsmerge.stages.pair_merge import POWERS, merge_neighbors
 from gsmerge.stages.prune import split_unseen
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, Segmentation
@@ -33,16 +32,13 @@ Build = Callable[[Prepared, Plan, int | None], Fitted]
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
-    starts = decode_pairs(prepared, plan, count) if plan.merges_pairs else [decode_views(prepared, plan, count)]
-    fitted = fit(starts, prepared, plan)
-    return prune_and_fill(fitted, starts[0], prepared, plan)
+    start = (decode_pairs if plan.merges_pairs else decode_views)(prepared, plan, count)
+    return prune_and_fill(fit(start, prepared, plan), start, prepared, plan)
 
 
-def decode_pairs(prepared: Prepared, plan: Plan, count: int | None) -> list[Decoded]:
-    """Merge neighbours pair by pair into ``count`` Gaussians, once for each power of their masses."""
-    count = plan.limits.default if count is None else count
-    merged = (merge_neighbors(prepared.scene.gaussians, count, power) for power in POWERS)
-    return [Decoded(gaussians, count, exact=True) for gaussians in merged]
+def decode_pairs(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
+    """Merge neighbours pair by pair into ``count`` Gaussians."""
+    return merge_pairs(plan.limits.default if count is None else count, plan.power, prepared)
 
 
 def decode_views(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
@@ -73,13 +69,12 @@ def encode_views(
     return correct(pooled, members, scene.cameras, networks, weaken=plan.weakens), members, segmentation, networks
 
 
-def fit(starts: list[Decoded], prepared: Prepared, plan: Plan) -> Fitted:
-    """Fit Gaussians to the pictures of the views; of several ``starts``, return the best result."""
+def fit(start: Decoded, prepared: Prepared, plan: Plan) -> Fitted:
+    """Fit Gaussians to the pictures of the views."""
     if plan.merges_pairs:
-        return fit_pairs(starts, prepared, plan.fit, plan.seed)
-    [start] = starts
+        return fit_around(start, prepared, plan.fit, plan.seed)
     if start.is_input and prepared.reference.name == RENDERS:  # the pictures show exactly these Gaussians
-        return unfitted(start, prepared)
+        return Fitted(start.gaussians, prepared.scene.cameras, None)
     return fit_scene(start, prepared.scene, plan.fit, plan.seed)
 
 

@@ -35,6 +35,7 @@ from gsmerge.settings.stages import (
     MatchOptions,
     SegmentOptions,
 )
+from gsmerge.stages.pair_merge import POWERS
 from gsmerge.stages.segment import SharedTree, SuperpixelChoices
 from gsmerge.types import Scene
 
@@ -51,12 +52,7 @@ USUAL_VIEWS = 12  # views up to which the steps of an effort are enough
 FIDELITY_PSNR = 32.5
 # By default, results with photos but without pixels show the photos at most so many dB worse than the input
 FIDELITY_LOSS = 0.3
-# A scene without views gets one step of the fit for every PER_STEP + count / PER_DRAWN of its Gaussians, where count is
-# the number in the result; at most the steps of the effort
-PER_STEP, PER_DRAWN = 700, 40
-RENDERS_STEPS = 0.35  # step sizes of a fit to renders instead of photos, relative to the usual: it begins near to them
-PLACED_STEPS = 0.2  # the same for placed views, which say less about other views
-NO_FIT = "without cameras there is a fit only with --effort best, or with the default effort and a --budget"
+NO_FIT = "without cameras a draft has no fit: --effort fast has one"
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
 WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
 BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same two limits in views, if blocks see little of each other
@@ -73,12 +69,15 @@ class Effort:
     merges: bool = True  # Merge Gaussians of different views
     refines: bool = True  # With `checkpoint="auto"`, run all networks, not only the heads
     prunes: bool = True  # Without a fit, leave out Gaussians that no photo shows
+    fits_alone: bool = True  # Fit scenes without cameras, to views that are placed for it
     large_photos: bool = True  # With `photo_scale="auto"`, allow photos larger than the views
     report_views: int = REPORT_VIEWS  # Views that input and result are scored on for the report alone
 
 
 EFFORTS = {
-    "draft": Effort(36, 1.0, 0, merges=False, refines=False, prunes=False, large_photos=False, report_views=3),
+    "draft": Effort(
+        36, 1.0, 0, merges=False, refines=False, prunes=False, fits_alone=False, large_photos=False, report_views=3
+    ),
     "fast": Effort(55, 1.0, 0, refines=False, large_photos=False),
     "default": Effort(STEPS, 2.0, 0),
     "best": Effort(900, 3.0, 1),
@@ -106,6 +105,7 @@ class Plan:
     seed: int  # Everything random depends on it alone
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
+    power: float = POWERS[0]  # Power of the masses by which pairs are merged
     free_poses: bool = False  # The options ask for moved cameras, even where the scene does not need it
     samples: bool = False  # Only the report needs the scores, so a sample of the pixels is scored
     new_views: bool = False  # Estimate the quality of new views
@@ -263,8 +263,7 @@ def choose_for_scene(
     the options as they were given; None: for these options.
     """
     keeps = keeps_fidelity(scene, options) if keeps is None else keeps
-    if scene.num_views == 0 and (keeps or resolve_fit(options).steps <= SHORT_STEPS) and options.effort != "best":
-        # a fit needs placed views, which are not worth it for few steps, or for the many counts of a search
+    if scene.num_views == 0 and options.fit.fit_steps is None and not EFFORTS[options.effort].fits_alone:
         options = replace(options, fit=replace(options.fit, fit="none"))
     segment, decode = options.segment, resolve_decode(options, scene)
     if segment.superpixels == AUTO:  # only computation on the scene could decide it
@@ -273,9 +272,6 @@ def choose_for_scene(
     fit = resolve_fit(options)
     share = limits.share if fit.share is None and scene.num_views else fit.share
     steps = steps_for(options, scene.num_views, USUAL_SHARE if share is None else share)
-    if scene.num_views == 0 and options.fit.fit_steps is None and options.effort != "best":
-        work = PER_STEP + (limits.count or limits.default) // PER_DRAWN
-        steps = min(steps, max(SHORT_STEPS, scene.num_gaussians // work))
     grow_steps = max(GROW_STEPS, GROW_ROUNDS * scene.num_views)
     fit = replace(fit, fit_steps=steps, share=share, grow_steps=grow_steps)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
@@ -492,15 +488,13 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) ->
 def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
     """Fill in the settings of a fit to renders of the input.
 
-    The steps are small, because the merged Gaussians are near to the renders already. Long thin Gaussians are allowed,
-    because the input may have them. The fit is not scored on held-out patches, and Gaussians beyond all views are kept,
-    because they belong to the scene.
+    Long thin Gaussians are allowed, because the input may have them. The fit is not scored on held-out patches.
+    Gaussians beyond all views, and those that show little, are kept, because they belong to the scene.
     """
-    placed = prepared.reference.placed
-    if placed and fit.fit == "none" != options.fit.fit:
+    if prepared.reference.placed and fit.fit == "none" != options.fit.fit:
         note(NO_FIT)
-    tuning = replace(fit.tuning.scaled(PLACED_STEPS if placed else RENDERS_STEPS), max_ratio=math.inf)
-    return replace(fit, scored=False, beyond=True, tuning=tuning)
+    tuning = replace(fit.tuning, max_ratio=math.inf)
+    return replace(fit, scored=False, beyond=True, fills=True, min_contribution=0.0, tuning=tuning)
 
 
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:

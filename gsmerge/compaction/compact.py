@@ -26,7 +26,6 @@ from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, search_count
 from gsmerge.errors import Doubt, DoubtWarning, TargetError
 from gsmerge.facts.crop import crop_scene
-from gsmerge.facts.place_cameras import stand_inside
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
@@ -100,7 +99,7 @@ def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Pro
         scene = as_scene(scene)
         if options.clean.crop is not None:
             scene = crop_scene(scene.numpy(), options.clean.crop)
-        result = _compact_scene(stand_inside(scene), options)
+        result = _compact_scene(scene, options)
         if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
             result = result.to_single()
         return replace(result, scene=source, names=scene.names)
@@ -200,6 +199,16 @@ def run_search(search: CountSearch, build: Build, rebuild: Rebuild, prepared: Pr
         return clean_best(search.best, prepared, plan)
     search.run(partial(build_scored, build, prepared, plan))
     return search.best
+
+
+def find_count(scene: Scene, options: CompactOptions) -> int | None:
+    """Find the number of Gaussians that a run makes of a scene without cameras if a PSNR decides it."""
+    with use_threads(options.threads), record_part(silent=True):
+        method = choose_method(options, scene)
+        prepared = method.prepare(scene.numpy(), options.prepare)
+        search = search_count(prepared, add_target(make_plan(prepared, options), prepared), method.build)
+        search.run(partial(build_scored, method.build, prepared, search.plan))
+    return search.count
 
 
 @record_part()

@@ -16,7 +16,6 @@ from gsmerge.facts.counts import LEVEL_FACTOR, CountLimits
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.runtime.record import Part
 from gsmerge.settings.compact import OURS
-from gsmerge.stages.pair_merge import POWERS
 from gsmerge.types import Scene
 
 IMPORT_SECONDS = 1.0  # imports, and the constant part of every run
@@ -60,8 +59,7 @@ class RunCosts:
             work += COST_PAPER if "paper" in (settings["recipe"], settings["checkpoint"]) else COST_NETWORKS
         view_pixels = min(self.num_pixels, PLACED_PIXELS) if self.is_placed else self.view_pixels
         step = COST_STEP * view_pixels + COST_DRAWN * self.inside * count
-        num_fits = len(POWERS) if self.is_placed else 1
-        return Part(self.num_pixels * work / 1e6, num_fits * steps * step / 1e6, num_fits)
+        return Part(self.num_pixels * work / 1e6, steps * step / 1e6)
 
     def end(self, counts: Sequence[float], trial: Part | None) -> list[Part]:
         """Return the parts that follow a result: levels of ``counts`` Gaussians, a trial, the scores of the input."""

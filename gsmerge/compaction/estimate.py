@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
+from gsmerge.compaction.compact import find_count
 from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.files import Outputs, sized
 from gsmerge.compaction.make_plan import load_networks
@@ -13,7 +14,6 @@ from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.crop import crop_scene
-from gsmerge.facts.place_cameras import stand_inside
 from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.geometry.frame import canonicalise
@@ -29,6 +29,7 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
 from gsmerge.values.words import count_words
 
+SEARCHED = 500_000  # Gaussians of a scene without cameras up to which a search takes seconds
 BESIDE = ("cameras", "images", "masks", "protect")  # files and folders that are read with the Gaussians
 
 
@@ -46,7 +47,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """
     if options.clean.crop is not None:
         scene = crop_scene(scene.numpy(), options.clean.crop)
-    num_input, (scene, *_) = scene.num_gaussians, without_repeats(stand_inside(scene))
+    num_input, (scene, *_) = scene.num_gaussians, without_repeats(scene)
     size = measure_size(scene)
     if (options.budget.auto or options.budget.is_limit) and scene.has_own_pixels:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
@@ -54,19 +55,22 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     limits, settings = choices.limits, choices.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)
     max_count = pixels if options.method.startswith("unmerged") else limits.count or limits.default
-    count = min(scene.num_gaussians or pixels, max_count)
+    count, alone = min(scene.num_gaussians or pixels, max_count), stands_alone(scene, options)
+    has_target = choices.keeps_fidelity or options.budget.target_psnr is not None
+    searched = find_count(scene, options) if alone and has_target and num_input <= SEARCHED else None
+    count = searched or count
     at_once, num_rest = gaussians_at_once(pixels, choices.blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count
     threads, kind = (
         options.threads or available_threads(),
         {OURS: choices.fit.fit, "unmerged-fit": "full"}.get(options.method, "none"),
     )
-    steps, alone = 0 if kind == "none" else choices.fit.steps, stands_alone(scene, options)
+    steps = 0 if kind == "none" else choices.fit.steps
     num_pixels, budget = at_once * choices.blocks, options.budget
     inside = 1.0 if alone else mean_inside(scene)
     costs = RunCosts(settings, num_pixels, num_pixels / max(1, len(scene)), inside, steps, alone, alone)
     parts = expected_parts(
-        costs, limits, drawn, has_target=choices.keeps_fidelity or budget.target_psnr is not None,
+        costs, limits, drawn, has_target=has_target,
         has_curve=budget.auto or budget.max_drop is not None, max_drop=budget.max_drop, rendered=size.rendered,
         levels=budget.levels, has_trial=steps > 0 and scene.has_own_pixels and options.new_views is not False,
     )  # fmt: skip
@@ -75,9 +79,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
-        "exact": options.budget.is_filled,
-        "psnr_kept": FIDELITY_PSNR if choices.keeps_fidelity and size.rendered else None,
-        "quality": options.budget.quality,
+        "exact": options.budget.is_filled or searched is not None,
+        "psnr_kept": FIDELITY_PSNR if choices.keeps_fidelity and size.rendered and searched is None else None,
+        "quality": options.budget.quality if searched is None else None,
         "loss_kept": FIDELITY_LOSS if choices.keeps_fidelity and not size.rendered else None,
         "ratio": count / max(1, num_input),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),

@@ -19,6 +19,7 @@ from gsmerge.plan import (
 )
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
+from gsmerge.stages.fit_pairs import choose_power
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
@@ -33,7 +34,11 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     check_pictures(prepared, options)
     with stage("prepare"):
         checkpoint = checkpoint or load_networks(options, prepared.size)
-        return decide(prepared, fill_options(prepared, options), checkpoint)
+        plan = decide(prepared, fill_options(prepared, options), checkpoint)
+        if not plan.merges_pairs:
+            return plan
+        count = plan.limits.count or plan.limits.default
+        return replace(plan, power=choose_power(count, prepared, plan.fit, plan.seed))
 
 
 def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import Prepared, prepare, prepare_alone
+from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, stands_alone
@@ -80,7 +81,7 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
         kinds = (PrepareOptions, SegmentOptions, MatchOptions, DecodeOptions)  # settings that act on views
         unused = options.changed(name for kind in kinds for name in flat_settings(kind) if name not in COUNTS)
         notes = [f"these settings have no effect without cameras: {', '.join(unused)}"] if unused else []
-        return replace(SUPERPIXELS, prepare=prepare_alone), notes
+        return replace(SUPERPIXELS, prepare=partial(prepare, pixels=False)), notes
     method = find_method(options)
     if method is SUPERPIXELS:
         return method, []

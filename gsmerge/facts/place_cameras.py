@@ -21,8 +21,8 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 NUM_VIEWS = 24  # most cameras that are placed
-MAX_SCORED, SCORED_SIZE = 8, 512  # most views for scores, and their most pixels per side
-FEWER = 3  # for views that are used only for scores, every third candidate is tried
+HELD_OUT = 8  # of so many placed cameras, one is held out from the fit, for scores
+FITTED = 16  # cameras of each kind for a scene without cameras, and half as many on a walk
 SAMPLE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
 EXTENT = (0.05, 0.95)  # quantiles of the positions along each axis between which the scene is assumed to lie
 AROUND = 40  # candidate cameras around the scene
@@ -65,18 +65,17 @@ def add_views(scene: Scene, *, shown: bool = False) -> Scene:
     """
     scene = keep_finite(scene)
     if len(scene) == 0:
-        scene = _with_cameras(scene, (place_viewpoints if shown else place_cameras)(scene.gaussians))
-        note(NO_VIEWS)
+        inside = place_inside(scene.gaussians)
+        note(NO_VIEWS if inside is None else STANDING)
+        cameras = inside or (place_viewpoints if shown else place_around)(scene.gaussians)
+        order = sorted(range(len(cameras)), key=lambda view: -((view + 1) % HELD_OUT == 0))  # those held out first
+        scene = _with_cameras(scene.gaussians, cameras if shown else cameras[order])
     return scene
 
 
-def stand_inside(scene: Scene) -> Scene:
-    """Place cameras where the viewer of a scene without cameras stands, with a note, if it was made around a viewer."""
-    cameras = place_inside(scene.gaussians.numpy()) if len(scene) == 0 and len(scene.gaussians) else None
-    if cameras is None:
-        return scene
-    note(STANDING)
-    return _with_cameras(scene.numpy(), cameras)
+def _with_cameras(gaussians: Gaussians, cameras: Cameras) -> Scene:
+    """Return a scene of Gaussians and placed cameras, without pictures."""
+    return Scene(gaussians, cameras, None, None, tuple(f"placed {view}" for view in range(len(cameras))))
 
 
 def place_inside(gaussians: Gaussians) -> Cameras | None:
@@ -122,35 +121,18 @@ def keep_finite(scene: Scene) -> Scene:
     return scene
 
 
-def _with_cameras(scene: Scene, cameras: Cameras) -> Scene:
-    """Return a scene of the same Gaussians with placed cameras, without pictures."""
-    return Scene(scene.gaussians, cameras, None, None, tuple(f"placed {view}" for view in range(len(cameras))))
+def place_around(gaussians: Gaussians, count: int = FITTED) -> Cameras:
+    """Place cameras to which a scene without cameras is fitted, and on which results are scored.
 
-
-def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
-    """Add renders of a canonical scene from placed views, which come last.
-
-    There are ``count`` views far away, ``count`` views near by, ``count`` views at positions that show most of the
-    scene, and half as many on a walk. The transmittance of the renders becomes their ``empty``.
+    There are ``count`` cameras far away, ``count`` near by, at most ``count`` at positions that show most of the scene,
+    and half as many on a walk.
     """
-    means = thin_out(scene.gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64)
+    means = thin_out(gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64)
     centre, half = _extent(means)
     outside = [_around(centre, half, radii, sphere(count)) for radii in (FAR_RADII, NEAR_RADII)]
-    within = [_walk(np.median(means, axis=0), half, count // 2), place_cameras(scene.gaussians, count).viewmats]
-    viewmats = np.concatenate([*outside, *within])
-    more = replace(scene.cameras, viewmats=viewmats, Ks=np.repeat(scene.cameras.Ks[:1], len(viewmats), 0))
-    drawn = render(scene.gaussians, more)
-    images = np.concatenate([scene.images, drawn.images.clip(0, 1)])
-    empty = np.concatenate([np.zeros(scene.images.shape[:3], np.float32), 1 - drawn.alphas[..., 0]])
-    names = (*scene.names, *(f"around {view}" for view in range(len(more))))
-    return replace(
-        scene, cameras=concat_cameras(scene.cameras, more), images=images, empty=empty, names=names, pixels=None
-    )
-
-
-def add_scored_views(scene: Scene) -> Scene:
-    """Add a few small views on which results of a scene without views are scored."""
-    return _with_cameras(scene, place_cameras(scene.gaussians, MAX_SCORED, largest=SCORED_SIZE, step=FEWER))
+    chosen, walk = place_cameras(gaussians, count), _walk(np.median(means, axis=0), half, count // 2)
+    viewmats = np.concatenate([*outside, chosen.viewmats, walk])
+    return replace(chosen, viewmats=viewmats, Ks=np.repeat(chosen.Ks[:1], len(viewmats), 0))
 
 
 def blank_pictures(scene: Scene) -> PicturedScene:
@@ -160,8 +142,10 @@ def blank_pictures(scene: Scene) -> PicturedScene:
 
 
 def draw_pictures(scene: Scene) -> PicturedScene:
-    """Render a canonical scene into its views and use the renders as its pictures."""
-    return PicturedScene.with_pictures(scene, render(scene.gaussians, scene.cameras).images.clip(0, 1), None)
+    """Render a canonical scene into its views and use the renders as its pictures, with what they leave empty."""
+    drawn = render(scene.gaussians, scene.cameras)
+    pictured = PicturedScene.with_pictures(scene, np.clip(drawn.images, 0, 1, out=drawn.images), None)
+    return replace(pictured, empty=1 - drawn.alphas[..., 0])
 
 
 def draw_around(scene: PicturedScene) -> PicturedScene:
@@ -176,9 +160,11 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
     more = outside_cameras(means[:: max(1, len(means) // SAMPLE_GAUSSIANS)], scene.cameras, count, NEAREST, FARTHEST)
     if views <= FEW_VIEWS:
         more = concat_cameras(between_cameras(scene.cameras), more)
-    images = np.concatenate([scene.images, render(scene.gaussians, more).images.clip(0, 1)])
-    names = (*scene.names, *(f"around {view}" for view in range(len(more))))
-    return replace(scene, cameras=concat_cameras(scene.cameras, more), images=images, names=names, pixels=None)
+    drawn = draw_pictures(_with_cameras(scene.gaussians, more))
+    return replace(
+        drawn, cameras=concat_cameras(scene.cameras, more), names=(*scene.names, *drawn.names),
+        images=np.concatenate([scene.images, drawn.images]), empty=np.concatenate([scene.empty, drawn.empty]),
+    )  # fmt: skip
 
 
 def between_cameras(cameras: Cameras, *further: float) -> Cameras:
@@ -199,26 +185,23 @@ def between_cameras(cameras: Cameras, *further: float) -> Cameras:
     return replace(cameras, viewmats=matmul(viewmats[views], moves), Ks=cameras.Ks[views])
 
 
-def place_cameras(
-    gaussians: Gaussians, num_views: int = NUM_VIEWS, *, largest: int = LARGEST, step: int = 1
-) -> Cameras:
+def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     """Place cameras that see as much of the scene as possible.
 
     Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it, looking in all
     directions. They are chosen one by one, at most ``num_views``. The next camera is always the candidate that shows
     the most opacity not shown yet, in pictures of a sample of the Gaussians. Images are square and grow with the number
-    of Gaussians up to ``largest`` pixels per side. Only every ``step``-th candidate is tried, on a sample smaller by
-    this factor. Raises ValueError if there is no Gaussian.
+    of Gaussians up to ``LARGEST`` pixels per side. Raises ValueError if there is no Gaussian.
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
-    sample = thin_out(gaussians, SAMPLE_GAUSSIANS // step)
+    sample = thin_out(gaussians, SAMPLE_GAUSSIANS)
     centre, half = _extent(sample.means.astype(np.float64))
-    viewmats = _candidates(centre, half)[::step]
+    viewmats = _candidates(centre, half)
     candidates = Cameras(viewmats, np.repeat(_lens(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
     shares = _shares_seen(sample, candidates, CLEAR * float(np.sqrt((half * half).sum())))
     best = _choose_candidates(shares, num_views, LEAST_GAIN)
-    size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, largest))
+    size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, LARGEST))
     return Cameras(viewmats[best], np.repeat(_lens(size)[None], len(best), 0), size, size)
 
 

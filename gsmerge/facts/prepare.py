@@ -14,15 +14,13 @@ from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.move_poses import move_poses
 from gsmerge.facts.pixels import raise_sizes, with_pixels
 from gsmerge.facts.place_cameras import (
+    HELD_OUT,
     NO_VIEWS,
     STANDING,
-    add_scored_views,
     add_views,
     blank_pictures,
     draw_around,
     draw_pictures,
-    draw_placed,
-    keep_finite,
     place_inside,
 )
 from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
@@ -44,7 +42,7 @@ class Reference:
 
     name: str  # "photos", or the name of the pictures that replace them
     score_views: tuple[int, ...]  # Views whose pictures results are scored on
-    placed: bool = False  # The scene has no views of its own; its views were placed, only for scores
+    placed: bool = False  # The scene has no views of its own; those for scores were placed, and no fit sees them
     # [v,h,w,3] unchanged photos of the input scene, if the run changed some of them
     photo_files: np.ndarray | None = field(default=None, compare=False, repr=False)
 
@@ -92,17 +90,6 @@ class Prepared:
         """The canonical scene with additional renders from around its views, which a fit to renders needs."""
         return draw_around(self.scene)
 
-    @cached_property
-    def _placed(self) -> dict[int, PicturedScene]:
-        """Scenes with placed views that were drawn already, by their number."""
-        return {}
-
-    def scene_placed(self, views: int) -> PicturedScene:
-        """Return the canonical scene with additional renders of it from placed views, drawn once for each number."""
-        if views not in self._placed:
-            self._placed[views] = draw_placed(self.scene, views)
-        return self._placed[views]
-
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
         if cameras is self.scene.cameras:
@@ -129,11 +116,13 @@ def prepare(
     *,
     fill: bool = True,
     outside: bool = True,
+    pixels: bool = True,
 ) -> Prepared:
     """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
     ``frame``: canonical frame; None: the scene's own. ``fill``: add Gaussians at pixels that only pictures show.
     ``outside``: draw pictures of a part that no view sees; not if other views, of which these are a part, see it.
+    ``pixels``: find the pixels of placed views, which superpixels need.
     Raises ValueError if there is no finite Gaussian, or if there are images without cameras.
     """
     options = options or PrepareOptions()
@@ -141,7 +130,8 @@ def prepare(
     for text in notes:
         note(text)
     scene, frame = canonicalise(add_views(scene), frame)
-    scene = raise_sizes(with_pixels(scene), placed=len(input_scene) == 0)
+    placed = len(input_scene) == 0
+    scene = raise_sizes(with_pixels(scene) if pixels or not placed else scene, placed=placed)
     prepared = _with_references(input_scene, scene, frame, tuple(repeated), options)
     files = _photos_before(input_scene, prepared)
     prepared = replace(prepared, reference=replace(prepared.reference, photo_files=files))
@@ -152,12 +142,12 @@ def prepare(
             note(agreement.advice)
         prepared = replace(prepared, agreement=agreement)
     prepared = _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
-    if not outside or scene.has_own_pixels or len(input_scene) == 0:
+    if not outside or scene.has_own_pixels or placed:
         return prepared
     drawn, reference = draw_outside(prepared.scene), prepared.reference
     if reference.name == RENDERS and drawn is not prepared.scene:  # all pixels of all pictures are drawings
-        placed = range(len(prepared.scene), len(drawn))
-        drawn, reference = replace(drawn, masks=None), replace(reference, score_views=(*reference.score_views, *placed))
+        views = (*reference.score_views, *range(len(prepared.scene), len(drawn)))
+        drawn, reference = replace(drawn, masks=None), replace(reference, score_views=views)
     return replace(prepared, scene=drawn, reference=reference)
 
 
@@ -206,13 +196,14 @@ def _with_references(
     elif own:
         reference = Reference(ROW_COLORS, every)
     else:
-        lacks_photos = input_scene.images is None
+        placed, lacks_photos = len(input_scene) == 0, input_scene.images is None
         reason = "no photos, and the rows are not the pixels of the views" if lacks_photos else "photos do not count"
         remedy = "; name photos with --images" if lacks_photos else ""
-        note(f"{reason}: renders of the scene itself are used instead{remedy}")
-        scene = draw_pictures(scene)
-        shown = tuple(view for view in every if scene.images[view].any())  # any result equals an empty view
-        return Prepared(input_scene, scene, frame, Reference(RENDERS, shown or every), repeated, False)
+        if not placed:  # a note says so
+            note(f"{reason}: renders of the scene itself are used instead{remedy}")
+        scene, scored = draw_pictures(scene), every[: len(every) // HELD_OUT] if placed else every
+        shown = tuple(view for view in scored if scene.images[view].any())  # any result equals an empty view
+        return Prepared(input_scene, scene, frame, Reference(RENDERS, shown or scored, placed), repeated, False)
     input_scene, moved = _with_photos(input_scene, scene, repeated), None
     if own:  # each view's Gaussians have the exposure and the pose of the view
         scene = equalise_exposure(scene, reference.score_views, options.exposure)
@@ -273,19 +264,6 @@ def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
                 return scene, not views or bool(record.choices)
         colored = add_row_colors(replace(canonical, images=None, large_photos=None, masks=None))
     return replace(scene, images=colored.images, masks=colored.masks), False
-
-
-@stage("prepare")
-def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
-    """Bring a scene without views into its canonical frame, and add pictures for scores.
-
-    These pictures are not used for a fit. Raises ValueError if there is no finite Gaussian.
-    """
-    finite = keep_finite(scene)
-    note(NO_VIEWS)
-    scored, frame = canonicalise(add_scored_views(finite))
-    reference = Reference(RENDERS, tuple(range(len(scored))), placed=True)
-    return Prepared(scene, draw_pictures(raise_sizes(scored, placed=True)), frame, reference, (), moved=False)
 
 
 def _with_photos(input_scene: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:

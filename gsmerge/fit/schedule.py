@@ -64,6 +64,7 @@ class FitJob:
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay unchanged; None: none
     # If renders stand for photos, the result is scored on this number of first photos; None: on all photos
     num_scored: int | None = None
+    held_out: Photos | None = None  # Photos that the result is scored on in place of these, and no step draws
     outside: Outside | None = None  # Views from outside, in which some steps clear fog and veils; None: no such steps
     edges: Edges | None = None  # Edges of the views, at which Gaussians are cut; None: no cuts
     region: Region | None = None  # Region in which centres stay; None: everywhere
@@ -218,8 +219,7 @@ class Schedule:
         if not self.views_left:
             self.views_left = self.rng.permutation(len(self.run.job.photos[0])).tolist()
         view, background, mask = self.views_left.pop(), self.rng.random(3, dtype=np.float32), None
-        job = self.run.job
-        if job.num_scored is not None and job.photos[0].empty is None:  # renders are black where the scene is empty
+        if self.run.job.num_scored is not None and number % 2:  # renders, which most viewers show before black
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
             mask = self.rng.random(count, dtype=np.float32) >= self.run.dropout

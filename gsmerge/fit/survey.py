@@ -128,10 +128,10 @@ def score_state(state: FitState, run: FitRun, half: Photos) -> float:
     return score_images(render_photos(state.splats, half, colors=state.view_colors(), views=views), run, half)
 
 
-def photo_error(gaussians: Gaussians, photos: Photos) -> float:
-    """Return the mean squared error of renders against whole photos."""
+def photo_mses(gaussians: Gaussians, photos: Photos) -> np.ndarray:
+    """Return the mean squared errors ``[v]``, above 0, of renders against whole photos."""
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
         return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
 
-    return float(np.mean(photo_errors(gaussians, photos, score)))
+    return np.array(photo_errors(gaussians, photos, score)) + np.finfo(np.float32).tiny

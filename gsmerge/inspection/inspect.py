@@ -14,7 +14,7 @@ from gsmerge.compaction.estimate import estimate, estimate_lines
 from gsmerge.errors import Doubt, SceneError
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.pixels import raise_sizes, with_pixels
-from gsmerge.facts.place_cameras import add_scored_views
+from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
@@ -137,7 +137,7 @@ def _prepare_quietly(scene: Scene) -> tuple[Scene, list[str]]:
     if len(scene.gaussians) == 0:
         return scene, []
     with record_part(silent=True) as record:
-        canonical = canonicalise(scene if len(scene) else add_scored_views(scene))[0]
+        canonical = canonicalise(add_views(scene))[0]
         raised = raise_sizes(with_pixels(canonical) if len(scene) else canonical, placed=len(scene) == 0)
         if raised.images is not None:
             compare_photos(PicturedScene.with_pictures(raised, raised.images, raised.masks))
@@ -198,8 +198,9 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     canonical, notes = _prepare_quietly(distinct)
     agreement = confirm_depths(canonical)
     doubt, depth = unlike_captures(canonical.gaussians), None if agreement is None else agreement.advice
+    all_notes = [*load.notes, *views_notes(scene), *notes, doubt and Doubt(doubt), depth]
     facts: dict[str, Any] = {
-        **note_entries([*load.notes, *views_notes(scene), *notes, *filter(None, [doubt and Doubt(doubt), depth])]),
+        **note_entries(list(dict.fromkeys(filter(None, all_notes)))),
         "num_views": len(load.scene),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),

@@ -91,10 +91,10 @@ class Photos:
         return len(self.images)
 
     def __getitem__(self, views: Sequence[int]) -> Photos:
-        """Select the photos of some views; return the same object, without a copy, for all views in order."""
-        ids = list(views)
-        if ids == list(range(len(self))):
-            return self
+        """Select the photos of some views, without a copy if they are consecutive."""
+        ids: list[int] | slice = list(views)
+        if views and ids == list(range(views[0], views[0] + len(views))):
+            ids = slice(views[0], views[0] + len(views))
         maps = (self.weights, self.empty, self.importance)
         selected = (None if values is None else values[ids] for values in maps)
         return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, *selected)

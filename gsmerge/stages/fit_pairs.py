@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,65 +10,51 @@ import numpy as np
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.raster.photos import scene_photos, score_photos
-from gsmerge.runtime.record import note, stage
+from gsmerge.runtime.record import record_part
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Decoded, Gaussians
+from gsmerge.stages.pair_merge import POWERS, merge_neighbors
+from gsmerge.types import Decoded
 
-FITTED = 16  # views of each kind for a fit without cameras, and half as many on a walk
-FITTED_LONG, LONG = 48, 600  # views of each kind for a long fit; a fit is long from LONG steps on
-
-
-def fit_pairs(starts: Sequence[Decoded], prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
-    """Fit the best of several starts to renders of the input.
-
-    If the scene has no views of its own, each start is fitted, and the best result is returned.
-    """
-    photos, views = scene_photos(prepared.scene), prepared.reference.score_views
-    psnrs = [score_photos(start.gaussians, photos, views, every=4).psnr for start in starts]
-    best = int(np.argmax(psnrs))
-    if options.fit == "none":
-        return unfitted(starts[best], prepared)
-    if prepared.reference.placed:
-        return fit_to_placed(starts, best, prepared, options, seed)
-    return fit_around(starts[best], prepared, options, seed)
+SHORT = 60  # steps of a fit that tells which of two starts becomes better
+# Step sizes of a fit to renders, relative to the usual, if all Gaussians stay: a start is near to the renders, and the
+# distance from one Gaussian to the next is as the root of their number
+STEP = 0.09
 
 
-def unfitted(start: Decoded, prepared: Prepared) -> Fitted:
-    """Return a start as the result of a fit that was not made."""
-    return Fitted(start.gaussians, prepared.scene.cameras, None)
+def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int) -> float:
+    """Choose the power of the masses with which most views look best after a short fit of ``count`` Gaussians."""
+    photos = scene_photos(prepared.scene)
+    tuning = replace(options.tuning, outside_from=1.0)  # no steps outside, where nothing is scored
+    short = replace(options, fit_steps=min(options.steps, SHORT), tuning=tuning)
+
+    def score(power: float) -> float:
+        with record_part(silent=True):
+            start = merge_pairs(count, power, prepared)
+            gaussians = fit_around(start, prepared, short, seed).gaussians
+        psnrs = [score_photos(gaussians, photos, [view], every=4).psnr for view in range(len(photos))]
+        return float(np.median(psnrs))
+
+    return max(POWERS, key=score)
+
+
+def merge_pairs(count: int, power: float, prepared: Prepared) -> Decoded:
+    """Merge neighbours pair by pair into ``count`` Gaussians."""
+    return Decoded(merge_neighbors(prepared.scene.gaussians, count, power), count, exact=True)
 
 
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
-    """Fit a start to renders of the scene's own views; a long fit also uses renders of views around them."""
-    scene = prepared.scene_around if options.grows else prepared.scene
-    fitted = fit_scene(start, scene, options, seed, num_scored=len(prepared.scene))
+    """Fit a start to renders of the scene; a long fit also uses renders of views around its own.
+
+    If the scene has no views of its own, no fit sees those on which it is scored. A start that the fit shows worse is
+    returned as it is.
+    """
+    share = len(start.gaussians) / len(prepared.scene.gaussians)
+    options = replace(options, tuning=options.tuning.scaled(min(1.0, STEP / math.sqrt(share))))
+    scene, reference = prepared.scene_around if options.grows else prepared.scene, prepared.reference
+    held_out = reference.score_views if reference.placed else ()
+    views = [view for view in range(len(scene)) if view not in held_out]
+    num_own = len(prepared.scene) - len(held_out)
+    fitted = fit_scene(start, scene, options, seed, views=views, num_scored=num_own, held_out=held_out)
     accepted = fitted.report is not None and fitted.report.accepted
     gaussians = fitted.gaussians if accepted else start.gaussians
     return replace(fitted, gaussians=gaussians, cameras=prepared.scene.cameras)
-
-
-@stage("fit")
-def fit_to_placed(starts: Sequence[Decoded], best: int, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
-    """Fit each start to renders from placed views, and return the result with the best score in held-out views.
-
-    ``best`` is the start with the best score before the fits. It is returned unfitted, with a note, if no fit was
-    accepted, or if the best fit does not gain on average.
-    """
-    scene = prepared.scene_placed(FITTED_LONG if options.steps >= LONG else FITTED)
-    placed = range(len(prepared.scene), len(scene))
-    fits = [fit_scene(start, scene, options, seed, views=placed, num_scored=len(placed)) for start in starts]
-    accepted = [fit.report is not None and fit.report.accepted for fit in fits]
-    after = [score_views(fit.gaussians, prepared) for fit in fits]
-    if any(accepted):
-        best = int(np.argmax([psnrs.mean() for psnrs in after]))
-    gains = after[best] - score_views(starts[best].gaussians, prepared)
-    if accepted[best] and gains.mean() > 0:
-        return replace(fits[best], cameras=prepared.scene.cameras)
-    note("there is no fit, because a fit to placed views shows held-out views worse; --cameras allows a better fit")
-    return unfitted(starts[best], prepared)
-
-
-def score_views(gaussians: Gaussians, prepared: Prepared) -> np.ndarray:
-    """Return the PSNR (dB) ``[v]`` of each scored view."""
-    photos = scene_photos(prepared.scene)
-    return np.array([score_photos(gaussians, photos, [view]).psnr for view in prepared.reference.score_views])

@@ -40,7 +40,7 @@ from gsmerge.settings.compact import RECIPES, method_names
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions, Tuning
 from gsmerge.settings.stages import MAX_CHILDREN, SHARE, MatchOptions
-from gsmerge.stages import sky
+from gsmerge.stages import fit_pairs, sky
 
 ROOT = Path(__file__).parents[2]
 FIT, RATES, PAPER = FitOptions(), Tuning(), RECIPES["paper"]
@@ -117,7 +117,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"samples for {FIT.half_res_part:g} of the steps".replace(" 0.", " ."),
         f"a weight that grows from 0 to {RATES.edge_weight:g} over the run",
         f"(**kept**: every {word(RATES.outside_every, ordinal=True)}, {outside.PLACES})",
-        f"step sizes {plan.RENDERS_STEPS:g} times the usual",
+        f"{fit_pairs.STEP:g} / sqrt(share that stays)",
     ),
     COMPACT: (
         f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",

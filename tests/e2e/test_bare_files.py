@@ -36,7 +36,7 @@ def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
     assert not noted(report["notes"], "Depth Anything 3")
     assert report["output"]["num_gaussians"] == report["input"]["num_gaussians"] // 5
     judged = report["choices"]["fidelity"]
-    assert judged["views"] == 8
+    assert judged["views"] >= 3
     assert judged["psnr"] > 20
     assert judged["held_out"]
     assert report["psnr_input_views"] == {"before": None, "after": None}
@@ -44,7 +44,7 @@ def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
     said = run("compact", bare, "-o", tmp_path / "b.ply", "--budget", "20%", "--hint", "order=none", code=0)
     assert (tmp_path / "small.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     assert all(note in said.err for note in report["notes"])
-    assert "dB  from the input in 8 held-out views" in said.out
+    assert f"dB  from the input in {judged['views']} held-out views" in said.out
 
 
 @sweep(
@@ -106,6 +106,19 @@ def test_photos_are_used_with_order_none_where_cameras_are_known(
     assert report["psnr_input_views"]["after"] is not None
 
 
-def test_an_effort_that_is_too_short_for_a_fit_says_so(bare: Path, tmp_path: Path, run: Any) -> None:
-    report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", "--budget", "20%", "--effort", "fast")
-    assert noted(report["notes"], "without cameras there is a fit only", "--effort best")
+def test_a_draft_has_no_fit_and_says_so(bare: Path, tmp_path: Path, run: Any) -> None:
+    draft, fast = (
+        report_of(run, "compact", bare, "-o", tmp_path / f"{effort}.ply", "--budget", "20%", "--effort", effort)
+        for effort in ("draft", "fast")
+    )
+    assert noted(draft["notes"], "draft has no fit", "--effort fast")
+    assert not noted(fast["notes"], "no fit")
+    assert fast["choices"]["fidelity"]["psnr"] > draft["choices"]["fidelity"]["psnr"]
+
+
+def test_inspect_prints_what_compact_writes(bare: Path, tmp_path: Path, run: Any) -> None:
+    report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply")
+    count = report["output"]["num_gaussians"]
+    assert report_of(run, "inspect", bare)["compact"]["num_gaussians"] == count
+    assert report["choices"]["fidelity"]["psnr"] > 32.5
+    assert noted(report["notes"], f"kept {count:,} of")

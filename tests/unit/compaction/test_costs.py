@@ -44,10 +44,10 @@ def test_more_work_takes_longer() -> None:
     assert seconds(2) > seconds(2, threads=2) == seconds(2, threads=16)
 
 
-def test_a_fit_is_told_where_a_budget_is_named() -> None:
-    plain, asked, best = (
-        estimate(ALONE, CompactOptions().with_settings(settings))
-        for settings in ({}, {"budget": "10%"}, {"budget": "10%", "effort": "best"})
+def test_a_file_alone_is_fitted_except_by_a_draft() -> None:
+    draft, asked, best = (
+        estimate(ALONE, CompactOptions().with_settings({"budget": "10%", "effort": effort}))
+        for effort in ("draft", "default", "best")
     )
-    assert (plain["fit"], asked["fit"], best["fit"]) == ("none", "full", "full")
+    assert (draft["fit"], asked["fit"], best["fit"]) == ("none", "full", "full")
     assert asked["seconds"] < best["seconds"]

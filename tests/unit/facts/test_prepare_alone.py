@@ -11,11 +11,13 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
-from gsmerge.facts.place_cameras import MAX_SCORED, place_viewpoints
-from gsmerge.facts.prepare import Prepared, prepare_alone
+from gsmerge.facts.place_cameras import HELD_OUT, place_viewpoints
+from gsmerge.facts.prepare import Prepared, prepare
+from gsmerge.fit import FitOptions, fit_scene
 from gsmerge.geometry.transforms import project
 from gsmerge.plan import stands_alone
 from gsmerge.runtime.record import record_run
+from gsmerge.stages.fit_pairs import merge_pairs
 
 
 @pytest.fixture(scope="module")
@@ -26,16 +28,38 @@ def bare() -> Scene:
 
 @pytest.fixture(scope="module")
 def prepared(bare: Scene) -> Prepared:
-    return prepare_alone(bare)
+    return prepare(bare)
 
 
-def test_views_show_the_input_and_nothing_is_fitted_to_them(prepared: Prepared) -> None:
+def test_views_show_the_input_and_some_are_held_out(prepared: Prepared) -> None:
     scene, reference = prepared.scene, prepared.reference
     assert reference.placed
-    assert reference.score_views == tuple(range(len(scene)))
-    assert 1 <= len(scene) <= MAX_SCORED
-    np.testing.assert_array_equal(scene.images, render(scene.gaussians, scene.cameras).images.clip(0, 1))
+    assert reference.score_views == tuple(range(len(scene) // HELD_OUT))
+    drawn = render(scene.gaussians, scene.cameras)
+    np.testing.assert_array_equal(scene.images, drawn.images.clip(0, 1))
+    np.testing.assert_array_equal(scene.empty, 1 - drawn.alphas[..., 0])
     assert scene.images.std() > 0.05
+
+
+def test_no_fit_sees_the_views_that_judge_it(prepared: Prepared) -> None:
+    """Whatever these show, the fitted Gaussians are the same."""
+    pictures = prepared.scene.images.copy()
+    pictures[list(prepared.reference.score_views)] = 0.5
+    other = replace(prepared, scene=replace(prepared.scene, images=pictures))
+    options = FitOptions(fit_steps=20, scored=False, beyond=True)
+    a, b = (fit_scene_alone(each, options) for each in (prepared, other))
+    for before, after in zip(vars(a).values(), vars(b).values(), strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def fit_scene_alone(prepared: Prepared, options: FitOptions) -> Gaussians:
+    held_out = prepared.reference.score_views
+    start = merge_pairs(300, 1.0, prepared)
+    views = [view for view in range(len(prepared.scene)) if view not in held_out]
+    fitted = fit_scene(start, prepared.scene, options, 0, views=views, num_scored=len(views))
+    assert fitted.report is not None
+    assert fitted.report.steps == 20
+    return fitted.gaussians
 
 
 def test_views_together_show_most(prepared: Prepared) -> None:
@@ -55,7 +79,7 @@ def test_fog_and_holes_are_seen(bare: Scene) -> None:
     g = bare.gaussians
     half = Scene(g[g.means[:, 0] < np.median(g.means[:, 0])], unaligned_scenes.NO_CAMERAS, None, None, ())
     for spoilt in (_with_fog(result.gaussians), compact(half, budget="30%", fit="none").gaussians):
-        prepared = prepare_alone(bare)
+        prepared = prepare(bare)
         shown = render(prepared.frame.enter(spoilt), prepared.scene.cameras).images.clip(0, 1)
         error = np.square(shown - prepared.scene.images).mean((1, 2, 3))
         assert -10 * np.log10(error).mean() < judged - 3
@@ -76,7 +100,7 @@ def _with_fog(gaussians: Gaussians) -> Gaussians:
 
 def test_one_note(bare: Scene) -> None:
     with record_run() as record:
-        prepare_alone(bare)
+        prepare(bare)
     assert len(record.notes) == 1
     assert noted(record.notes, "no cameras", "--cameras", "--images")
 
