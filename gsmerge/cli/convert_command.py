@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, output_file
 from gsmerge.errors import UsageError
 from gsmerge.settings.placement import PlacementOptions
@@ -49,8 +49,14 @@ def convert(args: opt.Args) -> None:
     check_outputs((output,), (*inputs, *named), overwrite=args.overwrite)
     check_format(output, writing)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
+    from gsmerge.io.formats.table import estimate_counts
+    from gsmerge.runtime.memory import BYTES_CONVERTED, BYTES_CONVERTED_VALUE, memory_problem
     from gsmerge.runtime.record import record_run
 
+    count, num_rest = estimate_counts(inputs)
+    needed = count * (BYTES_CONVERTED + BYTES_CONVERTED_VALUE * num_rest)
+    if problem := memory_problem(needed, "a .ply takes least, and parts of the scene can be converted one by one"):
+        say(problem, kind="warning", quiet=args.silent)
     hints = args.hints()
     options = ConvertOptions(
         inputs, output, args.cameras, images, args.opacity, hints.scales, hints.colors, cleaning, placement,

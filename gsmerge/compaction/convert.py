@@ -23,7 +23,7 @@ from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_
 from gsmerge.io.formats.read import FileInfo, kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents, Format
-from gsmerge.io.formats.write import lost_harmonics
+from gsmerge.io.formats.write import limit_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.io.scene_files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.measure.documents import document_head, note_entries
@@ -67,12 +67,13 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         for path in options.inputs:
             report_progress(f"convert: {path.name}", len(files), steps)
             files.append(read_gaussians(path, opacity=options.opacity, scales=options.scales, colors=options.colors))
-        gaussians = join_gaussians([file.gaussians[file.valid] for file in files])
+        # a selection of all rows would be a copy
+        gaussians = join_gaussians([f.gaussians if f.valid.all() else f.gaussians[f.valid] for f in files])
         stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
         count = len(gaussians)
         rows, dropped = _clean(gaussians, options, stored)
-        gaussians = gaussians[rows]
+        gaussians = gaussians if len(rows) == count else gaussians[rows]
         if len(gaussians) == 0:
             problem = f"expected Gaussians that are kept, found none of {count:,}"
             raise SceneError(options.inputs[0], problem, "find the extent of the scene with gsmerge inspect")
@@ -92,7 +93,9 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, dropped["unseen"], count, None if stored is None else stored.path)
     names = () if stored is None else stored.names
-    notes += lost_harmonics(options.output, gaussians.sh_degree) + rounding_notes(options.output, gaussians)
+    notes += limit_notes(options.output, gaussians.sh_degree, len(gaussians)) + rounding_notes(
+        options.output, gaussians
+    )
     comments, comment_notes = _join_comments(infos, format_, moves=options.placement.moves)
     notes += comment_notes
     if any(RESULT_COMMENT in info.comments for info in infos):

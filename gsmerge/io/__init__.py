@@ -14,7 +14,7 @@ from gsmerge.io.formats.read import read_ply as read_ply
 from gsmerge.io.formats.table import OUTPUT_FORMATS as OUTPUT_FORMATS
 from gsmerge.io.formats.table import SCENE_SUFFIXES as SCENE_SUFFIXES
 from gsmerge.io.formats.table import output_format as output_format
-from gsmerge.io.formats.write import lost_harmonics as lost_harmonics
+from gsmerge.io.formats.write import limit_notes as limit_notes
 from gsmerge.io.formats.write import write_gaussians as write_gaussians
 from gsmerge.io.formats.write import write_ply as write_ply
 from gsmerge.io.photo_files import read_images as read_images

@@ -26,7 +26,12 @@ BYTES_FIXED = 250_000_000  # interpreter and libraries
 BYTES_PER_GAUSSIAN = 150
 BYTES_PER_VALUE = 4.5  # for each value of higher harmonics: of the scene, and of some of its groups
 BYTES_PER_PIXEL = 90  # the photo as floats, and arrays of segmentation and rendering
+# A conversion: of a Gaussian, up to a .sog or .glb; a .ply takes a third. Of each value of higher harmonics
+BYTES_CONVERTED, BYTES_CONVERTED_VALUE = 330, 6
 BYTES_ELSEWHERE = 40  # per Gaussian of the whole scene while a block of it is in memory
+FEWER_PIXELS = (
+    "use fewer views (gsmerge extend adds more later), export without higher harmonics, or try --effort draft"
+)
 _own_pages: WeakSet[mmap.mmap] = WeakSet()  # maps made here: only their pages may be discarded
 
 
@@ -82,15 +87,12 @@ def memory_bytes(pixels: int, *, num_rest: int = 0, num_elsewhere: int = 0) -> i
     return BYTES_FIXED + round(pixel_bytes * pixels + BYTES_ELSEWHERE * num_elsewhere)
 
 
-def memory_problem(needed: int) -> str | None:
-    """Return why a run that needs ``needed`` bytes may not fit into this machine; None if it should fit."""
+def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
+    """Return why a run that needs ``needed`` bytes may not fit into this machine, and what helps; None if it fits."""
     available = machine_memory()
     if available is None or needed <= available:
         return None
-    return (
-        f"about {needed / 1e9:.1f} GB of memory are needed, and this machine has {available / 1e9:.1f} GB; use fewer"
-        " views (gsmerge extend adds more later), export without higher harmonics, or try --effort draft"
-    )
+    return f"about {needed / 1e9:.1f} GB of memory are needed, and this machine has {available / 1e9:.1f} GB; {remedy}"
 
 
 def keep_memory() -> None:

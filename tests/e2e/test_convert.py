@@ -282,3 +282,12 @@ def test_linear_scales_by_a_hint(small_scene: Path, tmp_path: Path, run: Run) ->
         "scene.ply",
         "scales=linear",
     )
+
+
+def test_what_does_not_fit_is_said_before_it_is_read(
+    made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.runtime.memory.machine_memory", lambda: 10**5)
+    said = run("convert", made_scene / "scene.ply", tmp_path / "a.spz", code=0)
+    assert "this machine has 0.0 GB" in said.err
+    assert "a .ply takes least" in said.err

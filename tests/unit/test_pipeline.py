@@ -71,7 +71,7 @@ def test_a_result_that_loses_what_the_input_covers_is_worse(scene: Scene) -> Non
 @pytest.mark.parametrize(("settings", "scored_all", "near"), [({}, False, 1.5), ({"budget": 9}, True, 1e-4)], ids=str)
 def test_a_sample_is_scored_unless_the_result_may_be_worse(settings: Any, scored_all: bool, near: float) -> None:
     """Then all photos decide, and the report is exact."""
-    scene = scenes.make_scene(scenes.room(), scenes.arc(5, 160, 128), noise=0.3)
+    scene = scenes.make_scene(scenes.room(), scenes.arc(5, 240, 224), noise=0.3)
     result = compact(scene, effort="draft", poses="fixed", **settings)
     photos = scene_photos(scene)
     exact = [score_photos(one, photos, range(5)).psnr for one in (scene.gaussians, result.gaussians)]

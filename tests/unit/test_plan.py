@@ -270,7 +270,7 @@ def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
 
 
 def test_more_views_are_scored_for_a_quality(scene: Scene) -> None:
-    wide = scenes.make_scene(scenes.room(), scenes.arc(10, 112, 98))
+    wide = scenes.make_scene(scenes.room(), scenes.arc(10, 240, 224))
     some, every = plan_of(wide), plan_of(wide, quality="20dB")
     assert (len(some.scored_views), some.samples) == (REPORT_VIEWS, True)
     assert (len(every.scored_views), every.samples) == (10, False)

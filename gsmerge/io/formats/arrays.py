@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from gsmerge.types import Gaussians
 from gsmerge.values.arrays import Array, as_array
 
 MAX_POSITION = 1e13  # no scene is larger, in any unit; float32 can square and sum positions and scales below
+BLOCK_ROWS = 1 << 16  # rows converted at a time
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
 LOGIT_COMMENT = "opacity: logit"  # states the encoding in files of gsmerge, so that no reader guesses it
 RESULT_COMMENT = "gsmerge result"  # replaces LOGIT_COMMENT in results of commands, and has the same length
@@ -326,6 +327,12 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
         sh0=array(gaussians.sh0)[:, 0],
         harmonics=array(gaussians.shN)[:, : (degree + 1) ** 2 - 1],
     )
+
+
+def column_blocks(gaussians: Gaussians, max_degree: int) -> Iterator[tuple[int, Columns]]:
+    """Yield the first row of each block of Gaussians, and the block's columns, which take a few times its memory."""
+    for start in range(0, len(gaussians), BLOCK_ROWS):
+        yield start, to_columns(gaussians[start : start + BLOCK_ROWS], max_degree, start)
 
 
 def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:

@@ -26,9 +26,9 @@ from gsmerge.io.formats.arrays import (
     Packed,
     StoredRows,
     are_logarithms,
+    column_blocks,
     note_surplus,
     to_bytes,
-    to_columns,
     to_stored,
     turner,
 )
@@ -60,9 +60,11 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 
     Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
-    columns = to_columns(gaussians, MAX_DEGREE)
-    half_turn = turner(np.diag([-1.0, -1.0, 1.0]), columns.harmonics.shape[1])  # from y down to y up
-    attributes = _attributes(half_turn(columns))
+    half_turn = turner(
+        np.diag([-1.0, -1.0, 1.0]), (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2 - 1
+    )  # from y down to y up
+    blocks = [_attributes(half_turn(columns)) for _, columns in column_blocks(gaussians, MAX_DEGREE)]
+    attributes = {name: _join([block.pop(name) for block in blocks]) for name in tuple(blocks[0])}
     views, accessors = _describe_arrays(list(attributes.values()))
     for name, bound in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
         accessors[0][name] = bound(attributes["POSITION"], axis=0).tolist()
@@ -84,6 +86,11 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
     return _HEADER.pack(b"glTF", 2, _HEADER.size + len(chunks)) + chunks
+
+
+def _join(blocks: Sequence[np.ndarray]) -> np.ndarray:
+    """Join blocks of rows, with their padding."""
+    return np.concatenate([block if block.base is None else block.base for block in blocks])[:, : blocks[0].shape[1]]
 
 
 def _describe_arrays(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

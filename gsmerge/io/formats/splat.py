@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
-from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored
+from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, column_blocks, to_bytes, to_stored
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 
@@ -23,12 +23,13 @@ ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), 
 
 def splat_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     """Encode a ``.splat`` file, which has no comments; ValueError if there is NaN or inf."""
-    columns = to_columns(gaussians, MAX_DEGREE)
-    rows = np.empty(len(columns), ROW)
-    rows["means"], rows["scales"] = columns.means, exp(columns.log_scales)
-    rows["colors"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
-    rows["quats"] = to_bytes(128 * columns.quats + 128)
-    return rows.tobytes()
+    all_rows = np.empty(len(gaussians), ROW)
+    for start, columns in column_blocks(gaussians, MAX_DEGREE):
+        rows = all_rows[start : start + len(columns)]
+        rows["means"], rows["scales"] = columns.means, exp(columns.log_scales)
+        rows["colors"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
+        rows["quats"] = to_bytes(128 * columns.quats + 128)
+    return all_rows.tobytes()
 
 
 def read_rows(path: Path) -> StoredRows:

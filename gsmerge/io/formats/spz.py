@@ -16,7 +16,7 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import reduce
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +28,7 @@ from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.types import SH_C0, Gaussians, StrPath
-from gsmerge.values.arrays import to_float32
+from gsmerge.values.arrays import as_array, to_float32
 
 VERSION, MAX_DEGREE = 3, 3  # of written files; Spark 2.2 does not read version 4
 MAGIC = 0x5053474E
@@ -274,10 +274,20 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> 
 
     ValueError if there is NaN or inf.
     """
-    columns = arrays.to_columns(gaussians, max_degree)
-    fraction = choose_fraction(columns.means, FINE)
+    means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
+    fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], FINE)
+    header = Header(VERSION, count, degree, fraction, MIP_FLAG * mip, 0)
+    parts = tuple(np.empty((count, width), np.uint8) for width in header.widths)
+    for start, columns in arrays.column_blocks(gaussians, max_degree):
+        for part, values in zip(parts, _quantise(columns, fraction), strict=True):
+            part[start : start + len(columns)] = values
+    return HEADER.pack(MAGIC, *astuple(header)), parts
+
+
+def _quantise(columns: arrays.Columns, fraction: int) -> tuple[np.ndarray, ...]:
+    """Quantise a block of Gaussians to columns of bytes; means to ``fraction`` bits after the binary point."""
     fixed = fix_means(columns.means, fraction)
-    parts = (
+    return (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes a coordinate
         arrays.to_bytes(255 * columns.opacities)[:, None],
         arrays.to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
@@ -285,8 +295,6 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> 
         _pack_rotations(columns.quats),
         _quantise_harmonics(columns.harmonics),
     )
-    degree = arrays.sh_degree(columns.harmonics.shape[1])
-    return HEADER.pack(MAGIC, VERSION, len(columns), degree, fraction, MIP_FLAG * mip, 0), parts
 
 
 def _quantise_harmonics(harmonics: np.ndarray) -> np.ndarray:
@@ -317,11 +325,14 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     A comment may mark the Gaussians as antialiased, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
     header, parts = spz_columns(gaussians, MAX_DEGREE, mip=arrays.render_mode(comments) == arrays.MIP)
-    return gzip_bytes(b"".join([header, *(part.tobytes() for part in parts)]))
+    return gzip_bytes(header, *(part.data for part in parts))
 
 
-def gzip_bytes(data: bytes, level: int = 9, strategy: int = zlib.Z_DEFAULT_STRATEGY) -> bytes:
-    """Compress to a gzip stream with equal bytes at any time, on every system and in every version of Python."""
-    packer = zlib.compressobj(level, wbits=31, strategy=strategy)  # without a time
-    packed = packer.compress(data) + packer.flush()
-    return packed[:SYSTEM] + UNIX + packed[SYSTEM + 1 :]
+def gzip_bytes(*parts: bytes | memoryview, level: int = 6, strategy: int = zlib.Z_DEFAULT_STRATEGY) -> bytes:
+    """Compress to one gzip stream with equal bytes at any time, on every system and in every version of Python."""
+    packer, packed = zlib.compressobj(level, wbits=31, strategy=strategy), bytearray()  # without a time
+    for part in parts:
+        packed += packer.compress(part)
+    packed += packer.flush()
+    packed[SYSTEM : SYSTEM + 1] = UNIX
+    return bytes(packed)

@@ -72,6 +72,7 @@ class Format:
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as the format does
     columns: bool = False  # whether the user can choose which of INRIA's columns it has
     marks: Sequence[str] | None = ()  # comments of the input that it keeps; None: all of ``copied_comments``
+    most: float = math.inf  # Gaussians that its public readers take
     lost: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
 
     # Bytes of a Gaussian by degree; of a .sog or .spz, as measured for results; empty if budgets cannot count them
@@ -113,7 +114,7 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     PLY,
     Format(
         ".spz", "Niantic's format; written as version 3", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
-        each=(17.0, 18.5, 18.9, 19.2), round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,),
+        most=10_000_000, each=(17.0, 18.5, 18.9, 19.2), round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,),
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,

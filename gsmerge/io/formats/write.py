@@ -15,12 +15,12 @@ from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arguments import check_arguments
 
 
-def lost_harmonics(path: StrPath, sh_degree: int) -> list[str]:
-    """Note which harmonics a format leaves out; no note if it stores all. UsageError for an unknown ending."""
+def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
+    """Note which harmonics a format leaves out, and more Gaussians than readers take; UsageError for its ending."""
     format_ = output_format(path, levels=True, cameras=True)
-    if sh_degree <= format_.max_degree:
-        return []
-    return [format_.lost.format(ending=format_.ending, degree=format_.max_degree)]
+    notes = [f"public readers of {format_.ending} stop at {format_.most:,} Gaussians: write a .ply or .sog, or fewer"]
+    lost = [format_.lost.format(ending=format_.ending, degree=format_.max_degree)]
+    return lost * (sh_degree > format_.max_degree) + notes * (count > format_.most)
 
 
 def level_output(output: Path, level: int) -> Path:

@@ -19,7 +19,9 @@ from gsmerge import Gaussians, SceneError
 from gsmerge.errors import list_doubts
 from gsmerge.geometry.transforms import covariances, rotate_harmonics
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
+from gsmerge.io.formats.glb import glb_bytes
 from gsmerge.io.formats.read import file_notes
+from gsmerge.io.formats.splat import splat_bytes
 from gsmerge.io.formats.spz import AXES, gzip_bytes, spz_bytes
 
 # Two Gaussians of degree 1 as @adobe/spz 0.2.3 writes them, which is Niantic's library for browsers
@@ -125,11 +127,11 @@ def test_axes_are_turned_to_those_of_a_ply(
     assert all(axes in note for note in file_notes(ply.info))
 
 
-@pytest.mark.parametrize(("how", "word"), [((9,), b"\2"), ((1, zlib.Z_RLE), b"\4")])
+@pytest.mark.parametrize(("how", "word"), [((9, zlib.Z_DEFAULT_STRATEGY), b"\2"), ((1, zlib.Z_RLE), b"\4")])
 def test_streams_name_no_time_and_the_same_system(how: tuple[int, ...], word: bytes) -> None:
     """Python 3.10 to 3.13 write one of two systems into what ``gzip.compress`` returns."""
     data = spz_bytes(corners())
-    actual = gzip_bytes(data, *how)
+    actual = gzip_bytes(data, level=how[0], strategy=how[1])
     assert actual[:10] == b"\x1f\x8b\x08" + bytes(5) + word + b"\3"
     assert gzip.decompress(actual) == data
     assert data[:10] == gzip_bytes(b"")[:10]
@@ -168,3 +170,9 @@ def test_bytes_after_the_streams(
     (tmp_path / "a.spz").write_bytes(write(some(0)) + bytes(num_more))
     notes = file_notes(read_gaussians(tmp_path / "a.spz").info)
     assert [note.startswith("16 bytes follow") for note in list_doubts(notes)] == [True] * is_doubtful
+
+
+def test_blocks_of_rows_make_the_same_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = {writer: writer(corners()) for writer in (spz_bytes, splat_bytes, glb_bytes)}
+    monkeypatch.setattr("gsmerge.io.formats.arrays.BLOCK_ROWS", 3)
+    assert {writer: writer(corners()) for writer in whole} == whole

@@ -20,7 +20,7 @@ from tiny_scene import Tiny
 from gsmerge import Scene
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry.transforms import normalize
-from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_ply, write_gaussians, write_ply
+from gsmerge.io import OUTPUT_FORMATS, limit_notes, output_format, read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.kernels import elementary
 from gsmerge.types import Gaussians
@@ -110,12 +110,17 @@ def test_rotations_are_the_same_up_to_a_sign(ending: str, tmp_path: Path) -> Non
 
 
 def test_harmonics_without_room_are_noted() -> None:
-    assert lost_harmonics("a.ply", 3) == []
-    assert noted(lost_harmonics("a.ply", 4), "above degree 3", ".ply")
-    assert lost_harmonics("a.spz", 3) == []
-    (note,) = lost_harmonics("a.splat", 1)
+    assert limit_notes("a.ply", 3, 1) == []
+    assert noted(limit_notes("a.ply", 4, 1), "above degree 3", ".ply")
+    assert limit_notes("a.spz", 3, 1) == []
+    (note,) = limit_notes("a.splat", 1, 1)
     assert note == "harmonics above degree 0, which .splat cannot store, are left out"
-    assert noted(lost_harmonics("a.SPZ", 4), "above degree 3")
+    assert noted(limit_notes("a.SPZ", 4, 1), "above degree 3")
+
+
+def test_more_gaussians_than_readers_take_are_noted() -> None:
+    assert limit_notes("a.spz", 0, 10_000_000) == limit_notes("a.ply", 0, 10**9) == []
+    assert noted(limit_notes("a.spz", 0, 10_000_001), "10,000,000", ".sog")
 
 
 def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
