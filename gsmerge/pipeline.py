@@ -71,10 +71,10 @@ def encode_views(
 
 def fit(start: Decoded, prepared: Prepared, plan: Plan) -> Fitted:
     """Fit Gaussians to the pictures of the views."""
-    if plan.merges_pairs:
-        return fit_around(start, prepared, plan.fit, plan.seed)
     if start.is_input and prepared.reference.name == RENDERS:  # the pictures show exactly these Gaussians
         return Fitted(start.gaussians, prepared.scene.cameras, None)
+    if plan.merges_pairs:
+        return fit_around(start, prepared, plan.fit, plan.seed)
     return fit_scene(start, prepared.scene, plan.fit, plan.seed)
 
 

@@ -102,7 +102,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
     contents = Contents(
-        [gaussians], comments, moved, scene_title(options.inputs[0]), options.normals, extra_columns=columns
+        [gaussians], comments, moved, names, scene_title(options.inputs[0]), options.normals, extra_columns=columns
     )
     num_bytes, camera_path = write_contents(options.output, contents, names, overwrite=options.overwrite)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}

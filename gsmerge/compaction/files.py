@@ -88,7 +88,7 @@ def compact_files(
             out, result.gaussians
         )
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
-        contents = Contents(levels, comments, cameras, scene_title(files.ply), outputs.normals)
+        contents = Contents(levels, comments, cameras, names, scene_title(files.ply), outputs.normals)
         written = format_.write(add, out, temporary, contents)
         if cameras_path is not None:
             add_views(add, cameras_path, cameras, names, overwrite=outputs.overwrite)

@@ -70,7 +70,7 @@ def write_result(
     format_ = output_format(out, levels=True, cameras=True)
     comments = [RESULT_COMMENT, *([] if new_views is None else [new_views_comment(new_views)])]
     stored_levels = [level.numpy() for level in (levels if format_.levels else levels[:1])]
-    contents = Contents(stored_levels, comments, cameras, out.stem)
+    contents = Contents(stored_levels, comments, cameras, names, out.stem)
     write_contents(out, contents, names, overwrite=overwrite)
     return out
 

@@ -57,7 +57,7 @@ def record_fit(report: FitReport) -> None:
         seen = f"seen from outside, the result shows haze where the scene is empty: far fog {report.fog:.2f}"
         note(f"{seen}; --fit none makes less, and is farther from the photos" if report.accepted else seen)
     if not report.accepted:
-        note("the fit was not accepted: it shows most photos worse than its start does")
+        note("the fit was not accepted: it shows most views worse than its start does")
 
 
 def report_steps(step: int, steps: int, photos: float, half_part: float) -> None:

@@ -289,9 +289,9 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
         scene = add_views(load.scene, shown=True)
     scene = scene if inside else subset(scene, range(len(scene) // 2))
     scene = replace(scene, cameras=fill_cameras(scene.cameras, *PLACED_SIZE))
-    notes = [text for text in record.notes if text != NO_VIEWS]  # that note concerns results
     placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
-    return replace(load, scene=scene, notes=(*load.notes, *notes, placed))
+    notes = (placed if text == NO_VIEWS else text for text in record.notes)  # that note concerns results
+    return replace(load, scene=scene, notes=(*load.notes, *notes))
 
 
 def find_view(view: str, names: Sequence[str]) -> int:

@@ -34,12 +34,13 @@ def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int)
         psnrs = [score_photos(gaussians, photos, [view], every=4).psnr for view in range(len(photos))]
         return float(np.median(psnrs))
 
-    return max(POWERS, key=score)
+    return max(POWERS, key=score) if count < len(prepared.scene.gaussians) else POWERS[0]
 
 
 def merge_pairs(count: int, power: float, prepared: Prepared) -> Decoded:
     """Merge neighbours pair by pair into ``count`` Gaussians."""
-    return Decoded(merge_neighbors(prepared.scene.gaussians, count, power), count, exact=True)
+    gaussians = merge_neighbors(prepared.scene.gaussians, count, power)
+    return Decoded(gaussians, count, exact=True, is_input=gaussians is prepared.scene.gaussians)
 
 
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:

@@ -166,7 +166,7 @@ def decode_file(
         raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
     cameras = features.frame.leave_cameras(features.cameras)
     notes = [*limit_notes(out, gaussians.sh_degree, len(gaussians)), *rounding_notes(out, gaussians)]
-    contents = Contents([gaussians], [RESULT_COMMENT], cameras, scene_title(path), normals)
+    contents = Contents([gaussians], [RESULT_COMMENT], cameras, features.names, scene_title(path), normals)
     num_bytes, _ = write_contents(out, contents, features.names, overwrite=overwrite, viewer_cameras=viewer_cameras)
     seconds = {**(seconds_before or {}), "read": read_end - start, "decode": decode_end - read_end}
     seconds["write"] = perf_counter() - decode_end

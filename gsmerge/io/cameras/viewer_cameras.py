@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,12 @@ from gsmerge.io.cameras.camera_file import CENTRED_PX
 from gsmerge.types import Cameras
 
 ENDING = ".cameras.json"
+_SAMPLE = 10_000  # Gaussians from which a depth is estimated
+_EFFECTS: dict[str, dict[str, Any]] = {
+    "sharpness": {"amount": 0}, "bloom": {"intensity": 1, "blurLevel": 2},
+    "grading": {"brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+    "vignette": {"intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1}, "fringing": {"intensity": 0.5},
+}  # fmt: skip
 _MAX_NAME = 255  # bytes of a file's name
 
 
@@ -45,3 +53,37 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
         for i, name in enumerate(names)
     ]  # fmt: skip
     return json.dumps(entries) + "\n"
+
+
+def order_views(cameras: Cameras) -> list[int]:
+    """Return the views by their distance from the middle of all, the nearest first."""
+    centres = cameras.centres.astype(np.float64)
+    offsets = centres - np.median(centres, axis=0) if len(centres) else centres
+    return np.argsort((offsets**2).sum(1), kind="stable").tolist()
+
+
+def vertical_field(cameras: Cameras, view: int) -> float:
+    """Return the vertical field of a view in radians, rounded so that every processor gives the same."""
+    return round(2 * math.atan(cameras.height / (2 * float(cameras.Ks[view, 1, 1]))), 9)
+
+
+def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
+    """Return the text of settings for SuperSplat's viewer (its ``settings.json``, version 2): where to look from.
+
+    The camera is the view nearest to the middle of all. Its target lies at the median depth of the ``means [n,3]`` in
+    front of it. The viewer turns the scene by half a turn about z.
+    """
+    view = order_views(cameras)[0]
+    forward, centre = cameras.viewmats[view, 2, :3].astype(np.float64), cameras.centres[view].astype(np.float64)
+    depths = ((means[:: max(1, len(means) // _SAMPLE)] - centre) * forward).sum(1)
+    depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
+    position, target = (np.array([-1.0, -1.0, 1.0]) * point for point in (centre, centre + depth * forward))
+    fov = round(math.degrees(vertical_field(cameras, view)), 4)
+    pose = {"position": position.tolist(), "target": target.tolist(), "fov": fov}
+    off = {name: {"enabled": False, **zeros} for name, zeros in _EFFECTS.items()}
+    settings = {
+        "version": 2, "tonemapping": "none", "highPrecisionRendering": False, "background": {"color": [0, 0, 0]},
+        "postEffectSettings": off, "animTracks": [], "cameras": [{"initial": pose}], "annotations": [],
+        "startMode": "default",
+    }  # fmt: skip
+    return json.dumps(settings) + "\n"

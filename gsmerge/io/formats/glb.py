@@ -14,13 +14,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
+from gsmerge.io.cameras.viewer_cameras import order_views, vertical_field
 from gsmerge.io.formats.arrays import (
     Columns,
     Packed,
@@ -36,6 +37,9 @@ from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
 
+if TYPE_CHECKING:
+    from gsmerge.io.formats.table import Contents
+
 MAX_DEGREE = 3
 NAME = "KHR_gaussian_splatting"
 HARMONICS = [f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for degree in range(MAX_DEGREE + 1) for i in range(2 * degree + 1)]
@@ -49,14 +53,37 @@ _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+_NEAR = 0.01  # near plane of camera nodes, world units, as of `render`
 _MAX_STRIDE = 252  # bytes from a value to the next, the limit of glTF
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
 _TRANSFORMS = {"matrix", "rotation", "scale", "translation"}  # keys of a node with a transform of its own
 _TOLERANCE = 1e-3  # largest difference of the scales of a node's axes, and largest cosine between two axes
 
 
-def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
+def encode_views(gaussians: Gaussians, contents: Contents) -> bytes:
+    """Encode a ``.glb`` file as :func:`glb_bytes` does, with a camera node for each view.
+
+    The first is the view that stands nearest to the middle of all, since viewers look from the first.
+    """
+    cameras, names = contents.cameras, contents.names
+    nodes, lenses, ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
+    for i, view in enumerate(ids):
+        pose = np.eye(4)  # of glTF's cameras, which look along -z with y up
+        pose[:3, :3], pose[:3, 3] = cameras.viewmats[view, :3, :3].T * (1, -1, -1), cameras.centres[view]
+        pose = matmul(_HALF_TURN, pose)
+        nodes.append({"name": names[view], "camera": i, "matrix": pose.T.reshape(-1).tolist()})
+        ratio = float(cameras.width * cameras.Ks[view, 1, 1] / (cameras.height * cameras.Ks[view, 0, 0]))
+        lens = {"yfov": vertical_field(cameras, view), "aspectRatio": ratio, "znear": _NEAR}
+        lenses.append({"name": names[view], "type": "perspective", "perspective": lens})
+    return glb_bytes(gaussians, nodes=nodes, cameras=lenses)
+
+
+def glb_bytes(
+    gaussians: Gaussians, _: Sequence[str] = (), *, nodes: Sequence[Any] = (), cameras: Sequence[Any] = ()
+) -> bytes:
     """Encode a ``.glb`` file without comments; ValueError if there is NaN or inf.
+
+    ``nodes`` and ``cameras`` are added to its document.
 
     Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
@@ -75,9 +102,10 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     document = {
         "asset": {"version": "2.0", "generator": "gsmerge"},
         "scene": 0,
-        "scenes": [{"nodes": [0]}],
+        "scenes": [{"nodes": list(range(1 + len(nodes)))}],
         "extensionsUsed": [NAME],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0}, *nodes],
+        **({"cameras": cameras} if cameras else {}),
         "meshes": [{"primitives": [{"attributes": accessor_ids, "mode": _POINTS, "extensions": {NAME: splats}}]}],
         "accessors": accessors,
         "bufferViews": views,

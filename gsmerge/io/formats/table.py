@@ -35,6 +35,7 @@ class Contents:
     levels: Sequence[Gaussians]  # the finest first
     comments: Sequence[str] = ()  # lines for the header
     cameras: Cameras = NO_CAMERAS
+    names: Sequence[str] = ()  # of the cameras
     title: str = ""
     normals: bool = True  # of a ``.ply``, as in :func:`gsmerge.write_ply`
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
@@ -60,6 +61,9 @@ class Format:
     # Encodes one file of Gaussians with comments; None: :func:`gsmerge.io.write_ply` or ``write`` writes the file
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
     max_degree: int  # of the harmonics that are written; -1: the format is only read
+    # Encodes one file with the views of the content, from which viewers look first; None: ``encode`` does
+    encode_views: Callable[[Gaussians, Contents], bytes] | None = None
+    has_settings: bool = False  # Where viewers look first is in a file of settings beside it
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
     finish: Callable[[Path], object] = lambda _: None  # called with the path after all files were renamed
@@ -118,12 +122,12 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,
-        each=_SOG, round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
+        each=_SOG, round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT), has_settings=True,
     ),
     Format(".splat", "antimatter15's format", _lazy("splat.read_rows"), _lazy("splat.splat_bytes"), 0, each=(32.0,)),
     Format(
         ".glb", "binary glTF with KHR_gaussian_splatting", _lazy("glb.read_rows"), _lazy("glb.glb_bytes"), 3,
-        holds=_lazy("glb.holds_gaussians"), each=(52.1, 88.1, 148.1, 232.2),
+        encode_views=_lazy("glb.encode_views"), holds=_lazy("glb.holds_gaussians"), each=(52.1, 88.1, 148.1, 232.2),
     ),
 )  # fmt: skip
 STATE = Format(

@@ -13,11 +13,14 @@ import scenes
 from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
+from gsmerge.compaction.outputs import write_result
 from gsmerge.errors import list_doubts
-from gsmerge.geometry.transforms import multiply_quats, quat_to_rotmat
+from gsmerge.geometry.transforms import multiply_quats, project, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
+from gsmerge.io.cameras.viewer_cameras import order_views
 from gsmerge.io.formats.glb import holds_gaussians
 from gsmerge.io.formats.read import file_notes
+from gsmerge.kernels.elementary import cos, sin
 
 NAME = "KHR_gaussian_splatting"
 NUMBERS = {"<f4": 5126, "|i1": 5120, "|u1": 5121, "<i2": 5122, "<u2": 5123}
@@ -167,3 +170,41 @@ def test_bytes_beyond_the_stated_length(scene: Scene, tmp_path: Path, num_more: 
         file.write(bytes(num_more))
     doubts = list_doubts(file_notes(read_gaussians(tmp_path / "a.glb").info))
     assert [doubt.startswith("12 bytes follow") for doubt in doubts] == [True] * is_doubtful
+
+
+def test_a_viewers_first_picture_is_that_of_the_middle_view(scene: Scene, tmp_path: Path) -> None:
+    """A camera node projects points as the view does, whose pixels are those of a picture of glTF's camera."""
+    path = write_result(tmp_path / "a.glb", [scene.gaussians], scene.cameras, scene.names, None, overwrite=False)
+    document, _ = _read_document(path)
+    nodes = [node for node in document["nodes"] if "camera" in node]
+    assert [node["name"] for node in nodes] == [scene.names[view] for view in order_views(scene.cameras)]
+    view, lens = order_views(scene.cameras)[0], document["cameras"][nodes[0]["camera"]]["perspective"]
+    assert view == 1
+    shown = read_gaussians(path).gaussians.means[::50].astype(np.float64) * (-1, -1, 1)  # to the frame of the file
+    pose = np.reshape(nodes[0]["matrix"], (4, 4)).T
+    x, y, z = (np.linalg.inv(pose) @ np.column_stack([shown, np.ones(len(shown))]).T)[:3]
+    focal = float(cos(np.array(lens["yfov"] / 2)) / sin(np.array(lens["yfov"] / 2)))
+    ndc = np.stack([focal / lens["aspectRatio"] * x / -z, focal * y / -z], 1)
+    width, height = scene.cameras.width, scene.cameras.height
+    pixels = project(scene.gaussians.means[::50].astype(np.float64), scene.cameras)[0][view]
+    np.testing.assert_allclose((1 + ndc * (1, -1)) / 2 * (width, height), pixels, atol=1e-2)
+
+
+def _read_document(path: Path) -> tuple[Document, int]:
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    return json.loads(content[20 : 20 + length]), length
+
+
+def test_settings_start_a_viewer_at_that_view_and_those_of_a_user_stay(scene: Scene, tmp_path: Path) -> None:
+    path, settings = tmp_path / "a.sog", tmp_path / "a.settings.json"
+    write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=False)
+    (camera,) = json.loads(settings.read_text())["cameras"]
+    view = order_views(scene.cameras)[0]
+    position, target = (np.array(camera["initial"][name]) * (-1, -1, 1) for name in ("position", "target"))
+    np.testing.assert_allclose(position, scene.cameras.centres[view])
+    pixel = project(target[None], scene.cameras)[0][view][0]
+    np.testing.assert_allclose(pixel, (scene.cameras.width / 2, scene.cameras.height / 2), atol=1e-6)
+    settings.write_text("{}")
+    write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=True)
+    assert settings.read_text() == "{}"
