@@ -91,7 +91,7 @@ def compact_files(
         contents = Contents(levels, comments, cameras, names, scene_title(files.ply), outputs.normals)
         written = format_.write(add, out, temporary, contents)
         if cameras_path is not None:
-            add_views(add, cameras_path, cameras, names, overwrite=outputs.overwrite)
+            add_views(add, out, cameras_path, contents, overwrite=outputs.overwrite)
         notes += doubt_changed(load.stats)
         document = report_document(
             result.report, recognised=load.recognised, output_path=out,

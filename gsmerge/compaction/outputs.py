@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from gsmerge.io import output_format
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path, viewer_settings
 from gsmerge.io.formats.arrays import RESULT_COMMENT, ExpectedScores, new_views_comment
 from gsmerge.io.formats.table import Contents
 from gsmerge.types import Cameras, Gaussians
@@ -23,12 +24,19 @@ from gsmerge.types import Cameras, Gaussians
 SAME = 1e-5
 
 
-def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str], *, overwrite: bool) -> None:
+def add_views(add: AddOutput, out: Path, path: Path, contents: Contents, *, overwrite: bool) -> None:
     """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has other cameras.
+
+    Viewers of some formats have settings, which start them at the view in the middle. Settings that are there already
+    stay, as they may be the user's.
 
     If the file has these cameras already, to within rounding, it stays unchanged, because results in several formats
     share it.
     """
+    cameras, names, format_ = contents.cameras, contents.names, output_format(out, levels=True, cameras=True)
+    settings = out.with_name(format_.settings.format(stem=out.name.removesuffix(format_.ending)) or out.name)
+    if format_.settings and not settings.exists():
+        add(settings).write_text(viewer_settings(cameras, contents.levels[0].means), encoding="utf-8")
     if overwrite or not path.exists():
         add(path).write_bytes(viewer_cameras(cameras, names).encode())
     else:
@@ -87,7 +95,7 @@ def write_contents(
     with atomic_outputs(overwrite=overwrite) as add:
         written = format_.write(add, out, add(out), contents)
         if is_beside:
-            add_views(add, path, contents.cameras, names, overwrite=overwrite)
+            add_views(add, out, path, replace(contents, names=names), overwrite=overwrite)
         num_bytes = sum(file.stat().st_size for file in written[out])
     format_.finish(out)
     return num_bytes, str(path) if is_beside else None

@@ -64,7 +64,9 @@ def test_every_format_is_written_with_the_cameras(
     assert document["output"]["num_gaussians"] == len(written) == 400
     files = [path for path in (tmp_path / "new").rglob("*") if path.is_file()]
     beside = [path for path in files if path.name.endswith(".cameras.json")]
-    assert document["output"]["bytes"] == sum(path.stat().st_size for path in files if path not in beside)
+    assert document["output"]["bytes"] == sum(
+        path.stat().st_size for path in files if path not in beside and path.name[-13:] != "settings.json"
+    )
     assert [str(path) for path in beside] == [document["viewer_cameras"]]
     assert gsmerge.read_cameras(beside[0]).names == gsmerge.read_cameras(tmp_path / "in.cameras.json").names
     again = convert_files(ConvertOptions([tmp_path / "new" / name], tmp_path / "again.ply"))

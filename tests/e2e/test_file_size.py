@@ -17,7 +17,7 @@ QUICK = ("--effort", "draft", "--set", "fit=none", "-q")
 
 def file_bytes(folder: Path) -> int:
     files = [path for path in folder.rglob("*") if path.is_file()]
-    return sum(path.stat().st_size for path in files if not path.name.endswith(".cameras.json"))
+    return sum(path.stat().st_size for path in files if not path.name.endswith(("cameras.json", "settings.json")))
 
 
 @sweep("name", FORMATS, often=2)

@@ -223,7 +223,9 @@ def test_feature_gaussians_are_decoded(k: str, features: Path, tmp_path: Path, r
     assert "Feature Gaussians ->" in run("compact", features, *words, "--overwrite", code=0).out
 
 
-@pytest.mark.parametrize(("out", "files"), [("a.sog", {"a.sog", "a.cameras.json"}), ("a.html", {"a.html"})])
+@pytest.mark.parametrize(
+    ("out", "files"), [("a.sog", {"a.sog", "a.cameras.json", "a.settings.json"}), ("a.html", {"a.html"})]
+)
 def test_feature_gaussians_in_every_kind_of_output(
     out: str, files: set[str], features: Path, tmp_path: Path, run: Run
 ) -> None:

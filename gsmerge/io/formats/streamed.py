@@ -27,7 +27,7 @@ from gsmerge.io.formats import arrays, sog
 from gsmerge.io.formats.read import GaussianFile, convert_files
 from gsmerge.io.formats.splat_transform import name_file, run_program
 from gsmerge.io.formats.table import INDEX, Contents
-from gsmerge.io.formats.write import add_settings, write_ply
+from gsmerge.io.formats.write import write_ply
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
@@ -87,7 +87,6 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
             write_ply(ply, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=contents.comments)
         program_index = Path(folder) / "made" / INDEX
         run_program(*words, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", ITERATIONS, program_index)
-        add_settings(add, path.with_name("settings.json"), contents)
         with name_file(path):
             _name_by_content(program_index)
             levels = read_index(program_index).levels

@@ -63,7 +63,7 @@ class Format:
     max_degree: int  # of the harmonics that are written; -1: the format is only read
     # Encodes one file with the views of the content, from which viewers look first; None: ``encode`` does
     encode_views: Callable[[Gaussians, Contents], bytes] | None = None
-    has_settings: bool = False  # Where viewers look first is in a file of settings beside it
+    settings: str = ""  # name of a file beside it that tells viewers where to look first; "": none
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
     finish: Callable[[Path], object] = lambda _: None  # called with the path after all files were renamed
@@ -103,7 +103,7 @@ LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
     _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
     write=_lazy("streamed.write_output"), finish=_lazy("streamed.remove_unused_chunks"), levels="inside",
-    round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
+    settings="settings.json", round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
 )  # fmt: skip
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
@@ -122,7 +122,8 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,
-        each=_SOG, round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT), has_settings=True,
+        each=_SOG, round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
+        settings="{stem}.settings.json",
     ),
     Format(".splat", "antimatter15's format", _lazy("splat.read_rows"), _lazy("splat.splat_bytes"), 0, each=(32.0,)),
     Format(

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.io.atomic import AddOutput, atomic_output
-from gsmerge.io.cameras.viewer_cameras import viewer_settings
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, output_format
 from gsmerge.types import Gaussians, StrPath
@@ -30,18 +29,10 @@ def level_output(output: Path, level: int) -> Path:
     return output.with_name(f"{output.name[:stem_length]}.level{level}{output.name[stem_length:]}")
 
 
-def add_settings(add: AddOutput, path: Path, contents: Contents) -> None:
-    """Write settings for SuperSplat's viewer if there are views; a file that is there stays: it may be the user's."""
-    if len(contents.cameras) and not path.exists():
-        add(path).write_text(viewer_settings(contents.cameras, contents.levels[0].means), encoding="utf-8")
-
-
 def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write each level to a separate file, as :data:`gsmerge.io.formats.table.WriteOutput`."""
     written, format_ = {path: [temporary]}, output_format(path)
     ending = format_.ending
-    if format_.has_settings:
-        add_settings(add, path.with_name(f"{path.name[: -len(ending)]}.settings.json"), contents)
     for level in range(1, len(contents.levels)):
         written[level_output(path, level)] = [add(level_output(path, level))]
     if ending == PLY.ending and contents.extra_columns is not None:

@@ -176,7 +176,8 @@ def test_results_in_other_formats(ending: str, scene: Path, out: Path) -> None:
     actual = run(scene, out, said)
     paths = [f"room{ending}", f"room.level1{ending}", "room.cameras.json"]
     assert [file["path"] for file in actual["files"]] == paths
-    assert sorted(path.name for path in out.iterdir()) == sorted([*paths, "batch.jsonl"])
+    beside = ["batch.jsonl", *(["room.settings.json"] if ending == ".sog" else [])]
+    assert sorted(path.name for path in out.iterdir()) == sorted([*paths, *beside])
     start = {".sog": b"PK", ".spz": b"\x1f\x8b"}[ending]
     assert (out / f"room{ending}").read_bytes().startswith(start)
     assert run(scene, out, said)["status"] == SKIPPED

@@ -29,7 +29,7 @@ def result(scene: Scene) -> gsmerge.CompactResult:
     ("name", "files"),
     [
         ("a.ply", {"a.ply", "a.level1.ply", "a.cameras.json"}),
-        ("a.sog", {"a.sog", "a.level1.sog", "a.cameras.json"}),
+        ("a.sog", {"a.sog", "a.level1.sog", "a.cameras.json", "a.settings.json"}),
         ("a.html", {"a.html"}),
     ],
 )
