@@ -311,11 +311,15 @@ def test_the_picture_fits_the_window(size: tuple[int, int], opened: tuple[Browse
 
 
 def test_a_phone(opened: tuple[Browser, Any]) -> None:
-    """The picture comes first, with its controls in sight; both are whole; the table begins with what matters most."""
+    """The headline and the picture come first, with its controls in sight; the table begins with what matters most."""
     tab, _ = opened
     resize(tab, 390, 844)
-    assert tab.box("stage")["y"] < 20
-    for control in ("id('left-source')", "id('right-source')", "id('overlay-share')"):
+    assert tab.box("headline")["y"] < 40
+    assert 60 < tab.box("stage")["y"] < 844 / 3
+    alts = tab.run("[id('left').alt, id('right').alt, id('canvas').getAttribute('aria-label')]")
+    assert [alt.split(":")[0].split(",")[0] for alt in alts[:2]] == ["before", "after"]
+    assert alts[2].endswith(" in 3D")
+    for control in ("id('left-source')", "id('right-source')"):  # in sight with the headline and the picture
         assert 0 < tab.box(control)["y"] < 844
     for mode, shown in {"swipe": 2, "side": 2, "blink": 1, "difference": 2}.items():
         side = mode == "side"
@@ -333,8 +337,8 @@ def test_a_phone(opened: tuple[Browser, Any]) -> None:
             assert tab.run("stage.classList.contains('stacked')") is side
 
     heads = "[...document.querySelectorAll('.results th')]"
-    assert tab.run(f"{heads}.map(one => one.textContent)")[:3] == ["", "File", "PSNR (dB)"]
-    assert tab.run(f"{heads}[2].getBoundingClientRect().right") < 390
+    assert tab.run(f"{heads}.map(one => one.textContent)")[:2] == ["File", "PSNR (dB)"]
+    assert tab.run(f"{heads}[1].getBoundingClientRect().right") < 390
     assert tab.run("(one => one.scrollWidth > one.clientWidth)(document.querySelector('.results .scroll'))")
     ground = tab.run("getComputedStyle(document.querySelector('.results .scroll')).backgroundAttachment")
     assert ground == "local, local, scroll, scroll"  # a shadow says that there is more

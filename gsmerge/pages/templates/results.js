@@ -5,6 +5,12 @@ const FIRST_RESULT = Number(data.photos) + Number(data.results.length < data.sou
 const FASTER = 1.2; // times, from which on the headline says it
 const times = new Map(); // milliseconds of a frame in 3D, by source
 const number = (value, digits) => (value === null ? "-" : value.toFixed(digits));
+// What a picture shows, for those who cannot see it.
+const roleOf = (source) => {
+  if (data.photos && source === 0) return "photo";
+  if (source < FIRST_RESULT) return "before";
+  return data.results.length > 1 ? `after, ${data.sources[source].name}` : "after";
+};
 const scoreOf = (named, source) => named.scores[source - Number(data.photos)] || [null, null, null];
 
 function make(name, words, settings = {}) {

@@ -119,7 +119,7 @@ function show() {
     const picture = id(side);
     picture.hidden = !here || drawn || !state.atCamera || (stills && !still);
     if (!picture.hidden && still && picture.src !== still) picture.src = still;
-    picture.alt = data.sources[source].name;
+    picture.alt = `${roleOf(source)}: ${view().name}`;
     const pane = id(`${side}-pane`);
     pane.hidden = !here;
     lay(pane.querySelector(".overlay"), data.photos && plain && stillOf(0), state.overlay);
