@@ -77,7 +77,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
         layout=_layout_name(names, _num_rest(path, names), compressed=compressed),
         format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
         encoding="logit" if compressed or is_from_gsmerge(comments) else None,
-        sizes=_bytes_by_attribute(rows.dtype, len(rows)),
+        sizes=_packed_bytes(rows) if compressed else _bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
         extra_elements=extra_elements,
         notes=(
@@ -214,6 +214,13 @@ def _bytes_by_attribute(row: np.dtype[Any], count: int) -> dict[str, int]:
         attribute = attributes.get(name, "shN" if name.startswith("f_rest_") else "extra")
         sizes[attribute] += row[name].itemsize * count
     return dict(sizes)
+
+
+def _packed_bytes(rows: np.ndarray | arrays.PackedRows) -> dict[str, int]:
+    """Count the bytes of packed rows by attribute: a word for each, the fourth with colour and opacity."""
+    num_rest = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
+    each = {"means": 4, "quats": 4, "scales": 4, "sh0": 3, "opacities": 1, "shN": num_rest}
+    return {name: size * len(rows) for name, size in each.items() if size}
 
 
 def no_ply(path: Path) -> SceneError:

@@ -85,6 +85,7 @@ def made() -> dict[str, np.ndarray]:
 def test_what_was_packed_comes_back(tmp_path: Path, made: dict[str, np.ndarray], rest: int, ranged: bool) -> None:
     write_compressed(tmp_path / "a.ply", made, rest, ranged)
     ply = read_ply(tmp_path / "a.ply")
+    assert sum(ply.info.bytes_by_attribute.values()) == (16 + rest) * len(ply.gaussians) < ply.info.file_bytes
     g = ply.gaussians
     assert ply.info.layout.startswith("compressed")
     assert (ply.info.opacity_encoding, ply.info.opacity_guessed) == ("logit", False)
