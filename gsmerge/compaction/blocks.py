@@ -111,7 +111,7 @@ def compact_in_blocks(
         fitted = list(adopt_records(work.run("fit", fit_block, count, each_start(starts, shared_start, growth))))
         joined, owners = join_parts([gaussians for gaussians, _ in fitted])
         joined = fit_seams(joined, owners, starts, options.seed)
-        result = finish_joined(joined, scene.cameras, frame, options, choices)
+        result = finish_joined(joined, scene.cameras, scene.names, frame, options, choices)
         scored = work.run("score", score_block, count, each_start(starts, work.share(result)))
         scores = [score for score, _ in adopt_records(scored)]
     facts = [
@@ -188,8 +188,9 @@ def score_block(start: BlockStart, gaussians: Gaussians, _: int) -> float | None
 
 
 def finish_joined(
-    joined: Gaussians, cameras: Cameras, frame: Frame, options: CompactOptions, choices: SceneChoices
-) -> Gaussians:
+    joined: Gaussians, cameras: Cameras, names: Sequence[str], frame: Frame, options: CompactOptions,
+    choices: SceneChoices,
+) -> Gaussians:  # fmt: skip
     """Prune the canonical Gaussians of all blocks, move them into the world, and drop those beyond the budget."""
     limit = choices.limits.count
     if choices.fit.min_contribution > 0:
@@ -200,8 +201,8 @@ def finish_joined(
     if limit is not None and options.budget.is_filled and len(result) < limit:
         note(f"budget: {limit:,} Gaussians were asked for, {len(result):,} remain of those of all blocks")
     if (size := file_size(options.budget)) and size.packed:
-        page = size.num_bytes, size.file, cameras
-        result = drop_to_bytes(result, *page, measure_rest(result, *page))
+        content = size.num_bytes, size.file, cameras, names
+        result = drop_to_bytes(result, *content, measure_rest(result, *content))
     return result
 
 

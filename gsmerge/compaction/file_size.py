@@ -9,7 +9,7 @@ from gsmerge.compaction.search import meet
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import MIP_COMMENT, RESULT_COMMENT
-from gsmerge.io.formats.table import Format
+from gsmerge.io.formats.table import Contents, Format
 from gsmerge.plan import Plan
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.stages.clean import faintest_dropped
@@ -24,11 +24,13 @@ TRIES, MAX_REBUILDS = 8, 2  # files that are measured to choose what is dropped;
 Rebuild = Callable[[int | None], Candidate]  # a count -> a candidate of all views, built, cleaned up and scored
 
 
-def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras) -> int:
-    """Count the bytes of a file with the given Gaussians; of a page with ``cameras``, count an upper bound."""
+def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: Sequence[str] = ()) -> int:
+    """Count the bytes of a file with Gaussians and ``cameras`` of these ``names``; of a page, count an upper bound."""
     comments = RESULT_COMMENT, MIP_COMMENT
     if file.measure is not None:
         return file.measure(gaussians, cameras, comments)
+    if file.encode_views is not None:
+        return len(file.encode_views(gaussians, Contents([gaussians], comments, cameras, names)))
     assert file.encode is not None  # all other formats have a fixed number of bytes for each Gaussian
     return len(file.encode(gaussians, comments))
 
@@ -41,10 +43,11 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
     if plan.size is None or not plan.size.packed:
         return candidate
     max_bytes, file = plan.size.num_bytes, plan.size.file
-    rest = measure_rest(candidate.gaussians, max_bytes, file, candidate.cameras)
+    names = prepared.input_scene.names
+    rest = measure_rest(candidate.gaussians, max_bytes, file, candidate.cameras, names)
 
     def choose_next(built: Sequence[Candidate]) -> int | None:
-        size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras), len(built[-1].gaussians)
+        size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras, names), len(built[-1].gaussians)
         # unseen Gaussians were dropped from the requested number; the bytes that they free are not filled up
         requested = max(count, built[-1].count or 0)
         full_size = rest + (size - rest) * requested / max(count, 1)  # bytes with the dropped Gaussians
@@ -54,20 +57,24 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
         return None if fits or len(built) > MAX_REBUILDS else room
 
     candidate = meet(rebuild, candidate, choose_next)[-1]
-    gaussians = drop_to_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, rest)
+    gaussians = drop_to_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names, rest)
     return candidate if len(gaussians) == len(candidate.gaussians) else shrink(candidate, gaussians, prepared, plan)
 
 
-def measure_rest(gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras) -> int:
+def measure_rest(
+    gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, names: Sequence[str] = ()
+) -> int:
     """Count the bytes of a file with one Gaussian; UsageError if they are more than ``max_bytes``."""
-    rest = measure_bytes(gaussians[:1], file, cameras)
+    rest = measure_bytes(gaussians[:1], file, cameras, names)
     if rest > max_bytes:
         problem = f"expected at least {human_bytes(rest)} for a {file.ending} with one Gaussian"
         raise UsageError(f"budget: {problem}, got {human_bytes(max_bytes)}")
     return rest
 
 
-def drop_to_bytes(gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, rest: int) -> Gaussians:
+def drop_to_bytes(
+    gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, names: Sequence[str], rest: int
+) -> Gaussians:
     """Keep as many of the largest and most opaque Gaussians as fit into ``max_bytes``.
 
     ``rest``: bytes of a file with one Gaussian.
@@ -76,7 +83,7 @@ def drop_to_bytes(gaussians: Gaussians, max_bytes: int, file: Format, cameras: C
     best, count = gaussians[:0], len(gaussians)
     for _ in range(TRIES):
         trial = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
-        size = measure_bytes(trial, file, cameras)
+        size = measure_bytes(trial, file, cameras, names)
         if size <= max_bytes:
             low, best = count, trial
         else:

@@ -65,7 +65,8 @@ def encode_views(gaussians: Gaussians, contents: Contents) -> bytes:
 
     The first is the view that stands nearest to the middle of all, since viewers look from the first.
     """
-    cameras, names = contents.cameras, contents.names
+    cameras = contents.cameras
+    names = contents.names or [f"view {view}" for view in range(len(cameras))]
     nodes, lenses, ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
     for i, view in enumerate(ids):
         pose = np.eye(4)  # of glTF's cameras, which look along -z with y up
