@@ -65,7 +65,7 @@ def pack_splats(
     head |= {"steps": steps, "levels": levels, "sizes": [size for size, _ in packed]}
     line = json.dumps(head).encode() + b"\n"
     content = line + b"".join(planes for _, planes in packed)
-    return spz.gzip_bytes(content, level=1, strategy=zlib.Z_RLE), degree  # longer matches are rare in differences
+    return spz.gzip_bytes([content], level=1, strategy=zlib.Z_RLE), degree  # longer matches are rare in differences
 
 
 def _num_harmonics(degree: int) -> int:

@@ -15,11 +15,13 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import reduce
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -325,14 +327,18 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     A comment may mark the Gaussians as antialiased, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
     header, parts = spz_columns(gaussians, MAX_DEGREE, mip=arrays.render_mode(comments) == arrays.MIP)
-    return gzip_bytes(header, *(part.data for part in parts))
+    columns = deque(parts)
+    del parts  # each column is freed when the next one is compressed
+    return gzip_bytes(chain([header], (columns.popleft().data for _ in range(len(columns)))))
 
 
-def gzip_bytes(*parts: bytes | memoryview, level: int = 6, strategy: int = zlib.Z_DEFAULT_STRATEGY) -> bytes:
-    """Compress to one gzip stream with equal bytes at any time, on every system and in every version of Python."""
+def gzip_bytes(
+    parts: Iterable[bytes | memoryview], *, level: int = 6, strategy: int = zlib.Z_DEFAULT_STRATEGY
+) -> bytes:
+    """Compress parts to a gzip stream with equal bytes at any time, on every system and in every version of Python."""
     packer, packed = zlib.compressobj(level, wbits=31, strategy=strategy), bytearray()  # without a time
     for part in parts:
         packed += packer.compress(part)
     packed += packer.flush()
     packed[SYSTEM : SYSTEM + 1] = UNIX
-    return bytes(packed)
+    return cast(bytes, packed)  # as good as bytes where it is written, without a copy
