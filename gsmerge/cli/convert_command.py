@@ -50,12 +50,11 @@ def convert(args: opt.Args) -> None:
     check_format(output, writing)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.io.formats.table import estimate_counts
-    from gsmerge.runtime.memory import BYTES_CONVERTED, BYTES_CONVERTED_VALUE, memory_problem
+    from gsmerge.runtime.memory import conversion_bytes, memory_problem
     from gsmerge.runtime.record import record_run
 
-    count, num_rest = estimate_counts(inputs)
-    needed = count * (BYTES_CONVERTED + BYTES_CONVERTED_VALUE * num_rest)
-    if problem := memory_problem(needed, "a .ply takes least, and parts of the scene can be converted one by one"):
+    remedy = "a .ply takes least, and parts of the scene can be converted one by one"
+    if problem := memory_problem(conversion_bytes(*estimate_counts(inputs)), remedy):
         say(problem, kind="warning", quiet=args.silent)
     hints = args.hints()
     options = ConvertOptions(

@@ -201,14 +201,15 @@ def run_search(search: CountSearch, build: Build, rebuild: Rebuild, prepared: Pr
     return search.best
 
 
-def find_count(scene: Scene, options: CompactOptions) -> int | None:
+def find_count(scene: Scene, options: CompactOptions) -> int:
     """Find the number of Gaussians that a run makes of a scene without cameras if a PSNR decides it."""
     with use_threads(options.threads), record_part(silent=True):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
-        search = search_count(prepared, add_target(make_plan(prepared, options), prepared), method.build)
-        search.run(partial(build_scored, method.build, prepared, search.plan))
-    return search.count
+        plan = add_target(make_plan(prepared, options), prepared)
+        rebuild = partial(build_scored, method.build, prepared, plan)
+        best = run_search(search_count(prepared, plan, method.build), method.build, rebuild, prepared)
+    return len(best.gaussians)
 
 
 @record_part()

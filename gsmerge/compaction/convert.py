@@ -21,9 +21,8 @@ from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, upward_axis
 from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_columns, read_extra_columns
 from gsmerge.io.formats.read import FileInfo, kept_comments
-from gsmerge.io.formats.rounding import rounding_notes
+from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.table import Contents, Format
-from gsmerge.io.formats.write import limit_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.io.scene_files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.measure.documents import document_head, note_entries
@@ -93,9 +92,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, dropped["unseen"], count, None if stored is None else stored.path)
     names = () if stored is None else stored.names
-    notes += limit_notes(options.output, gaussians.sh_degree, len(gaussians)) + rounding_notes(
-        options.output, gaussians
-    )
+    notes += format_notes(options.output, gaussians)
     comments, comment_notes = _join_comments(infos, format_, moves=options.placement.moves)
     notes += comment_notes
     if any(RESULT_COMMENT in info.comments for info in infos):
@@ -104,7 +101,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     contents = Contents(
         [gaussians], comments, moved, names, scene_title(options.inputs[0]), options.normals, extra_columns=columns
     )
-    num_bytes, camera_path = write_contents(options.output, contents, names, overwrite=options.overwrite)
+    num_bytes, camera_path = write_contents(options.output, contents, overwrite=options.overwrite)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
     inputs = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     input_cameras = None if stored is None else str(stored.path)

@@ -17,9 +17,8 @@ from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.columns import UNUSED, list_names
 from gsmerge.io.formats.ply import is_from_gsmerge
-from gsmerge.io.formats.rounding import rounding_notes
+from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.table import Contents
-from gsmerge.io.formats.write import limit_notes
 from gsmerge.io.scene_files import SceneFiles, result_cameras, scene_title
 from gsmerge.measure.documents import file_sha256
 from gsmerge.runtime.memory import release_memory
@@ -84,9 +83,7 @@ def compact_files(
         comments, expected = [RESULT_COMMENT, *load.comments], result.report.new_views
         if expected is not None:
             comments.append(new_views_comment(expected))
-        notes = limit_notes(out, result.gaussians.sh_degree, len(result.gaussians)) + rounding_notes(
-            out, result.gaussians
-        )
+        notes = format_notes(out, result.gaussians)
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
         contents = Contents(levels, comments, cameras, names, scene_title(files.ply), outputs.normals)
         written = format_.write(add, out, temporary, contents)

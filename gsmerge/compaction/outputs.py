@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +26,9 @@ SAME = 1e-5
 def add_views(add: AddOutput, out: Path, path: Path, contents: Contents, *, overwrite: bool) -> None:
     """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has other cameras.
 
-    Viewers of some formats have settings, which start them at the view in the middle. Settings that are there already
-    stay, as they may be the user's.
-
     If the file has these cameras already, to within rounding, it stays unchanged, because results in several formats
-    share it.
+    share it. Viewers of some formats have settings, which start them at the view in the middle. Settings that are there
+    already stay, as they may be the user's.
     """
     cameras, names, format_ = contents.cameras, contents.names, output_format(out, levels=True, cameras=True)
     settings = out.with_name(format_.settings.format(stem=out.name.removesuffix(format_.ending)) or out.name)
@@ -79,23 +76,23 @@ def write_result(
     comments = [RESULT_COMMENT, *([] if new_views is None else [new_views_comment(new_views)])]
     stored_levels = [level.numpy() for level in (levels if format_.levels else levels[:1])]
     contents = Contents(stored_levels, comments, cameras, names, out.stem)
-    write_contents(out, contents, names, overwrite=overwrite)
+    write_contents(out, contents, overwrite=overwrite)
     return out
 
 
 def write_contents(
-    out: Path, contents: Contents, names: Sequence[str], *, overwrite: bool, viewer_cameras: bool = True
+    out: Path, contents: Contents, *, overwrite: bool, viewer_cameras: bool = True
 ) -> tuple[int, str | None]:
     """Write an output, and its cameras beside it if its format has none; return its bytes and their path.
 
-    ``names`` are those of the cameras. Without ``viewer_cameras`` no file is written beside it.
+    Without ``viewer_cameras`` no file is written beside it.
     """
     format_, path = output_format(out, levels=True, cameras=True), viewer_cameras_path(out)
     is_beside = viewer_cameras and len(contents.cameras) > 0 and not format_.has_cameras
     with atomic_outputs(overwrite=overwrite) as add:
         written = format_.write(add, out, add(out), contents)
         if is_beside:
-            add_views(add, out, path, replace(contents, names=names), overwrite=overwrite)
+            add_views(add, out, path, contents, overwrite=overwrite)
         num_bytes = sum(file.stat().st_size for file in written[out])
     format_.finish(out)
     return num_bytes, str(path) if is_beside else None

@@ -61,14 +61,14 @@ NO_VIEWS = (
 def add_views(scene: Scene, *, shown: bool = False) -> Scene:
     """Keep the finite Gaussians, at least one, and place cameras if there are none, with a note.
 
-    ``shown``: the views are for people to look at, so half of them are around the scene (:func:`place_viewpoints`).
+    ``shown``: the views are for people to look at, as of :func:`place_viewpoints`.
     """
     scene = keep_finite(scene)
     if len(scene) == 0:
         inside = place_inside(scene.gaussians)
         note(NO_VIEWS if inside is None else STANDING)
-        cameras = inside or (place_viewpoints if shown else place_around)(scene.gaussians)
-        order = sorted(range(len(cameras)), key=lambda view: -((view + 1) % HELD_OUT == 0))  # those held out first
+        cameras = inside or (_place_shown if shown else place_around)(scene.gaussians)
+        order = sorted(range(len(cameras)), key=lambda view: (view + 1) % HELD_OUT != 0)  # those held out first
         scene = _with_cameras(scene.gaussians, cameras if shown else cameras[order])
     return scene
 
@@ -92,9 +92,11 @@ def place_inside(gaussians: Gaussians) -> Cameras | None:
 
 def place_viewpoints(gaussians: Gaussians) -> Cameras:
     """Place cameras for people to look from: where a viewer stands; or else first around the scene, then inside."""
-    standing = place_inside(gaussians)
-    if standing is not None:
-        return standing
+    return place_inside(gaussians) or _place_shown(gaussians)
+
+
+def _place_shown(gaussians: Gaussians) -> Cameras:
+    """Place cameras for people to look from, first around a scene that was not made around a viewer, then inside."""
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
     centre, half = _extent(thin_out(gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64))
     angles = 2 * np.pi * np.arange(len(inside)) / len(inside)
@@ -161,8 +163,9 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
     if views <= FEW_VIEWS:
         more = concat_cameras(between_cameras(scene.cameras), more)
     drawn = draw_pictures(_with_cameras(scene.gaussians, more))
+    names = (*scene.names, *(f"around {view}" for view in range(len(more))))
     return replace(
-        drawn, cameras=concat_cameras(scene.cameras, more), names=(*scene.names, *drawn.names),
+        scene, cameras=concat_cameras(scene.cameras, more), names=names, pixels=None,
         images=np.concatenate([scene.images, drawn.images]), empty=np.concatenate([scene.empty, drawn.empty]),
     )  # fmt: skip
 

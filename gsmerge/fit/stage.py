@@ -54,13 +54,8 @@ def fit_scene(
         job = FitJob(photos, options, decoded.count, growth, seed, report_steps, decoded.fixed, num_scored)
         outside = place_outside_views(scene, decoded.gaussians, job.scored_photos(1), options)
         edges = None if options.beyond else find_edges(scene.cameras, decoded.count)
-        job = replace(
-            job,
-            held_out=scene_photos(scene)[held_out] if held_out else None,
-            outside=outside,
-            edges=edges,
-            region=scene.region,
-        )
+        unseen = scene_photos(scene)[held_out] if held_out else None
+        job = replace(job, held_out=unseen, outside=outside, edges=edges, region=scene.region)
         gaussians, report = fit(decoded.gaussians, job)
         if scene.region is not None:  # Gaussians that grew last took no step since
             gaussians = replace(gaussians, means=clamp_inside(scene.region, gaussians.means).astype(np.float32))
@@ -84,12 +79,11 @@ def fit(gaussians: Gaussians, job: FitJob) -> FitResult:
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Run :func:`fit` on a job with its views from outside."""
     options = job.options
-    run, scored = prepare_fit(job), job.scored_photos(0)
+    run, scored = prepare_fit(job), job.scored_photos(0) if job.held_out is None else job.held_out
     survey = survey_photos(gaussians, run)
     keep = survey.visible(options.min_contribution)
     start, rows = gaussians[keep], np.flatnonzero(keep)
     fixed = None if job.fixed is None else job.fixed[rows]
-    scored = scored if job.held_out is None else job.held_out
     fitted, report = _better_of(scored, start, *fit_full(start, run, survey[keep], fixed))
     if not report.accepted:
         return start, replace(report, origins=rows)

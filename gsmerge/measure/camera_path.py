@@ -16,6 +16,7 @@ from gsmerge.geometry.transforms import (
     rotmat_to_quat,
     step_outside,
 )
+from gsmerge.io.cameras.viewer_cameras import order_views
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.measure.fog import CAMERAS
@@ -122,11 +123,7 @@ def viewing_depth(cameras: Cameras, means: np.ndarray) -> float:
 
 def median_camera(cameras: Cameras) -> int:
     """Return the index of the camera nearest to the median centre and the mean viewing direction."""
-    centres = camera_centres(cameras.viewmats)
-    forward = cameras.viewmats[:, 2, :3]
-    distances = _lengths(centres - lower_median(centres))
-    turns = _lengths(forward - normalize(forward.mean(0)))
-    return int((distances / (distances.mean() or 1.0) + turns).argmin())
+    return order_views(cameras)[0]
 
 
 def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None) -> Cameras:

@@ -87,6 +87,11 @@ def memory_bytes(pixels: int, *, num_rest: int = 0, num_elsewhere: int = 0) -> i
     return BYTES_FIXED + round(pixel_bytes * pixels + BYTES_ELSEWHERE * num_elsewhere)
 
 
+def conversion_bytes(count: int, num_rest: int) -> int:
+    """Estimate the memory of a conversion of ``count`` Gaussians in bytes; ``num_rest`` as in :func:`memory_bytes`."""
+    return count * (BYTES_CONVERTED + BYTES_CONVERTED_VALUE * num_rest)
+
+
 def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
     """Return why a run that needs ``needed`` bytes may not fit into this machine, and what helps; None if it fits."""
     available = machine_memory()

@@ -15,9 +15,8 @@ from gsmerge.compaction.outputs import write_contents
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.atomic import common_mode
 from gsmerge.io.formats.arrays import RESULT_COMMENT
-from gsmerge.io.formats.rounding import rounding_notes
+from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.table import Contents
-from gsmerge.io.formats.write import limit_notes
 from gsmerge.io.locks import lock_file
 from gsmerge.io.scene_files import SceneFiles, scene_title
 from gsmerge.measure.documents import document_head, note_entries, seconds_document, seconds_line
@@ -165,9 +164,9 @@ def decode_file(
     if len(gaussians) == 0:
         raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
     cameras = features.frame.leave_cameras(features.cameras)
-    notes = [*limit_notes(out, gaussians.sh_degree, len(gaussians)), *rounding_notes(out, gaussians)]
+    notes = format_notes(out, gaussians)
     contents = Contents([gaussians], [RESULT_COMMENT], cameras, features.names, scene_title(path), normals)
-    num_bytes, _ = write_contents(out, contents, features.names, overwrite=overwrite, viewer_cameras=viewer_cameras)
+    num_bytes, _ = write_contents(out, contents, overwrite=overwrite, viewer_cameras=viewer_cameras)
     seconds = {**(seconds_before or {}), "read": read_end - start, "decode": decode_end - read_end}
     seconds["write"] = perf_counter() - decode_end
     return document | {

@@ -23,7 +23,7 @@ from gsmerge.geometry.transforms import camera_centres
 from gsmerge.pipeline import build
 from gsmerge.plan import choose_for_scene
 from gsmerge.raster.metrics import psnr
-from gsmerge.types import Decoded, Gaussians
+from gsmerge.types import Decoded, Gaussians, Region
 
 
 @pytest.fixture(scope="module")
@@ -141,8 +141,10 @@ def test_cameras_between_stand_half_way_and_look_at_the_same(scene: Scene) -> No
 
 
 def test_a_fit_sees_what_lies_around_its_views(scene: Scene) -> None:
-    drawn = draw_pictures(scene)
+    region = Region(np.zeros(3), np.full(3, 50.0), np.eye(3), is_sphere=False)
+    drawn = draw_pictures(replace(scene, region=region))
     more = draw_around(drawn)
+    assert more.region is region
     assert len(more) > len(scene) + int(OUTSIDE * len(scene))
     assert len(more.images) == len(more.cameras) == len(more.names) == len(set(more.names))
     np.testing.assert_array_equal(more.images[: len(scene)], drawn.images)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.geometry.transforms import camera_centres, lower_median, normalize
 from gsmerge.io.cameras.camera_file import CENTRED_PX
 from gsmerge.types import Cameras
 
@@ -56,10 +57,13 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
 
 
 def order_views(cameras: Cameras) -> list[int]:
-    """Return the views by their distance from the middle of all, the nearest first."""
-    centres = cameras.centres.astype(np.float64)
-    offsets = centres - np.median(centres, axis=0) if len(centres) else centres
-    return np.argsort((offsets**2).sum(1), kind="stable").tolist()
+    """Return the views in order; the first is nearest to the median centre and the mean viewing direction."""
+    if len(cameras) == 0:
+        return []
+    centres, forward = camera_centres(cameras.viewmats), cameras.viewmats[:, 2, :3]
+    offsets, turns = centres - lower_median(centres), forward - normalize(forward.mean(0))
+    distances, turned = (np.sqrt((rows * rows).sum(1)) for rows in (offsets, turns))
+    return np.argsort(distances / (distances.mean() or 1.0) + turned, kind="stable").tolist()
 
 
 def vertical_field(cameras: Cameras, view: int) -> float:
@@ -70,7 +74,7 @@ def vertical_field(cameras: Cameras, view: int) -> float:
 def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
     """Return the text of settings for SuperSplat's viewer (its ``settings.json``, version 2): where to look from.
 
-    The camera is the view nearest to the middle of all. Its target lies at the median depth of the ``means [n,3]`` in
+    The camera is the first of :func:`order_views`. Its target lies at the median depth of the ``means [n,3]`` in
     front of it. The viewer turns the scene by half a turn about z.
     """
     view = order_views(cameras)[0]

@@ -329,10 +329,14 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
     )
 
 
-def column_blocks(gaussians: Gaussians, max_degree: int) -> Iterator[tuple[int, Columns]]:
-    """Yield the first row of each block of Gaussians, and the block's columns, which take a few times its memory."""
-    for start in range(0, len(gaussians), BLOCK_ROWS):
-        yield start, to_columns(gaussians[start : start + BLOCK_ROWS], max_degree, start)
+def column_blocks(gaussians: Gaussians, max_degree: int, num_rows: int | None = None) -> Iterator[tuple[int, Columns]]:
+    """Yield the first row of each block of ``num_rows`` Gaussians, and the block as :func:`to_columns` gives it.
+
+    None: ``BLOCK_ROWS``. The columns take a few times the memory of the Gaussians.
+    """
+    num_rows = num_rows or BLOCK_ROWS
+    for start in range(0, len(gaussians), num_rows):
+        yield start, to_columns(gaussians[start : start + num_rows], max_degree, start)
 
 
 def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:

@@ -35,7 +35,7 @@ from gsmerge.io.formats.arrays import (
 )
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, number_views
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.table import Contents
@@ -66,7 +66,7 @@ def encode_views(gaussians: Gaussians, contents: Contents) -> bytes:
     The first is the view that stands nearest to the middle of all, since viewers look from the first.
     """
     cameras = contents.cameras
-    names = contents.names or [f"view {view}" for view in range(len(cameras))]
+    names = contents.names or number_views(len(cameras))
     nodes, lenses, ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
     for i, view in enumerate(ids):
         pose = np.eye(4)  # of glTF's cameras, which look along -z with y up
@@ -88,9 +88,8 @@ def glb_bytes(
 
     Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
-    half_turn = turner(
-        np.diag([-1.0, -1.0, 1.0]), (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2 - 1
-    )  # from y down to y up
+    num_higher = (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2 - 1
+    half_turn = turner(np.diag([-1.0, -1.0, 1.0]), num_higher)  # from y down to y up
     blocks = [_attributes(half_turn(columns)) for _, columns in column_blocks(gaussians, MAX_DEGREE)]
     attributes = {name: _join([block.pop(name) for block in blocks]) for name in tuple(blocks[0])}
     views, accessors = _describe_arrays(list(attributes.values()))

@@ -461,9 +461,7 @@ def ply_blocks(
     extra_types = {} if extra is None else {name: extra.dtype[name].str[1:] for name in extra.dtype.names or ()}
     header, num_columns = _header(len(gaussians), degree, comments, normals=normals, extra=extra_types)
     yield header
-    block = max(1, BLOCK_BYTES // (4 * num_columns))
-    for start in range(0, len(gaussians), block):
-        columns = arrays.to_columns(gaussians[start : start + block], degree, start)
+    for start, columns in arrays.column_blocks(gaussians, degree, max(1, BLOCK_BYTES // (4 * num_columns))):
         logits = log(columns.opacities) - log1p(-columns.opacities)  # infinite for 0 and 1, NaN outside [0, 1]
         parts = [
             columns.means,
@@ -480,7 +478,7 @@ def ply_blocks(
         if not extra_types or extra is None:
             yield rows.data
             continue
-        extra_bytes = np.ascontiguousarray(extra[start : start + block]).view(np.uint8).reshape(len(rows), -1)
+        extra_bytes = np.ascontiguousarray(extra[start : start + len(rows)]).view(np.uint8).reshape(len(rows), -1)
         yield np.concatenate([rows.view(np.uint8), extra_bytes], axis=1).data
 
 

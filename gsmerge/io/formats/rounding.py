@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.geometry.transforms import medians
 from gsmerge.io.formats.read import read_gaussians
 from gsmerge.io.formats.table import PLY, output_format
-from gsmerge.io.formats.write import write_gaussians
+from gsmerge.io.formats.write import limit_notes, write_gaussians
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arrays import distinct
 
@@ -19,6 +19,11 @@ from gsmerge.values.arrays import distinct
 # size and at most 1. Scenes around their origin have at most a tenth of this.
 SHOWN = 0.005
 SAMPLE = 1 << 17  # number of Gaussians from which the mean is estimated
+
+
+def format_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
+    """Note what a file's format leaves out or rounds of Gaussians; UsageError for an unknown ending."""
+    return limit_notes(path, gaussians.sh_degree, len(gaussians)) + rounding_notes(path, gaussians)
 
 
 def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:

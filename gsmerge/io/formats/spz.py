@@ -277,7 +277,7 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> 
     ValueError if there is NaN or inf.
     """
     means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
-    fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], FINE)
+    fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], FINE)  # others are refused below
     header = Header(VERSION, count, degree, fraction, MIP_FLAG * mip, 0)
     parts = tuple(np.empty((count, width), np.uint8) for width in header.widths)
     for start, columns in arrays.column_blocks(gaussians, max_degree):

@@ -17,10 +17,13 @@ from gsmerge.values.arguments import check_arguments
 
 def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
     """Note which harmonics a format leaves out, and more Gaussians than readers take; UsageError for its ending."""
-    format_ = output_format(path, levels=True, cameras=True)
-    notes = [f"public readers of {format_.ending} stop at {format_.most:,} Gaussians: write a .ply or .sog, or fewer"]
-    lost = [format_.lost.format(ending=format_.ending, degree=format_.max_degree)]
-    return lost * (sh_degree > format_.max_degree) + notes * (count > format_.most)
+    format_, notes = output_format(path, levels=True, cameras=True), list[str]()
+    if sh_degree > format_.max_degree:
+        notes.append(format_.lost.format(ending=format_.ending, degree=format_.max_degree))
+    if count > format_.most:
+        problem = f"public readers of {format_.ending} stop at {format_.most:,} Gaussians"
+        notes.append(f"{problem}: write a .ply or .sog, or fewer")
+    return notes
 
 
 def level_output(output: Path, level: int) -> Path:
