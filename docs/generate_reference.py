@@ -137,9 +137,9 @@ def _cell(text: str | None) -> str:
 
 
 def _settings_page() -> str:
-    from gsmerge.cli.paths import FileOptions
     from gsmerge.settings.compact import CompactOptions
     from gsmerge.settings.extend import ExtendOptions
+    from gsmerge.settings.files import FileOptions
     from gsmerge.settings.placement import PlacementOptions
     from gsmerge.settings.reading import FileHints
     from gsmerge.settings.setting import flat_settings, settings_of

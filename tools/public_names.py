@@ -19,13 +19,13 @@ import typer.main
 import gsmerge
 from gsmerge import errors, integrations
 from gsmerge.cli.app import app
-from gsmerge.cli.paths import FileOptions
 from gsmerge.io.formats import gsm
 from gsmerge.measure import documents
 from gsmerge.networks import checkpoint
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.extend import ExtendOptions
+from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import FileHints
 from gsmerge.settings.setting import flat_settings

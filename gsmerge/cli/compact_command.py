@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
-from gsmerge.cli.paths import FileOptions, check_format, check_outputs, default_output, input_files, output_file
+from gsmerge.cli.paths import check_format, check_outputs, default_output, input_files, output_file
 from gsmerge.errors import TargetError, UsageError
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
+from gsmerge.settings.files import FileOptions
 from gsmerge.settings.reading import NONE
 from gsmerge.settings.stages import Engine
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from gsmerge.scene.exporters import ReadHints
     from gsmerge.scene.read import Loaded
 
-STREAMED_LEVELS = 3  # of a lod-meta.json; the coarsest level, a sixteenth, loads at once
 REMEDY = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
 # Arguments and options that apply to Feature Gaussians too
 FEATURE_OPTIONS = ("scenes", "k", "set", "output", "overwrite", "dry_run", "open", "json", "quiet", "threads")
@@ -106,10 +106,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     _warn_of_memory(files, settings, quiet=args.silent)
     from gsmerge.compaction.files import Outputs, compact_files
 
-    outputs = Outputs(
-        out, viewer_cameras=cameras, overwrite=args.overwrite, normals=writing.normals,
-        full_columns=writing.columns == "full",
-    )  # fmt: skip
+    outputs = Outputs(out, viewer_cameras=cameras, overwrite=args.overwrite, options=writing)
     seconds_before = {"import": perf_counter() - start}
     with separate_stdout(engine.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         document = compact_files(
@@ -121,6 +118,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
 
 def _fit_format(args: opt.Args, settings: CompactOptions, out: Path) -> CompactOptions:
     """Choose the number of levels by the format of ``out``; UsageError if levels or budget do not fit the format."""
+    from gsmerge.facts.counts import STREAMED_LEVELS
     from gsmerge.io.formats.table import find_format, output_format
 
     format_ = find_format(out)
@@ -193,8 +191,7 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
     check_format(out, writing)
     before = {"import": perf_counter() - start}
     document = decode_file(
-        path, out, decoding, normals=writing.normals, viewer_cameras=writing.viewer_cameras,
-        overwrite=args.overwrite, dry_run=args.dry_run, seconds_before=before,
+        path, out, decoding, writing, overwrite=args.overwrite, dry_run=args.dry_run, seconds_before=before,
     )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)
     print_document(document, decoding_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)

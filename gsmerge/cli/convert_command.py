@@ -7,8 +7,9 @@ from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
-from gsmerge.cli.paths import FileOptions, check_format, check_outputs, output_file
+from gsmerge.cli.paths import check_format, check_outputs, output_file
 from gsmerge.errors import UsageError
+from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import CleanOptions
@@ -58,8 +59,7 @@ def convert(args: opt.Args) -> None:
         say(problem, kind="warning", quiet=args.silent)
     hints = args.hints()
     options = ConvertOptions(
-        inputs, output, args.cameras, images, args.opacity, hints.scales, hints.colors, cleaning, placement,
-        normals=writing.normals, full_columns=writing.columns == "full",
+        inputs, output, args.cameras, images, args.opacity, hints.scales, hints.colors, cleaning, placement, writing,
         overwrite=args.overwrite,
     )  # fmt: skip
     with stage_progress(quiet=args.silent) as progress, record_run(progress):

@@ -4,28 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.files import FileOptions
 
 if TYPE_CHECKING:
     from gsmerge.io.scene_files import SceneFiles
-
-
-@dataclass(frozen=True)
-class FileOptions(Settings):
-    """Options for writing a result."""
-
-    normals: bool = setting(True, "Write the normals of a `.ply`, three columns of zeros that some viewers need: 12 of "
-        "its 68 bytes per Gaussian. A `budget` in bytes counts them.")  # fmt: skip
-    columns: str = setting("needed", "Columns of a `.ply`. needed: only those that are needed; full: all 62 columns of "
-        "INRIA's files, with zeros for missing harmonics up to degree 3, which Unity's importer needs.",
-        choices=("needed", "full"))  # fmt: skip
-    viewer_cameras: bool = setting(True, "Write the cameras of the input views beside the result of `compact`, as "
-        "`NAME.cameras.json` for viewers.")  # fmt: skip
 
 
 def default_output(ply: Path) -> Path:
@@ -44,11 +30,13 @@ def output_file(output: Path, name: str) -> Path:
 
 def check_format(output: Path, options: FileOptions) -> None:
     """Raise UsageError if an output's ending is unknown, needs a missing package, or does not fit the options."""
-    from gsmerge.io import output_format
+    from gsmerge.io.formats.table import TILESET, output_format
 
-    columns = output_format(output, levels=True, cameras=True).columns
-    if options.columns == "full" and not (columns and options.normals):
+    format_ = output_format(output, levels=True, cameras=True)
+    if options.columns == "full" and not (format_.columns and options.normals):
         raise UsageError(f"columns full: expected a .ply output with normals, got {output.name}")
+    if options.place is not None and format_ is not TILESET:
+        raise UsageError(f"place: expected {TILESET.ending} as the output, got {output.name}")
 
 
 def check_outputs(

@@ -13,6 +13,7 @@ import numpy as np
 from gsmerge.compaction.outputs import write_contents
 from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.errors import Doubt, SceneError, UsageError, name_notes
+from gsmerge.facts.counts import LEVEL_FACTOR, STREAMED_LEVELS
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.io import GaussianFile, file_notes, output_format, read_cameras, read_gaussians
@@ -29,10 +30,12 @@ from gsmerge.measure.documents import document_head, note_entries
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, ColorChoice, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts
+from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.types import NO_CAMERAS, Gaussians, StrPath, make_scene
 
 
@@ -49,8 +52,7 @@ class ConvertOptions:
     colors: ColorChoice = "auto"
     clean: CleanOptions = field(default_factory=CleanOptions)
     placement: PlacementOptions = field(default_factory=PlacementOptions)
-    normals: bool = True  # Write the three columns of zeros that some viewers expect in a ``.ply``
-    full_columns: bool = False  # Pad its harmonics with zeros up to degree 3
+    writing: FileOptions = field(default_factory=FileOptions)
     overwrite: bool = False
 
 
@@ -82,7 +84,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         if options.placement.moves and not 1e-30 < largest < 1e30:  # numbers in files have 32 bits
             problem = f"expected coordinates of 1e-30 to 1e30, the largest would be {largest:.0e}"
             raise UsageError(f"--scale, --translate: {problem}")
-    gaussians = pad_harmonics(gaussians, NUM_FULL) if options.full_columns else gaussians
+    gaussians = pad_harmonics(gaussians, NUM_FULL) if options.writing.columns == "full" else gaussians
     infos = [file.info for file in files]
     columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
     columns = columns[rows]
@@ -98,8 +100,11 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
+    levels = [gaussians]
+    while format_.levels == "inside" and len(levels) < STREAMED_LEVELS and len(levels[-1]) >= LEVEL_FACTOR:
+        levels.append(merge_neighbors(levels[-1], len(levels[-1]) // LEVEL_FACTOR))
     contents = Contents(
-        [gaussians], comments, moved, names, scene_title(options.inputs[0]), options.normals, extra_columns=columns
+        levels, comments, moved, names, scene_title(options.inputs[0]), options.writing, extra_columns=columns
     )
     num_bytes, camera_path = write_contents(options.output, contents, overwrite=options.overwrite)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}

@@ -21,6 +21,8 @@ ENOUGH = 0.985  # no further Gaussian is put back from this share of the size on
 SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
 TRIES, MAX_REBUILDS = 8, 2  # files that are measured to choose what is dropped; builds after the first one
 
+PLACED_BYTES = 700  # most bytes of the node of a camera that is placed since a scene has none
+
 Rebuild = Callable[[int | None], Candidate]  # a count -> a candidate of all views, built, cleaned up and scored
 
 
@@ -29,8 +31,9 @@ def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: S
     comments = RESULT_COMMENT, MIP_COMMENT
     if file.measure is not None:
         return file.measure(gaussians, cameras, comments)
-    if file.encode_views is not None:
-        return len(file.encode_views(gaussians, Contents([gaussians], comments, cameras, names)))
+    if file.encode_contents is not None:
+        contents = Contents([gaussians], comments, cameras if names else cameras[:0], names)
+        return len(file.encode_contents(gaussians, contents)) + PLACED_BYTES * (file.first_view and not names)
     assert file.encode is not None  # all other formats have a fixed number of bytes for each Gaussian
     return len(file.encode(gaussians, comments))
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact_scene
-from gsmerge.compaction.outputs import add_views, refuse_other_cameras
+from gsmerge.compaction.outputs import add_output, add_views, refuse_other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError
@@ -27,6 +27,7 @@ from gsmerge.scene.content_hash import doubt_changed, list_changed, read_stats
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.files import FileOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene
 
@@ -38,8 +39,7 @@ class Outputs:
     result: Path  # Its name chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it
     viewer_cameras: Path | None = None  # May exist already with the same content, beside a result in another format
     overwrite: bool = False
-    normals: bool = True  # Write the three columns of zeros that some viewers expect in a ``.ply``
-    full_columns: bool = False  # Pad harmonics of a ``.ply`` with zeros up to degree 3
+    options: FileOptions = field(default_factory=FileOptions)
 
 
 def compact_files(
@@ -78,17 +78,17 @@ def compact_files(
         if len(result.gaussians) == 0:
             nothing = "expected Gaussians that show something, found none that remains after merging"
             raise SceneError(files.ply, nothing, "check its scales and opacities")
-        result = _padded(result) if outputs.full_columns else result
+        result = _padded(result) if outputs.options.columns == "full" else result
         compacted, results = perf_counter(), (result, *result.coarser)
         comments, expected = [RESULT_COMMENT, *load.comments], result.report.new_views
         if expected is not None:
             comments.append(new_views_comment(expected))
         notes = format_notes(out, result.gaussians)
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
-        contents = Contents(levels, comments, cameras, names, scene_title(files.ply), outputs.normals)
-        written = format_.write(add, out, temporary, contents)
+        contents = Contents(levels, comments, cameras, names, scene_title(files.ply), outputs.options)
+        written = add_output(add, out, temporary, contents)
         if cameras_path is not None:
-            add_views(add, out, cameras_path, contents, overwrite=outputs.overwrite)
+            add_views(add, cameras_path, contents, overwrite=outputs.overwrite)
         notes += doubt_changed(load.stats)
         document = report_document(
             result.report, recognised=load.recognised, output_path=out,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.io import output_format
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import to_cameras
@@ -23,17 +25,28 @@ from gsmerge.types import Cameras, Gaussians
 SAME = 1e-5
 
 
-def add_views(add: AddOutput, out: Path, path: Path, contents: Contents, *, overwrite: bool) -> None:
+def add_output(add: AddOutput, out: Path, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
+    """Write an output as :data:`gsmerge.io.formats.table.WriteOutput`, and settings that start its viewers at a view.
+
+    Without cameras, a camera is placed for formats whose viewers look from it first. Settings that are there already
+    stay, as they may be the user's.
+    """
+    format_, gaussians = output_format(out, levels=True, cameras=True), contents.levels[0]
+    if format_.first_view and len(contents.cameras) == 0:
+        contents = replace(contents, cameras=place_viewpoints(gaussians)[:1])
+    settings = out.with_name(format_.settings.format(stem=out.name.removesuffix(format_.ending)) or out.name)
+    if format_.settings and contents.options.viewer_cameras and not settings.exists():
+        add(settings).write_text(viewer_settings(contents.cameras, gaussians.means), encoding="utf-8")
+    return format_.write(add, out, temporary, contents)
+
+
+def add_views(add: AddOutput, path: Path, contents: Contents, *, overwrite: bool) -> None:
     """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has other cameras.
 
     If the file has these cameras already, to within rounding, it stays unchanged, because results in several formats
-    share it. Viewers of some formats have settings, which start them at the view in the middle. Settings that are there
-    already stay, as they may be the user's.
+    share it.
     """
-    cameras, names, format_ = contents.cameras, contents.names, output_format(out, levels=True, cameras=True)
-    settings = out.with_name(format_.settings.format(stem=out.name.removesuffix(format_.ending)) or out.name)
-    if format_.settings and not settings.exists():
-        add(settings).write_text(viewer_settings(cameras, contents.levels[0].means), encoding="utf-8")
+    cameras, names = contents.cameras, contents.names
     if overwrite or not path.exists():
         add(path).write_bytes(viewer_cameras(cameras, names).encode())
     else:
@@ -80,19 +93,14 @@ def write_result(
     return out
 
 
-def write_contents(
-    out: Path, contents: Contents, *, overwrite: bool, viewer_cameras: bool = True
-) -> tuple[int, str | None]:
-    """Write an output, and its cameras beside it if its format has none; return its bytes and their path.
-
-    Without ``viewer_cameras`` no file is written beside it.
-    """
+def write_contents(out: Path, contents: Contents, *, overwrite: bool) -> tuple[int, str | None]:
+    """Write an output, and its cameras beside it if its format has none; return its bytes and their path."""
     format_, path = output_format(out, levels=True, cameras=True), viewer_cameras_path(out)
-    is_beside = viewer_cameras and len(contents.cameras) > 0 and not format_.has_cameras
+    is_beside = contents.options.viewer_cameras and len(contents.cameras) > 0 and not format_.has_cameras
     with atomic_outputs(overwrite=overwrite) as add:
-        written = format_.write(add, out, add(out), contents)
+        written = add_output(add, out, add(out), contents)
         if is_beside:
-            add_views(add, out, path, contents, overwrite=overwrite)
-        num_bytes = sum(file.stat().st_size for file in written[out])
+            add_views(add, path, contents, overwrite=overwrite)
+        num_bytes = sum(file.stat().st_size for files in written.values() for file in files)
     format_.finish(out)
     return num_bytes, str(path) if is_beside else None

@@ -10,6 +10,7 @@ from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 
+STREAMED_LEVELS = 3  # of a lod-meta.json; the coarsest level, a sixteenth, loads at once
 LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
 FEW_PIXELS = 1 << 18  # pixels of a few small photos
 # A scene has few Gaussians below this number per pixel of the photos, counting at most FEW_PIXELS pixels. Then a share

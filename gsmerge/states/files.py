@@ -25,6 +25,7 @@ from gsmerge.runtime.record import Progress
 from gsmerge.scene.content_hash import content_hash, digest, doubt_changed, list_files
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.settings.extend import batch_settings
+from gsmerge.settings.files import FileOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.compactor import extend_state
@@ -136,9 +137,8 @@ def decode_file(
     path: Path,
     out: Path,
     options: DecodeOptions,
+    writing: FileOptions,
     *,
-    normals: bool = True,
-    viewer_cameras: bool = True,
     overwrite: bool = False,
     dry_run: bool = False,
     seconds_before: Mapping[str, float] | None = None,
@@ -165,8 +165,8 @@ def decode_file(
         raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
     cameras = features.frame.leave_cameras(features.cameras)
     notes = format_notes(out, gaussians)
-    contents = Contents([gaussians], [RESULT_COMMENT], cameras, features.names, scene_title(path), normals)
-    num_bytes, _ = write_contents(out, contents, overwrite=overwrite, viewer_cameras=viewer_cameras)
+    contents = Contents([gaussians], [RESULT_COMMENT], cameras, features.names, scene_title(path), writing)
+    num_bytes, _ = write_contents(out, contents, overwrite=overwrite)
     seconds = {**(seconds_before or {}), "read": read_end - start, "decode": decode_end - read_end}
     seconds["write"] = perf_counter() - decode_end
     return document | {

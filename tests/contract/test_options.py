@@ -13,9 +13,9 @@ from gsmerge.batch import BatchOptions
 from gsmerge.cli import main
 from gsmerge.cli.app import app
 from gsmerge.cli.parameters import OPTIONS
-from gsmerge.cli.paths import FileOptions
 from gsmerge.research.generate import GenerateOptions
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.files import FileOptions
 from gsmerge.settings.setting import flat_settings
 from gsmerge.settings.stages import Engine
 

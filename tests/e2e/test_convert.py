@@ -22,6 +22,7 @@ from gsmerge.geometry.transforms import covariances
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
 from gsmerge.io.formats import table as formats
+from gsmerge.io.formats.streamed import read_index, read_level
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.settings.placement import AXES, PlacementOptions
 from gsmerge.settings.stages import CleanOptions
@@ -29,7 +30,7 @@ from gsmerge.types import Gaussians
 
 from .conftest import Run, assert_refused
 
-FORMATS = ("out.sog", "lod-meta.json", "out.ply", "out.spz", "out.splat", "out.glb")
+FORMATS = ("out.sog", "lod-meta.json", "tileset.json", "out.ply", "out.spz", "out.splat", "out.glb")
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +72,17 @@ def test_every_format_is_written_with_the_cameras(
     assert gsmerge.read_cameras(beside[0]).names == gsmerge.read_cameras(tmp_path / "in.cameras.json").names
     again = convert_files(ConvertOptions([tmp_path / "new" / name], tmp_path / "again.ply"))
     assert again["output"]["num_gaussians"] == 400
+
+
+def test_streamed_levels_have_a_quarter_of_the_gaussians_each(
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
+    out = tmp_path / "new" / "lod-meta.json"
+    convert_files(ConvertOptions([result], out))
+    assert read_index(out).counts == [400, 100, 25]
+    whole, coarse = read(out), read_level(out, 1).gaussians
+    assert (np.ptp(coarse.means, axis=0) > 0.7 * np.ptp(whole.means, axis=0)).all()
 
 
 @sweep(

@@ -3,7 +3,7 @@
 The axis y points up in glTF, and down in a ``.ply``. Therefore the writer rotates Gaussians by half a turn about z, and
 the reader rotates them back. Viewers that do not know the extension show points in the base colours.
 
-Neither drafts of the extension are read, whose scales are logarithms, nor a ``.spz`` in place of the values.
+A ``.spz`` in place of the values is read. Drafts of the extension are not, whose scales are logarithms.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from gsmerge.io.formats.arrays import (
     to_stored,
     turner,
 )
+from gsmerge.io.formats.spz import read_packed
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians, number_views
@@ -44,15 +45,16 @@ MAX_DEGREE = 3
 NAME = "KHR_gaussian_splatting"
 HARMONICS = [f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for degree in range(MAX_DEGREE + 1) for i in range(2 * degree + 1)]
 _OPACITY = f"{NAME}:OPACITY"
+COMPRESSED = f"{NAME}_compression_spz_2"  # of which Cesium's tiles consist
 COLOR_SPACE = "srgb_rec709_display"
-READ_EXTENSIONS = {NAME, "KHR_mesh_quantization", "KHR_materials_unlit"}
+READ_EXTENSIONS = {NAME, COMPRESSED, "KHR_mesh_quantization", "KHR_materials_unlit"}
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # constants of glTF
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _WIDTHS = {name: width for width, name in _TYPES.items()}
 _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # between the axes of a ``.ply`` and of glTF
 _NEAR = 0.01  # near plane of camera nodes, world units, as of `render`
 _MAX_STRIDE = 252  # bytes from a value to the next, the limit of glTF
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
@@ -60,7 +62,7 @@ _TRANSFORMS = {"matrix", "rotation", "scale", "translation"}  # keys of a node w
 _TOLERANCE = 1e-3  # largest difference of the scales of a node's axes, and largest cosine between two axes
 
 
-def encode_views(gaussians: Gaussians, contents: Contents) -> bytes:
+def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
     """Encode a ``.glb`` file as :func:`glb_bytes` does, with a camera node for each view.
 
     The first is the view that stands nearest to the middle of all, since viewers look from the first.
@@ -71,7 +73,7 @@ def encode_views(gaussians: Gaussians, contents: Contents) -> bytes:
     for i, view in enumerate(ids):
         pose = np.eye(4)  # of glTF's cameras, which look along -z with y up
         pose[:3, :3], pose[:3, 3] = cameras.viewmats[view, :3, :3].T * (1, -1, -1), cameras.centres[view]
-        pose = matmul(_HALF_TURN, pose)
+        pose = matmul(HALF_TURN, pose)
         nodes.append({"name": names[view], "camera": i, "matrix": pose.T.reshape(-1).tolist()})
         ratio = float(cameras.width * cameras.Ks[view, 1, 1] / (cameras.height * cameras.Ks[view, 0, 0]))
         lens = {"yfov": vertical_field(cameras, view), "aspectRatio": ratio, "znear": _NEAR}
@@ -100,15 +102,23 @@ def glb_bytes(
     splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
     accessor_ids = {name: i for i, name in enumerate(attributes)}
     document = {
-        "asset": {"version": "2.0", "generator": "gsmerge"},
-        "scene": 0,
-        "scenes": [{"nodes": list(range(1 + len(nodes)))}],
         "extensionsUsed": [NAME],
         "nodes": [{"mesh": 0}, *nodes],
         **({"cameras": cameras} if cameras else {}),
         "meshes": [{"primitives": [{"attributes": accessor_ids, "mode": _POINTS, "extensions": {NAME: splats}}]}],
         "accessors": accessors,
         "bufferViews": views,
+    }
+    return pack_glb(document, content)
+
+
+def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
+    """Encode a ``.glb`` from a ``document`` without head, whose scene has all nodes, and its binary ``content``."""
+    document = {
+        "asset": {"version": "2.0", "generator": "gsmerge"},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(document["nodes"])))}],
+        **document,
         "buffers": [{"byteLength": len(content)}],
     }
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
@@ -228,6 +238,16 @@ class _Content:
     end: int
     num_read: list[int] = field(default_factory=lambda: [0])  # bytes read so far, at most the size of the chunk
 
+    def packed(self, view_id: int) -> bytes:
+        """Read the bytes of a view of the buffer."""
+        view = self.document["bufferViews"][view_id]
+        at, length = view.get("byteOffset", 0), view["byteLength"]
+        self.num_read[0] += length
+        if min(at, length) < 0 or self.start + at + length > self.end or self.num_read[0] > self.end - self.start:
+            raise _ForeignError(f"a truncated one, of {self.end} bytes without {length} of a .spz")
+        self.file.seek(self.start + at)
+        return self.file.read(length)
+
     def values(self, accessor_id: int) -> _Values:
         """Read the values of an accessor, which must lie in the chunk."""
         accessor = self.document["accessors"][accessor_id]
@@ -277,7 +297,7 @@ def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple
     """Yield each primitive of Gaussians with the matrix ``[4,4]`` from its frame to that of a ``.ply``."""
     scenes, nodes, visited = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
     budget.check_steps(_STEPS_PER_NODE * len(nodes), "steps for nodes")
-    stack = [(node_id, _HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
+    stack = [(node_id, HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
     while stack:
         node_id, parent_transform = stack.pop()
         if node_id in visited:
@@ -323,6 +343,12 @@ class _Attributes:
 def _read_splats(content: _Content, primitive: dict[str, Any], transform: np.ndarray, sizes: dict[str, int]) -> Packed:
     """Read one primitive, apply the matrix ``transform [4,4]``, and add its bytes to ``sizes`` by attribute."""
     splats, attributes = primitive["extensions"][NAME], _Attributes(content, primitive.get("attributes", {}), sizes)
+    if COMPRESSED in splats.get("extensions", {}):
+        packed = content.packed(splats["extensions"][COMPRESSED]["bufferView"])
+        _, rows, of_columns, _ = read_packed(content.budget.path, packed)
+        sizes |= {name: sizes.get(name, 0) + size for name, size in of_columns.items()}
+        rotate = _transformer(transform, rows.num_higher)
+        return Packed(rows.count, rows.num_higher, lambda block: rotate(rows.unpack(block)))
     kind = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
     if splats.get("extensions") or kind != ("ellipse", COLOR_SPACE):
         raise _ForeignError(f"Gaussians of another kind ({', '.join(map(str, splats.get('extensions') or kind))})")

@@ -28,11 +28,14 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
+from gsmerge.io.cameras.viewer_cameras import vertical_field
 from gsmerge.io.formats import arrays
-from gsmerge.types import SH_C0, Gaussians, StrPath
+from gsmerge.io.formats.table import Contents
+from gsmerge.kernels.elementary import arctan2
+from gsmerge.types import SH_C0, Cameras, Gaussians, StrPath
 from gsmerge.values.arrays import as_array, to_float32
 
-VERSION, MAX_DEGREE = 3, 3  # of written files; Spark 2.2 does not read version 4
+VERSION, MAX_DEGREE = 3, 3  # of written files; Spark 2.2 does not read version 4, and old readers only read 2
 MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, number of streams or zero
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
@@ -41,6 +44,7 @@ MIP_FLAG = 1  # render the Gaussians antialiased
 EXTENSIONS_FLAG = 2  # records of extensions are before the table in version 4, and after the columns in older versions
 RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
 AXES_KIND = 0xADBE0003  # of SPZ_ADOBE_coordinate_system; its content is 1 for the first of AXES, or 0 for unknown
+ORBIT_KIND = 0xADBE0002  # of SPZ_ADOBE_safe_orbit_camera: least and largest elevation in radians, least radius
 AXES = (
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
@@ -92,6 +96,14 @@ def read_rows(path: Path) -> arrays.StoredRows:
         if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # other files are refused without reading them
             file.seek(0)
             packed = file.read()
+    header, rows, sizes, notes = read_packed(path, packed)
+    mode = arrays.MIP if header.flags & MIP_FLAG else None
+    stored = arrays.to_stored([rows], f".spz version {header.version}", sizes, mode)
+    return replace(stored, notes=notes)
+
+
+def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, dict[str, int], tuple[str, ...]]:
+    """Read the bytes of a ``.spz`` that ``path`` holds: header, Gaussians, bytes of each attribute and notes."""
     read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
     header, parts, extensions, num_left = read(ReadBudget(path, len(packed)), packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
@@ -102,13 +114,12 @@ def read_rows(path: Path) -> arrays.StoredRows:
     rows = arrays.Packed(
         header.count, header.num_higher, lambda block: rotate(_unpack([part[block] for part in parts], header))
     )
-    mode = arrays.MIP if header.flags & MIP_FLAG else None
-    stored = arrays.to_stored([rows], f".spz version {header.version}", sizes, mode)
     turned = f"Gaussians are turned from the file's axes {axes} to those of a .ply, {PLY_AXES}"
-    return replace(stored, notes=(*([turned] if axes != PLY_AXES else []), *arrays.note_surplus(num_left, HEADER.size)))
+    notes = *([turned] if axes != PLY_AXES else []), *arrays.note_surplus(num_left, HEADER.size)
+    return header, rows, sizes, notes
 
 
-def _stored_axes(path: Path, extensions: bytes) -> str:
+def _stored_axes(path: StrPath, extensions: bytes) -> str:
     """Return the axes that the extensions name, by default those of a ``.ply``; SceneError if they are unknown."""
     at = 0
     while at + RECORD.size <= len(extensions):
@@ -271,30 +282,32 @@ def fix_means(means: np.ndarray, fraction: int) -> np.ndarray:
     return np.clip(np.round(means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
 
 
-def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> tuple[bytes, tuple[np.ndarray, ...]]:
+def spz_columns(
+    gaussians: Gaussians, max_degree: int, *, flags: int = 0, version: int = VERSION
+) -> tuple[bytes, tuple[np.ndarray, ...]]:
     """Quantise Gaussians; return the header, and columns ``[n,bytes]`` uint8 in the order of the file.
 
-    ValueError if there is NaN or inf.
+    ``version``: 2 or 3. ValueError if there is NaN or inf.
     """
     means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
     fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], FINE)  # others are refused below
-    header = Header(VERSION, count, degree, fraction, MIP_FLAG * mip, 0)
+    header = Header(version, count, degree, fraction, flags, 0)
     parts = tuple(np.empty((count, width), np.uint8) for width in header.widths)
     for start, columns in arrays.column_blocks(gaussians, max_degree):
-        for part, values in zip(parts, _quantise(columns, fraction), strict=True):
+        for part, values in zip(parts, _quantise(columns, header), strict=True):
             part[start : start + len(columns)] = values
     return HEADER.pack(MAGIC, *astuple(header)), parts
 
 
-def _quantise(columns: arrays.Columns, fraction: int) -> tuple[np.ndarray, ...]:
-    """Quantise a block of Gaussians to columns of bytes; means to ``fraction`` bits after the binary point."""
-    fixed = fix_means(columns.means, fraction)
+def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]:
+    """Quantise a block of Gaussians to columns of bytes."""
+    fixed = fix_means(columns.means, header.fraction)
     return (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes a coordinate
         arrays.to_bytes(255 * columns.opacities)[:, None],
         arrays.to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
         arrays.to_bytes(16 * (columns.log_scales + 10)),
-        _pack_rotations(columns.quats),
+        _pack_rotations(columns.quats, header.version),
         _quantise_harmonics(columns.harmonics),
     )
 
@@ -307,11 +320,14 @@ def _quantise_harmonics(harmonics: np.ndarray) -> np.ndarray:
     return np.clip(stepped, 0, 255).astype(np.uint8).reshape(count, 3 * num_higher)
 
 
-def _pack_rotations(quats: np.ndarray) -> np.ndarray:
-    """Pack unit quaternions ``[n,4]`` wxyz to bytes ``[n,4]``, which :func:`_read_rotations` unpacks.
+def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
+    """Pack unit quaternions ``[n,4]`` wxyz to bytes, which :func:`_read_rotations` unpacks.
 
-    From the highest bit, a word has the index of the largest of xyzw, then sign and magnitude of the other components.
+    Version 2 has xyz of the quaternion with w above 0, a byte each. In version 3 a word
+    has, from its highest bit, the index of the largest of xyzw, then sign and magnitude of the other components.
     """
+    if version < 3:
+        return arrays.to_bytes(127.5 * (np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] + 1))
     largest, smallest = arrays.smallest_three(np.roll(quats, -1, axis=1))
     codes = np.minimum(np.floor(511 * np.abs(smallest) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
     codes |= (smallest < 0).astype(np.uint32) << np.uint32(9)
@@ -326,10 +342,36 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 
     A comment may mark the Gaussians as antialiased, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
-    header, parts = spz_columns(gaussians, MAX_DEGREE, mip=arrays.render_mode(comments) == arrays.MIP)
+    return encode_contents(gaussians, Contents([gaussians], comments))
+
+
+def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
+    """Encode a ``.spz`` file as :func:`spz_bytes` does, of the version that the options name.
+
+    An extension keeps cameras on orbits at the elevations of the photos, if there are any.
+    """
+    orbit = _orbit_record(contents.cameras) if contents.names else b""
+    flags = MIP_FLAG * (arrays.render_mode(contents.comments) == arrays.MIP) + EXTENSIONS_FLAG * bool(orbit)
+    header, parts = spz_columns(gaussians, MAX_DEGREE, flags=flags, version=contents.options.spz_version)
     columns = deque(parts)
     del parts  # each column is freed when the next one is compressed
-    return gzip_bytes(chain([header], (columns.popleft().data for _ in range(len(columns)))))
+    return gzip_bytes(chain([header], (columns.popleft().data for _ in range(len(columns))), [orbit]))
+
+
+def _orbit_record(cameras: Cameras) -> bytes:
+    """Encode the elevations from which cameras look, with half of their field of view on both sides.
+
+    From there half of a picture is what the photos show. A radius of 0 is no limit. If the cameras stand upright along
+    another axis than y, which viewers take for vertical, there is no record.
+    """
+    x, y, z = cameras.viewmats[:, 2, :3].astype(np.float64).T
+    up = -cameras.viewmats[:, 1, :3].mean(0)
+    if np.abs(up).argmax() != 1:
+        return b""
+    elevations = arctan2(-np.sign(up[1]) * y, np.sqrt(x * x + z * z))
+    margin = vertical_field(cameras, 0) / 2
+    low, high = np.clip([elevations.min() - margin, elevations.max() + margin], -np.pi / 2, np.pi / 2)
+    return RECORD.pack(ORBIT_KIND, 12) + np.array([low, high, 0], "<f4").tobytes()
 
 
 def gzip_bytes(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +16,7 @@ from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import FLAT_COMMENT, MIP_COMMENT, StoredRows
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.plugins import lazy_functions
+from gsmerge.settings.files import FileOptions
 from gsmerge.settings.setting import join_words
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath
 from gsmerge.values.arrays import to_float32
@@ -37,7 +38,7 @@ class Contents:
     cameras: Cameras = NO_CAMERAS
     names: Sequence[str] = ()  # of the cameras
     title: str = ""
-    normals: bool = True  # of a ``.ply``, as in :func:`gsmerge.write_ply`
+    options: FileOptions = field(default_factory=FileOptions)
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
@@ -61,8 +62,9 @@ class Format:
     # Encodes one file of Gaussians with comments; None: :func:`gsmerge.io.write_ply` or ``write`` writes the file
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
     max_degree: int  # of the harmonics that are written; -1: the format is only read
-    # Encodes one file with the views of the content, from which viewers look first; None: ``encode`` does
-    encode_views: Callable[[Gaussians, Contents], bytes] | None = None
+    # Encodes one file by the views and options of the content; None: ``encode`` does without them
+    encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
+    first_view: bool = False  # Viewers look from its first camera, so one is placed if there is none
     settings: str = ""  # name of a file beside it that tells viewers where to look first; "": none
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
@@ -103,7 +105,12 @@ LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
     _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
     write=_lazy("streamed.write_output"), finish=_lazy("streamed.remove_unused_chunks"), levels="inside",
-    settings="settings.json", round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
+    first_view=True, settings="settings.json", round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
+)  # fmt: skip
+TILESET = Format(
+    "tileset.json", "3D Tiles for Cesium; a .spz in a .glb beside it", _lazy("tileset.read_rows"), None, 3,
+    holds=Path.is_file, write=_lazy("tileset.write_output"), levels="",
+    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), most=10_000_000,
 )  # fmt: skip
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
@@ -117,18 +124,20 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     ),
     PLY,
     Format(
-        ".spz", "Niantic's format; written as version 3", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
-        most=10_000_000, each=(17.0, 18.5, 18.9, 19.2), round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,),
+        ".spz", "Niantic's format; written as version 3 or 2", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
+        encode_contents=_lazy("spz.encode_contents"), most=10_000_000, each=(17.0, 18.5, 18.9, 19.2),
+        round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,),
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,
         each=_SOG, round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
-        settings="{stem}.settings.json",
+        first_view=True, settings="{stem}.settings.json",
     ),
     Format(".splat", "antimatter15's format", _lazy("splat.read_rows"), _lazy("splat.splat_bytes"), 0, each=(32.0,)),
     Format(
         ".glb", "binary glTF with KHR_gaussian_splatting", _lazy("glb.read_rows"), _lazy("glb.glb_bytes"), 3,
-        encode_views=_lazy("glb.encode_views"), holds=_lazy("glb.holds_gaussians"), each=(52.1, 88.1, 148.1, 232.2),
+        encode_contents=_lazy("glb.encode_contents"), first_view=True, holds=_lazy("glb.holds_gaussians"),
+        each=(52.1, 88.1, 148.1, 232.2),
     ),
 )  # fmt: skip
 STATE = Format(
@@ -138,7 +147,7 @@ META = "meta.json"  # of a .sog that is a folder
 SOG_FOLDER = Format(
     META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_folder"),
 )  # fmt: skip
-FORMATS = (*FILES, HTML, LEVELS, STATE, SOG_FOLDER)
+FORMATS = (*FILES, HTML, LEVELS, TILESET, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
 # Endings of files that may hold no Gaussians; models write cameras and depth maps into .npz
@@ -197,16 +206,17 @@ def may_hold_gaussians(path: Path) -> bool:
 def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: allow an index of levels of detail. ``cameras``: allow a page, which has cameras.
+    ``levels``: allow an index with files beside it. ``cameras``: allow a page, which has cameras.
     """
     by_name = next((row for row in FORMATS if row.names(path)), None)
-    if by_name is not None and ((by_name.levels == "inside" and not levels) or (by_name.has_cameras and not cameras)):
+    is_index = by_name is not None and by_name.ending[0] != "."
+    if by_name is not None and ((is_index and not levels) or (by_name.has_cameras and not cameras)):
         by_name = None
     if by_name is None or by_name.max_degree < 0:
         read_only = "" if by_name is None else f"{by_name.ending} can be read but not written; "
         inside = [row.ending for row in FORMATS if row.has_cameras and row.ending[0] == "."]
         endings = join_words((*OUTPUT_FORMATS, *(inside if cameras else [])))
-        index = f", or the name {INDEX}" if levels else ""
+        index = f", or the name {INDEX} or {TILESET.ending}" if levels else ""
         folder = ", or a folder" if cameras else ""
         raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{index}{folder}")
     by_name.require()

@@ -41,14 +41,14 @@ def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents)
     if ending == PLY.ending and contents.extra_columns is not None:
         (gaussians,), extra = contents.levels, contents.extra_columns
         degree = min(gaussians.sh_degree, PLY.max_degree)
-        _write_ply(temporary, gaussians, True, degree, contents.comments, contents.normals, extra)
+        _write_ply(temporary, gaussians, True, degree, contents.comments, contents.options.normals, extra)
         return written
     for (file,), gaussians in zip(written.values(), contents.levels, strict=True):
-        if format_.encode_views is not None:
-            file.write_bytes(format_.encode_views(gaussians, contents))
+        if format_.encode_contents is not None:
+            file.write_bytes(format_.encode_contents(gaussians, contents))
             continue
         write_gaussians(
-            file, gaussians, overwrite=True, comments=contents.comments, ending=ending, normals=contents.normals
+            file, gaussians, overwrite=True, comments=contents.comments, ending=ending, normals=contents.options.normals
         )
     return written
 

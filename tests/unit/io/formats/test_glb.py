@@ -196,6 +196,23 @@ def _read_document(path: Path) -> tuple[Document, int]:
     return json.loads(content[20 : 20 + length]), length
 
 
+@pytest.mark.parametrize("ending", [".glb", ".sog"])
+def test_without_cameras_viewers_start_at_a_placed_one(ending: str, scene: Scene, tmp_path: Path) -> None:
+    """It sees the scene, and it is not written as if it were a photo's."""
+    path = tmp_path / f"a{ending}"
+    write_result(path, [scene.gaussians], scene.cameras[:0], (), None, overwrite=False)
+    assert not path.with_name("a.cameras.json").exists()
+    if ending == ".glb":
+        (node,) = (node for node in _read_document(path)[0]["nodes"] if "camera" in node)
+        pose = np.reshape(node["matrix"], (4, 4)).T
+        position, forward = pose[:3, 3] * (-1, -1, 1), -pose[:3, 2] * (-1, -1, 1)
+    else:
+        (camera,) = json.loads(path.with_name("a.settings.json").read_text())["cameras"]
+        position, target = (np.array(camera["initial"][name]) * (-1, -1, 1) for name in ("position", "target"))
+        forward = target - position
+    assert float(((scene.gaussians.means - position) @ forward > 0).mean()) > 0.9
+
+
 def test_settings_start_a_viewer_at_that_view_and_those_of_a_user_stay(scene: Scene, tmp_path: Path) -> None:
     path, settings = tmp_path / "a.sog", tmp_path / "a.settings.json"
     write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=False)

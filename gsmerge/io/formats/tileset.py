@@ -1,0 +1,107 @@
+"""Read and write 3D Tiles 1.1 for Cesium: a ``tileset.json`` with one tile, a ``.glb`` that holds a ``.spz``.
+
+The ``.glb`` uses ``KHR_gaussian_splatting_compression_spz_2``, which Cesium requires. A node turns the axes of the
+``.spz`` to those of glTF, and Cesium turns y up to z up. On the globe, x points east, y north and z up (EPSG 4978).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.atomic import AddOutput
+from gsmerge.io.bounds import read_json
+from gsmerge.io.formats import glb
+from gsmerge.io.formats.arrays import StoredRows
+from gsmerge.io.formats.glb import COLOR_SPACE, COMPRESSED, HALF_TURN, HARMONICS, NAME, pack_glb
+from gsmerge.io.formats.spz import MAX_DEGREE, encode_contents
+from gsmerge.io.formats.table import Contents
+from gsmerge.kernels.elementary import cos, sin
+from gsmerge.kernels.matrices import matmul
+from gsmerge.settings.placement import parse_triple
+
+FRAMED = 1, 99  # percentiles of the means that the bounds include; a few far Gaussians would make a scene small
+AXIS, SQUARED_ECCENTRICITY = 6378137.0, 0.0066943799901413165  # metres; of the ellipsoid WGS 84
+_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # from y up
+
+
+def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
+    """Write the files of a tileset, as :data:`gsmerge.io.formats.table.WriteOutput`; the ``.glb`` has its stem."""
+    tile = path.with_suffix(".glb")
+    file, low, high = add(tile), *np.percentile(contents.levels[0].means.astype(np.float64), FRAMED, axis=0)
+    file.write_bytes(_tile_bytes(contents, low, high))
+    turn = matmul(_Z_UP, HALF_TURN)[:3, :3]
+    halves = np.diag(np.abs(matmul(turn, (high - low)[:, None] / 2))[:, 0])
+    box = [*matmul(turn, (low + high)[:, None] / 2)[:, 0].tolist(), *halves.reshape(-1).tolist()]
+    place = contents.options.place
+    root = {"boundingVolume": {"box": box}, "geometricError": 0, "refine": "REPLACE", "content": {"uri": tile.name}}
+    root |= {"transform": globe_matrix(place).T.reshape(-1).tolist()} if place else {}
+    extensions = {"extensionsUsed": [NAME, COMPRESSED], "extensionsRequired": [NAME, COMPRESSED]}
+    document = {
+        "asset": {"version": "1.1", "generator": "gsmerge"},
+        "extensionsUsed": ["3DTILES_content_gltf"],
+        "extensions": {"3DTILES_content_gltf": extensions},
+        "geometricError": float(np.abs(high - low).max()),  # an empty picture is wrong by the size of the scene
+        "root": root,
+    }
+    index.write_text(json.dumps(document), encoding="utf-8")
+    return {path: [index, file]}
+
+
+def read_rows(path: Path) -> StoredRows:
+    """Read the Gaussians of a tileset with one tile; SceneError for any other."""
+    document = read_json(path)
+    try:
+        root = document["root"]
+        name = PurePosixPath(root["content"]["uri"])
+        is_one = not root.get("children") and name.suffix == ".glb" and len(name.parts) == 1
+    except (LookupError, TypeError, AttributeError):
+        is_one = False
+    if not is_one:
+        raise SceneError(path, "expected a tileset with one tile, a .glb beside it, found another", "name its tiles")
+    rows = glb.read_rows(path.with_name(name.name))
+    return replace(rows, bytes_beside=path.with_name(name.name).stat().st_size)
+
+
+def _tile_bytes(contents: Contents, low: np.ndarray, high: np.ndarray) -> bytes:
+    """Encode the ``.glb`` of a tile, whose Gaussians lie mostly between the corners ``low [3]`` and ``high [3]``."""
+    gaussians, packed = contents.levels[0], encode_contents(contents.levels[0], contents)
+    num_harmonics = (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2
+    names = ["POSITION", "COLOR_0", f"{NAME}:ROTATION", f"{NAME}:SCALE", *HARMONICS[1:num_harmonics]]
+    accessors: list[dict[str, Any]] = [{"componentType": 5126, "type": "VEC3", "count": len(gaussians)} for _ in names]
+    accessors[0] |= {"min": low.tolist(), "max": high.tolist()}
+    accessors[1] |= {"componentType": 5121, "type": "VEC4", "normalized": True}
+    accessors[2]["type"] = "VEC4"
+    splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE, "extensions": {COMPRESSED: {"bufferView": 0}}}
+    primitive = {"attributes": {name: i for i, name in enumerate(names)}, "mode": 0, "extensions": {NAME: splats}}
+    document = {
+        "extensionsUsed": [NAME, COMPRESSED],
+        "extensionsRequired": [NAME, COMPRESSED],
+        "nodes": [{"mesh": 0, "matrix": HALF_TURN.T.reshape(-1).tolist()}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": [{"buffer": 0, "byteLength": len(packed)}],
+    }
+    return pack_glb(document, packed)
+
+
+def globe_matrix(place: str) -> np.ndarray:
+    """Return the matrix ``[4,4]`` from a local frame (east, north, up, metres) to the earth's, EPSG 4978.
+
+    ``place``: longitude and latitude in degrees and height in metres above the ellipsoid, separated by commas.
+    """
+    longitude, latitude, height = parse_triple("place", place)
+    angles = np.radians([longitude, latitude])
+    (sin_lon, sin_lat), (cos_lon, cos_lat) = sin(angles), cos(angles)
+    up = np.array([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat])
+    east, north = np.array([-sin_lon, cos_lon, 0]), np.array([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat])
+    radius = AXIS / np.sqrt(1 - SQUARED_ECCENTRICITY * sin_lat**2)  # of curvature in the prime vertical
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([east, north, up, radius * up + height * up], 1)
+    matrix[2, 3] -= SQUARED_ECCENTRICITY * radius * sin_lat
+    return matrix

@@ -1,0 +1,104 @@
+"""A tileset for Cesium holds the Gaussians of a ``.spz``, and states where they lie."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+from messages import refuses
+
+from gsmerge import Gaussians, read_gaussians, write_gaussians
+from gsmerge.compaction.convert import ConvertOptions, convert_files
+from gsmerge.errors import SceneError
+from gsmerge.io.formats.spz import spz_bytes
+from gsmerge.io.formats.tileset import globe_matrix
+from gsmerge.settings.files import FileOptions
+
+POLAR_RADIUS = 6356752.314245  # metres, of WGS 84
+
+
+@pytest.fixture(scope="module")
+def room() -> Gaussians:
+    """A room, and one of its Gaussians far away."""
+    gaussians = scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36)).gaussians
+    means = gaussians.means.copy()
+    means[7] = 900, 0, 0
+    return replace(gaussians, means=means)
+
+
+def convert(gaussians: Gaussians, folder: Path, place: str | None = None) -> Path:
+    """Write a tileset into a folder."""
+    write_gaussians(folder / "a.ply", gaussians)
+    out = folder / "web" / "tileset.json"
+    convert_files(ConvertOptions([folder / "a.ply"], out, writing=FileOptions(place=place)))
+    return out
+
+
+def test_the_tile_holds_the_bytes_of_a_spz(room: Gaussians, tmp_path: Path) -> None:
+    out = convert(room, tmp_path)
+    assert spz_bytes(read_gaussians(tmp_path / "a.ply").gaussians) in out.with_name("tileset.glb").read_bytes()
+    write_gaussians(tmp_path / "a.spz", read_gaussians(tmp_path / "a.ply").gaussians)
+    expected = read_gaussians(tmp_path / "a.spz").gaussians
+    for path in (out, out.with_name("tileset.glb")):
+        for name, column in vars(read_gaussians(path).gaussians).items():
+            np.testing.assert_array_equal(column, getattr(expected, name))
+
+
+def test_a_far_gaussian_does_not_enlarge_its_bounds(room: Gaussians, tmp_path: Path) -> None:
+    box = json.loads(convert(room, tmp_path).read_text())["root"]["boundingVolume"]["box"]
+    centre, halves = np.array(box[:3]), np.reshape(box[3:], (3, 3))
+    assert np.array_equal(halves, np.diag(np.diag(halves)))
+    offsets = np.abs(room.means * (-1, 1, -1) @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]] - centre)  # glTF's axes, then z up
+    inside = (offsets <= np.diag(halves)).all(1)
+    assert 0.94 <= inside.mean() < 1
+    assert not inside[7]
+    assert halves.max() < 20
+
+
+def test_a_place_on_the_globe(room: Gaussians, tmp_path: Path) -> None:
+    stored = json.loads(convert(room, tmp_path, "10,50,100").read_text())["root"]["transform"]
+    np.testing.assert_array_equal(np.reshape(stored, (4, 4)).T, globe_matrix("10,50,100"))
+    assert "transform" not in json.loads(convert(room, tmp_path / "b").read_text())["root"]
+
+
+@pytest.mark.parametrize(
+    ("place", "position", "north"),
+    [
+        ("0,0,5", (6378142, 0, 0), (0, 0, 1)),
+        ("90,0,0", (0, 6378137, 0), (0, 0, 1)),
+        ("0,90,0", (0, 0, POLAR_RADIUS), (-1, 0, 0)),
+        ("0,45,0", (4517590.8788, 0, 4487348.4088), (-(0.5**0.5), 0, 0.5**0.5)),  # as geodetic tables give it
+    ],
+)
+def test_frames_on_the_ellipsoid(place: str, position: tuple[float, ...], north: tuple[float, ...]) -> None:
+    matrix = globe_matrix(place)
+    np.testing.assert_allclose(matrix[:3, 3], position, atol=1e-3)
+    np.testing.assert_allclose(matrix[:3, 1], north, atol=1e-12)
+    np.testing.assert_allclose(np.cross(matrix[:3, 0], matrix[:3, 1]), matrix[:3, 2], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        [], {"root": {}}, {"root": {"content": {"uri": "a.b3dm"}}}, {"root": {"content": {"uri": "../a.glb"}}},
+        {"root": {"content": {"uri": "a.glb"}, "children": [{}]}},
+    ],
+)  # fmt: skip
+def test_other_tilesets_are_refused(tmp_path: Path, document: object) -> None:
+    (tmp_path / "tileset.json").write_text(json.dumps(document))
+    with refuses(SceneError, "tileset.json", "one", "tile"):
+        read_gaussians(tmp_path / "tileset.json")
+
+
+def test_a_tile_that_states_bytes_it_does_not_have(room: Gaussians, tmp_path: Path) -> None:
+    tile = convert(room, tmp_path).with_name("tileset.glb")
+    content = tile.read_bytes()
+    length = str(len(spz_bytes(read_gaussians(tmp_path / "a.ply").gaussians))).encode()
+    for wrong in (b"9" * len(length), b"-" + length[1:]):
+        tile.write_bytes(content.replace(b'"byteLength":' + length, b'"byteLength":' + wrong, 1))
+        with refuses(SceneError, "tileset.glb", "truncated"):
+            read_gaussians(tile)
