@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gsmerge.fit.averages import RecentMean, TailMean
-from gsmerge.fit.edges import cut_state
-from gsmerge.fit.fit_state import FitState, gaussians_of, start_state
+from gsmerge.fit.edges import cut_state, split_at_edges
+from gsmerge.fit.fit_state import FitState, gaussians_of, start_state, state_of
 from gsmerge.fit.growth import FAINT, drop_faint, grow_to
 from gsmerge.fit.report import FitReport, FitResult
 from gsmerge.fit.schedule import CLEARS, CUTS, GROWTH, FitRun, Schedule
@@ -140,10 +140,13 @@ def take_step(fit: FullFit) -> None:
 def end_fit(fit: FullFit) -> FitResult:
     """Return the result of a fit and a report."""
     after = fit.before if fit.after is None else fit.after
-    state = fit.state
-    fitted, viewmats = gaussians_of(fit.tail.of(state.x), state.splats.shN), fit.optimiser.viewmats
-    report = FitReport("full", True, fit.step, fit.before, after, "all steps done", viewmats, origins=state.origins)
-    return fitted, report
+    job, ended, viewmats = fit.run.job, state_of(fit.tail.of(fit.state.x), fit.state.splats.shN), fit.optimiser.viewmats
+    ended.origins, ended.min_sizes = fit.state.origins, fit.state.min_sizes
+    is_limit = job.options.grows and not job.options.fills  # else the number is met, or renders show what lies beyond
+    if is_limit and job.edges is not None and job.fixed is None:
+        ended = split_at_edges(ended, job.edges, job.count)
+    report = FitReport("full", True, fit.step, fit.before, after, "all steps done", viewmats, origins=ended.origins)
+    return gaussians_of(ended.x, ended.splats.shN), report
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:

@@ -88,12 +88,17 @@ def split_parameters(parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     shift = rotations[rows, :, longest] * reach[:, None]
     halves = parents.copy()
     halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)
-    transmittances = 1 / (1 + exp(halves[:, LOGIT].astype(np.float64)))  # 1 - opacity
-    halves[:, LOGIT] = log(1 / power(transmittances, DEPTH) - 1)
+    halves[:, LOGIT] = fade_halves(halves[:, LOGIT])
     first_halves, second_halves = halves, halves.copy()
     first_halves[:, :SIZE] -= shift
     second_halves[:, :SIZE] += shift
     return first_halves, second_halves
+
+
+def fade_halves(logits: np.ndarray) -> np.ndarray:
+    """Return the opacity logits ``[m]`` of the halves of Gaussians with opacity ``logits [m]``."""
+    transmittances = 1 / (1 + exp(logits.astype(np.float64)))  # 1 - opacity
+    return np.asarray(log(1 / power(transmittances, DEPTH) - 1))
 
 
 def error_masses(state: FitState, half: Photos) -> np.ndarray:

@@ -92,7 +92,8 @@ def test_cameras_that_contradict_the_gaussians_cost_nothing(
     assert scores["harmed"] > scores["sound"] - 0.3
 
 
-@pytest.mark.parametrize(("beside", "least"), [("cameras", 30), ("nothing", 28)])  # which other views judge
+# Which other views judge; of those that are placed, seeds differ by 1.4 dB
+@pytest.mark.parametrize(("beside", "least"), [("cameras", 30), ("nothing", 27)])
 def test_a_result_compacted_again_looks_as_it_did(
     compacted_scene: Path, beside: str, least: float, tmp_path: Path, run: Run
 ) -> None:

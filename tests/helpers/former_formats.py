@@ -17,7 +17,7 @@ def spz4_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
     """A ``.spz`` of version 4: a header in the clear, a table of sizes, and a Zstandard stream for each column."""
     import zstandard
 
-    header, columns = spz_columns(gaussians, 4, flags=MIP_FLAG * mip)
+    header, columns = spz_columns(gaussians, 4, mip=mip)
     *_, count, degree, fraction, _, _ = HEADER.unpack(header)
     parts = [part.tobytes() for part in columns if part.shape[1]]
     packed = [zstandard.ZstdCompressor(level=12).compress(part) for part in parts]

@@ -75,19 +75,29 @@ def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
     """Return the text of settings for SuperSplat's viewer (its ``settings.json``, version 2): where to look from.
 
     The camera is the first of :func:`order_views`. Its target lies at the median depth of the ``means [n,3]`` in
-    front of it. The viewer turns the scene by half a turn about z.
+    front of it. The viewer turns the scene by half a turn about z, and takes the field of view for that of the longer
+    side. It would move by itself without a track; here both keys of the track are this view.
     """
     view = order_views(cameras)[0]
     forward, centre = cameras.viewmats[view, 2, :3].astype(np.float64), cameras.centres[view].astype(np.float64)
     depths = ((means[:: max(1, len(means) // _SAMPLE)] - centre) * forward).sum(1)
     depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
     position, target = (np.array([-1.0, -1.0, 1.0]) * point for point in (centre, centre + depth * forward))
-    fov = round(math.degrees(vertical_field(cameras, view)), 4)
+    longer = max(cameras.width / float(cameras.Ks[view, 0, 0]), cameras.height / float(cameras.Ks[view, 1, 1]))
+    fov = round(math.degrees(2 * math.atan(longer / 2)), 4)
     pose = {"position": position.tolist(), "target": target.tolist(), "fov": fov}
+    keys = {
+        "times": [0, 1],
+        "values": {"position": [*position, *position], "target": [*target, *target], "fov": [fov, fov]},
+    }
+    track = {
+        "name": "view", "duration": 1, "frameRate": 1, "loopMode": "none", "interpolation": "spline", "smoothness": 1,
+        "keyframes": keys,
+    }  # fmt: skip
     off = {name: {"enabled": False, **zeros} for name, zeros in _EFFECTS.items()}
     settings = {
         "version": 2, "tonemapping": "none", "highPrecisionRendering": False, "background": {"color": [0, 0, 0]},
-        "postEffectSettings": off, "animTracks": [], "cameras": [{"initial": pose}], "annotations": [],
-        "startMode": "default",
+        "postEffectSettings": off, "animTracks": [track], "cameras": [{"initial": pose}], "annotations": [],
+        "startMode": "animTrack",
     }  # fmt: skip
     return json.dumps(settings) + "\n"

@@ -28,11 +28,9 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
-from gsmerge.io.cameras.viewer_cameras import vertical_field
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.table import Contents
-from gsmerge.kernels.elementary import arctan2
-from gsmerge.types import SH_C0, Cameras, Gaussians, StrPath
+from gsmerge.types import SH_C0, Gaussians, StrPath
 from gsmerge.values.arrays import as_array, to_float32
 
 VERSION, MAX_DEGREE = 3, 3  # of written files; Spark 2.2 does not read version 4, and old readers only read 2
@@ -44,7 +42,6 @@ MIP_FLAG = 1  # render the Gaussians antialiased
 EXTENSIONS_FLAG = 2  # records of extensions are before the table in version 4, and after the columns in older versions
 RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
 AXES_KIND = 0xADBE0003  # of SPZ_ADOBE_coordinate_system; its content is 1 for the first of AXES, or 0 for unknown
-ORBIT_KIND = 0xADBE0002  # of SPZ_ADOBE_safe_orbit_camera: least and largest elevation in radians, least radius
 AXES = (
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
@@ -283,7 +280,7 @@ def fix_means(means: np.ndarray, fraction: int) -> np.ndarray:
 
 
 def spz_columns(
-    gaussians: Gaussians, max_degree: int, *, flags: int = 0, version: int = VERSION
+    gaussians: Gaussians, max_degree: int, *, mip: bool = False, version: int = VERSION
 ) -> tuple[bytes, tuple[np.ndarray, ...]]:
     """Quantise Gaussians; return the header, and columns ``[n,bytes]`` uint8 in the order of the file.
 
@@ -291,7 +288,7 @@ def spz_columns(
     """
     means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
     fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], FINE)  # others are refused below
-    header = Header(version, count, degree, fraction, flags, 0)
+    header = Header(version, count, degree, fraction, MIP_FLAG * mip, 0)
     parts = tuple(np.empty((count, width), np.uint8) for width in header.widths)
     for start, columns in arrays.column_blocks(gaussians, max_degree):
         for part, values in zip(parts, _quantise(columns, header), strict=True):
@@ -348,30 +345,13 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
     """Encode a ``.spz`` file as :func:`spz_bytes` does, of the version that the options name.
 
-    An extension keeps cameras on orbits at the elevations of the photos, if there are any.
+    It has no extensions: three 0.187 and mkkellogg's viewer refuse bytes after the columns.
     """
-    orbit = _orbit_record(contents.cameras) if contents.names else b""
-    flags = MIP_FLAG * (arrays.render_mode(contents.comments) == arrays.MIP) + EXTENSIONS_FLAG * bool(orbit)
-    header, parts = spz_columns(gaussians, MAX_DEGREE, flags=flags, version=contents.options.spz_version)
+    mip, version = arrays.render_mode(contents.comments) == arrays.MIP, contents.options.spz_version
+    header, parts = spz_columns(gaussians, MAX_DEGREE, mip=mip, version=version)
     columns = deque(parts)
     del parts  # each column is freed when the next one is compressed
-    return gzip_bytes(chain([header], (columns.popleft().data for _ in range(len(columns))), [orbit]))
-
-
-def _orbit_record(cameras: Cameras) -> bytes:
-    """Encode the elevations from which cameras look, with half of their field of view on both sides.
-
-    From there half of a picture is what the photos show. A radius of 0 is no limit. If the cameras stand upright along
-    another axis than y, which viewers take for vertical, there is no record.
-    """
-    x, y, z = cameras.viewmats[:, 2, :3].astype(np.float64).T
-    up = -cameras.viewmats[:, 1, :3].mean(0)
-    if np.abs(up).argmax() != 1:
-        return b""
-    elevations = arctan2(-np.sign(up[1]) * y, np.sqrt(x * x + z * z))
-    margin = vertical_field(cameras, 0) / 2
-    low, high = np.clip([elevations.min() - margin, elevations.max() + margin], -np.pi / 2, np.pi / 2)
-    return RECORD.pack(ORBIT_KIND, 12) + np.array([low, high, 0], "<f4").tobytes()
+    return gzip_bytes(chain([header], (columns.popleft().data for _ in range(len(columns)))))
 
 
 def gzip_bytes(

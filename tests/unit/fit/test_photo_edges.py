@@ -9,11 +9,12 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.fit.edges import Edges, cut_state, find_edges
-from gsmerge.fit.fit_state import FitState, start_state
+from gsmerge.fit.edges import Edges, cut_state, find_edges, split_at_edges
+from gsmerge.fit.fit_state import FitState, gaussians_of, start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.geometry.transforms import project
 from gsmerge.kernels.gaussians.edges import cut_at_edges
+from gsmerge.raster import render
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.fit import FitOptions
@@ -82,6 +83,48 @@ def test_fixed_gaussians_and_least_sizes_stay(truth: Gaussians, photos: Pair) ->
     np.testing.assert_array_equal(state.x[~free], before[~free])
     assert not np.array_equal(state.x[free], before[free])
     assert (state.x[:, 3:6].max(1) >= state.min_sizes).all()
+
+
+def across_an_edge(opacity: float) -> tuple[FitState, Edges]:
+    """A disc of ten pixels (sigma) whose middle lies two pixels inside a photo of 48 pixels, and a small one inside."""
+    cameras, x = scenes.arc(1), -22.0 * 3 / 48
+    means = np.array([[x, 0, 3], [0, 0, 3]], np.float32)
+    scales = np.array([[0.625, 0.625, 0.001], [0.02, 0.02, 0.02]], np.float32)
+    quats, sh0 = np.tile(np.float32([1, 0, 0, 0]), (2, 1)), np.zeros((2, 1, 3), np.float32)
+    opacities = np.array([opacity, 0.9], np.float32)
+    return start_state(Gaussians(means, quats, scales, opacities, sh0, np.zeros((2, 0, 3), np.float32))), find_edges(
+        cameras, 48 * 36 * 4
+    )
+
+
+def opacities_of(state: FitState) -> np.ndarray:
+    """Opacities ``[96]`` along the middle row of a picture that is twice as wide as the photo."""
+    cameras = scenes.arc(1)
+    wide = replace(cameras, Ks=cameras.Ks + np.array([[0, 0, 24], [0, 0, 0], [0, 0, 0]]), width=96)
+    return np.asarray(render(gaussians_of(state.x, state.splats.shN), wide).alphas[0, 18, :, 0])
+
+
+def test_a_large_gaussian_is_split_until_its_rim_is_narrow() -> None:
+    state, edges = across_an_edge(0.95)
+    before, after = opacities_of(state), opacities_of(split_at_edges(state, edges, 100))
+    assert before[:20].max() > 0.5  # it reaches beyond the photo, whose edge is at 24, moved out by one pixel
+    assert after[:20].max() < 0.05
+    assert after[25:30].min() > 0.9
+    assert (after[25:] > before[25:] - 0.05).all()  # halves overlap, so no gap opens
+
+
+@pytest.mark.parametrize("most", [2, 3, 6])
+def test_splits_keep_to_the_number(most: int) -> None:
+    state, edges = across_an_edge(0.95)
+    split = split_at_edges(state, edges, most)
+    assert len(split.x) <= most
+    assert set(split.origins) <= {0, 1}
+    np.testing.assert_array_equal(split.x[split.origins == 1], state.x[1:])
+
+
+def test_haze_before_the_scene_is_not_split() -> None:
+    state, edges = across_an_edge(0.15)
+    np.testing.assert_array_equal(split_at_edges(state, edges, 100).x, state.x)
 
 
 def test_threads_write_the_same(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -222,6 +222,12 @@ def test_settings_start_a_viewer_at_that_view_and_those_of_a_user_stay(scene: Sc
     np.testing.assert_allclose(position, scene.cameras.centres[view])
     pixel = project(target[None], scene.cameras)[0][view][0]
     np.testing.assert_allclose(pixel, (scene.cameras.width / 2, scene.cameras.height / 2), atol=1e-6)
+    tangent = sin(np.radians(camera["initial"]["fov"] / 2)) / cos(np.radians(camera["initial"]["fov"] / 2))
+    assert tangent == pytest.approx(scene.cameras.width / 2 / scene.cameras.Ks[view, 0, 0], rel=1e-5)  # the longer side
+    document = json.loads(settings.read_text())
+    (track,) = document["animTracks"]  # without one the viewer would turn by itself
+    assert document["startMode"] == "animTrack"
+    assert track["keyframes"]["values"]["position"] == 2 * camera["initial"]["position"]
     settings.write_text("{}")
     write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=True)
     assert settings.read_text() == "{}"

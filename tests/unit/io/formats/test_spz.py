@@ -6,12 +6,10 @@ import gzip
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import scenes
 import zstandard
 from damage.gaussians import add_record, axes_record
 from former_formats import spz4_bytes
@@ -26,9 +24,7 @@ from gsmerge.io.formats.read import file_notes
 from gsmerge.io.formats.splat import splat_bytes
 from gsmerge.io.formats.spz import AXES, encode_contents, gzip_bytes, spz_bytes
 from gsmerge.io.formats.table import Contents
-from gsmerge.kernels.elementary import cos, sin
 from gsmerge.settings.files import FileOptions
-from gsmerge.types import Cameras
 
 # Two Gaussians of degree 1 as @adobe/spz 0.2.3 writes them, which is Niantic's library for browsers
 NIANTIC = bytes.fromhex(
@@ -95,28 +91,6 @@ def test_version_2_has_rotations_of_a_byte_each(tmp_path: Path) -> None:
     assert float(np.abs((old.gaussians.quats * some(3).quats).sum(1)).min()) > 0.99
     for name in ("means", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(old.gaussians, name), getattr(new.gaussians, name))
-
-
-@pytest.mark.parametrize("up", [-1, 1])
-def test_limits_of_an_orbit_are_the_elevations_of_the_photos(up: int) -> None:
-    """Two cameras, 30 and 40 degrees above the scene, with fields of 53 degrees; in the file y points down or up."""
-    angles = np.radians([30, 40])
-    eyes = np.stack([np.zeros(2), up * sin(angles), -cos(angles)], 1)
-    viewmats = np.stack([scenes.look_at(eye, np.zeros(3)) for eye in eyes])
-    viewmats[:, :2] *= -up  # of a camera whose picture is upright
-    cameras = Cameras(viewmats, scenes.intrinsics(2, 48, 36), 48, 36)
-    content = gzip.decompress(encode_contents(some(0), Contents([some(0)], (), cameras, ("a", "b"))))
-    kind, size, low, high, radius = struct.unpack("<2I3f", content[-20:])
-    assert (kind, size, radius, content[14] & 2) == (0xADBE0002, 12, 0, 2)
-    margin = 0.3587706702705722  # half of the field, whose tangent is 18 / 48
-    np.testing.assert_allclose([low, high], [angles[0] - margin, min(angles[1] + margin, np.pi / 2)], atol=1e-5)
-
-
-def test_a_scene_on_its_side_has_no_limits_of_an_orbit() -> None:
-    cameras = scenes.arc(2)
-    turned = replace(cameras, viewmats=cameras.viewmats[:, [1, 0, 2, 3]])
-    contents = Contents([some(0)], (), turned, ("a", "b"))
-    assert encode_contents(some(0), contents) == spz_bytes(some(0))
 
 
 def test_harmonics_of_degree_4(tmp_path: Path) -> None:
