@@ -30,15 +30,16 @@ def run(block: str, folder: Path, **variables: str) -> None:
     assert done.returncode == 0, f"{block}\n{done.stdout[-500:]}\n{done.stderr[-2000:]}"
 
 
-def find_block(root: Path, words: str) -> str:
-    block: str = load_script(root / "tools" / "readme_block.py").find_block(words)
+def find_block(root: Path, words: str, page: str = "README.md") -> str:
+    block: str = load_script(root / "tools" / "readme_block.py").find_block(words, page=root / page)
     return block
 
 
 def test_one_minute_and_then_python(root: Path, project: Path) -> None:
     run(find_block(root, "tasks.py demo"), project)
     assert (project / "demo" / "preview.png").exists()
-    (code,) = re.findall(r"^```python\n(.*?)^```$", (root / "README.md").read_text(), re.DOTALL | re.MULTILINE)
+    guide = (root / "docs" / "guide" / "python.md").read_text()
+    code = re.findall(r"^```python\n(.*?)^```$", guide, re.DOTALL | re.MULTILINE)[0]
     subprocess.run([project / ".venv" / "bin" / "python", "-c", code], cwd=project, check=True)
     assert (project / "demo" / "small.ply").exists()
 
@@ -58,6 +59,6 @@ def test_install_and_then_every_command(root: Path, project: Path, tmp_path: Pat
         run(f"{make} {folder} --width 64 --height 48", tmp_path, PATH=path)
     run("cp -r monday/. .", tmp_path)
     run("\n".join(install[1:]), tmp_path, PATH=path, BROWSER="true")
-    run(find_block(root, "gsmerge batch scenes/"), tmp_path, PATH=path)
+    run(find_block(root, "gsmerge batch scenes/", "docs/README.md"), tmp_path, PATH=path)
     for name in ("small.ply", "small.spz", "clip.mp4", "room.gsm", "small"):
         assert (tmp_path / name).exists(), name
