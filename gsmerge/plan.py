@@ -136,11 +136,6 @@ class Plan:
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
     @property
-    def cleans_last(self) -> bool:
-        """Whether clean-up follows the search for the count: what it leaves out would count as errors in the search."""
-        return self.keeps_fidelity and self.clean.asked
-
-    @property
     def prunes(self) -> bool:
         """Whether Gaussians that no photo shows are dropped after the fit."""
         return self.fit.min_contribution > 0
@@ -332,7 +327,9 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     """
     if options.decides_count or options.replaces_stages:  # other stages seldom keep the quality
         return False
-    return scene.rendered or options.budget.keep or not (scene.is_dense or options.budget.auto)
+    # Gaussians per pixel, from which on a share of them is enough to show the photos
+    dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
+    return scene.rendered or options.budget.keep or not (dense or options.budget.auto)
 
 
 def check_pictures(prepared: Prepared, options: CompactOptions) -> None:

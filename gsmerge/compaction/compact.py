@@ -193,7 +193,7 @@ def run_search(search: CountSearch, build: Build, rebuild: Rebuild, prepared: Pr
     if search.left_out is not None:  # its candidates lack views, so the best count is built again
         search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)))
         return rebuild(search.count)
-    if plan.cleans_last:
+    if plan.keeps_fidelity and plan.clean.asked:  # what clean-up leaves out would count as errors in the search
         uncleaned = replace(plan, clean=CleanOptions())
         search.run(partial(build_scored, build, prepared, uncleaned))
         return clean_best(search.best, prepared, plan)

@@ -129,12 +129,14 @@ def read_input(
     ``hashed``: also hash the Gaussians. SceneError if it cannot be read, or if a file changes meanwhile.
     """
     stats = read_stats(files)
-    loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
+    loaded = load_files(files, opacity=opacity, hints=hints)
+    # photos inside the camera file are in the scene already, so their memory is freed
+    cameras = None if loaded.cameras is None else replace(loaded.cameras, images=())
     sha256 = file_sha256(*files.all_plys) if hashed else None
     if changed := list_changed(stats):
         raise SceneError(changed[0], "changed while it was read", "run this again when the file is complete")
     release_memory()
-    return replace(loaded, stats=stats, sha256=sha256, notes=(*loaded.notes, *_compact_notes(loaded)))
+    return replace(loaded, cameras=cameras, stats=stats, sha256=sha256, notes=(*loaded.notes, *_compact_notes(loaded)))
 
 
 def _compact_notes(loaded: Loaded) -> list[str]:

@@ -15,7 +15,6 @@ from gsmerge.types import Gaussians, Scene
 # holds most Gaussians. The median coefficient of the base colours is at most BRIGHT. Fewer than FEWEST Gaussians
 # are not tested
 LARGE, BRIGHT, FEWEST = 0.25, 10.0, 100
-DENSE = 0.5  # a scene is dense from this number of Gaussians per pixel on
 FLAT, FAINT = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
 SAMPLE_GAUSSIANS = 65536  # these bounds are tested on at least this many Gaussians, if there are as many
 
@@ -37,11 +36,6 @@ class SceneSize:
     def pixels_per_view(self) -> int:
         """Pixels of each view."""
         return self.height * self.width
-
-    @property
-    def is_dense(self) -> bool:
-        """Whether there are about as many Gaussians as pixels, so that a share of them is enough to show the photos."""
-        return self.has_own_pixels or self.num_gaussians >= DENSE * self.num_views * self.pixels_per_view > 0
 
 
 def measure_size(scene: Scene, rendered: bool | None = None) -> SceneSize:

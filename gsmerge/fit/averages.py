@@ -23,10 +23,6 @@ class RecentMean:
         self.count = min(self.count + 1, RECENT)
         self.mean += (number - self.mean) / self.count
 
-    def restart(self) -> None:
-        """Forget all numbers so far."""
-        self.count = 0
-
 
 @dataclass
 class TailMean:

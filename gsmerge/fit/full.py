@@ -125,7 +125,7 @@ def take_step(fit: FullFit) -> None:
     run, progress = fit.run, fit.progress
     step = fit.schedule.draw(fit.step + 1, progress, len(fit.state.x))
     if fit.reaches(run.half_part):  # whole photos have another error than samples
-        fit.error.restart()
+        fit.error = RecentMean()
     fit.error.add(fit.optimiser.step(fit.state, step))
     outside_view = run.outside_view(step.number, progress)
     if outside_view is not None:

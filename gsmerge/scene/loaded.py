@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +44,6 @@ class Loaded:
     def doubts(self) -> list[str]:
         """Those of the notes that make results doubtful, as on cameras and photos that are left out."""
         return list_doubts(self.notes)
-
-    def without_photos(self) -> Loaded:
-        """Return a copy without the photos inside the camera file, which frees memory; the scene keeps its own."""
-        return replace(self, cameras=None if self.cameras is None else replace(self.cameras, images=()))
 
     @property
     def comments(self) -> tuple[str, ...]:
