@@ -25,7 +25,7 @@ show(async ({ file, look, view, parent }) => {
   else camera.flyToBoundingSphere(sphere(), { duration: 0 });
   await Promise.race([loaded, failed]);
   const [x, y, z] = Cartesian3.pack(turnBack(camera.direction), []);
-  return [x, z, -y];
+  return [-x, z, y];
 }, { centred: true });
 
 async function openTiles(file, scene) {
@@ -49,7 +49,7 @@ async function openModel(file, scene) {
 }
 
 function lookFrom(camera, view) {
-  const place = ([x, y, z]) => new Cartesian3(x, -z, y); // from glTF's y up to Cesium's z up
+  const place = ([x, y, z]) => new Cartesian3(-x, z, y); // as the tileset turns glTF's y up to Cesium's z up
   const turn = (vector) => Matrix4.multiplyByPointAsVector(PLACE, place(vector), new Cartesian3());
   const { width, height, fx, fy } = view;
   const fov = 2 * Math.atan(Math.max(width / fx, height / fy) / 2); // of the longer side

@@ -8,10 +8,10 @@ gsmerge render R/r.ply --cameras R/r.cameras.json -o R/own
 node run.mjs R                               # --view 00010: another view; --only sog: some of the pictures
 python score.py R CAPTURE
 
-R/r2.spz, a .spz of version 2 (--set spz_version=2), and R/tileset.json are opened if they are there. WebGL2 runs in
-software, so times say nothing. PSNR is over all pixels. A cell holds the dB against our own picture, and against the
-photo. First pictures are what one sees who says nothing of a camera. Angles are to the view from which gsmerge lets
-viewers start; so is the dB.
+R/r2.spz, a .spz of version 2 (--set spz_version=2), and R/tileset.json, which has no place, are opened if they are
+there. WebGL2 runs in software, so times say nothing. PSNR is over all pixels. A cell holds the dB against our own
+picture, and against the photo. First pictures are what one sees who says nothing of a camera. Angles are to the view
+from which gsmerge lets viewers start; so is the dB.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
-from gsmerge.cli.paths import check_format, check_outputs, default_output, input_files, output_file
+from gsmerge.cli.paths import check_format, check_outputs, default_output, input_files, output_file, with_beside
 from gsmerge.errors import TargetError, UsageError
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.files import FileOptions
@@ -144,7 +144,7 @@ def _check_outputs(
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
     # Without --overwrite the camera file may exist, from a result in another format
     replaced_cameras = cameras if args.overwrite else None
-    outputs = (out, *levels, replaced_cameras)
+    outputs = (*with_beside(out), *levels, replaced_cameras)
     check_outputs(outputs, (*input_files(files), *networks), overwrite=args.overwrite or args.dry_run)
     check_format(out, writing)
     if writing.columns == "full" and settings.budget.in_bytes:
@@ -187,7 +187,7 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
 
     decoding, writing = args.make(DecodeOptions, FileOptions, columns="needed")
     out = output_file(args.output or default_output(path), default_output(path).name)
-    check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
+    check_outputs(with_beside(out), (path,), overwrite=args.overwrite or args.dry_run)
     check_format(out, writing)
     before = {"import": perf_counter() - start}
     document = decode_file(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
-from gsmerge.cli.paths import check_format, check_outputs, output_file
+from gsmerge.cli.paths import check_format, check_outputs, output_file, with_beside
 from gsmerge.errors import UsageError
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import PlacementOptions
@@ -47,7 +47,7 @@ def convert(args: opt.Args) -> None:
     images = None if photos.images is None else opt.named_or_none(photos.images)
     named = [path for path in (args.cameras, images) if isinstance(path, Path)]
     output = output_file(output, inputs[0].name)
-    check_outputs((output,), (*inputs, *named), overwrite=args.overwrite)
+    check_outputs(with_beside(output), (*inputs, *named), overwrite=args.overwrite)
     check_format(output, writing)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.io.formats.table import estimate_counts

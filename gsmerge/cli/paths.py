@@ -37,6 +37,16 @@ def check_format(output: Path, options: FileOptions) -> None:
         raise UsageError(f"columns full: expected a .ply output with normals, got {output.name}")
     if options.place is not None and format_ is not TILESET:
         raise UsageError(f"place: expected {TILESET.ending} as the output, got {output.name}")
+    if options.spz_version != FileOptions.spz_version and format_.ending not in (".spz", TILESET.ending):
+        raise UsageError(f"spz_version: expected .spz or {TILESET.ending} as the output, got {output.name}")
+
+
+def with_beside(output: Path) -> list[Path]:
+    """List an output and the file that its format writes beside it under a fixed name."""
+    from gsmerge.io.formats.table import find_format
+
+    beside = find_format(output).beside
+    return [output, *([output.with_name(beside.format(stem=output.stem))] if beside else [])]
 
 
 def check_outputs(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.outputs import write_contents
+from gsmerge.compaction.outputs import frame_notes, write_contents
 from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.errors import Doubt, SceneError, UsageError, name_notes
 from gsmerge.facts.counts import LEVEL_FACTOR, STREAMED_LEVELS
@@ -106,6 +106,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     contents = Contents(
         levels, comments, moved, names, scene_title(options.inputs[0]), options.writing, extra_columns=columns
     )
+    notes += frame_notes(options.output, contents)
     num_bytes, camera_path = write_contents(options.output, contents, overwrite=options.overwrite)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
     inputs = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]

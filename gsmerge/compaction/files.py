@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact_scene
-from gsmerge.compaction.outputs import add_output, add_views, refuse_other_cameras
+from gsmerge.compaction.outputs import add_output, add_views, frame_notes, refuse_other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError
@@ -87,6 +87,7 @@ def compact_files(
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
         contents = Contents(levels, comments, cameras, names, scene_title(files.ply), outputs.options)
         written = add_output(add, out, temporary, contents)
+        notes += frame_notes(out, contents)
         if cameras_path is not None:
             add_views(add, cameras_path, contents, overwrite=outputs.overwrite)
         notes += doubt_changed(load.stats)

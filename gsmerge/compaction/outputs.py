@@ -15,9 +15,9 @@ from gsmerge.io import output_format
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path, viewer_settings
+from gsmerge.io.cameras.viewer_cameras import is_own_settings, viewer_cameras, viewer_cameras_path, viewer_settings
 from gsmerge.io.formats.arrays import RESULT_COMMENT, ExpectedScores, new_views_comment
-from gsmerge.io.formats.table import Contents
+from gsmerge.io.formats.table import TILESET, Contents
 from gsmerge.types import Cameras, Gaussians
 
 # Cameras are the same up to this difference of their viewmats, relative to the largest translation. Their Ks may differ
@@ -28,16 +28,32 @@ SAME = 1e-5
 def add_output(add: AddOutput, out: Path, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write an output as :data:`gsmerge.io.formats.table.WriteOutput`, and settings that start its viewers at a view.
 
-    Without cameras, a camera is placed for formats whose viewers look from it first. Settings that are there already
-    stay, as they may be the user's.
+    Without cameras, a camera is placed for formats whose viewers look from it first. Of settings that are there already
+    only those that gsmerge wrote are replaced.
     """
     format_, gaussians = output_format(out, levels=True, cameras=True), contents.levels[0]
-    if format_.first_view and len(contents.cameras) == 0:
+    shows = format_.first_view and contents.options.viewer_cameras
+    if shows and len(contents.cameras) == 0:
         contents = replace(contents, cameras=place_viewpoints(gaussians)[:1])
     settings = out.with_name(format_.settings.format(stem=out.name.removesuffix(format_.ending)) or out.name)
-    if format_.settings and contents.options.viewer_cameras and not settings.exists():
+    if format_.settings and shows and (not settings.exists() or is_own_settings(settings)):
         add(settings).write_text(viewer_settings(contents.cameras, gaussians.means), encoding="utf-8")
     return format_.write(add, out, temporary, contents)
+
+
+def frame_notes(out: Path, contents: Contents) -> list[str]:
+    """Note that viewers of a format do not show the scene upright, or where it lies on the globe."""
+    format_, notes = output_format(out, levels=True, cameras=True), list[str]()
+    if format_ is TILESET and contents.options.place is None:
+        notes.append("without a place the scene lies in the middle of the earth: --set place=LON,LAT,HEIGHT")
+    if len(contents.cameras) and (format_.first_view or format_ is TILESET):
+        up = -contents.cameras.viewmats[:, 1, :3].mean(0)
+        axis = int(np.abs(up).argmax())
+        name = f"{'-' * bool(up[axis] < 0)}{'xyz'[axis]}"
+        if name != "-y":
+            problem = f"{name} is upward for the cameras, and -y for viewers of {format_.ending}"
+            notes.append(f"{problem}: gsmerge convert --up -y turns the scene")
+    return notes
 
 
 def add_views(add: AddOutput, path: Path, contents: Contents, *, overwrite: bool) -> None:

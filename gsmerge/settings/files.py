@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-from gsmerge.settings.placement import parse_triple
 from gsmerge.settings.setting import Settings, setting
 
 
@@ -22,8 +22,26 @@ class FileOptions(Settings):
         "`NAME.cameras.json` for viewers.")  # fmt: skip
     spz_version: Literal[2, 3] = setting(3, "Version of a `.spz`; readers of before 2025 only read 2.")
     place: str | None = setting(None, "Where a `tileset.json` lies on the globe: LON,LAT,HEIGHT, in degrees and metres "
-        "above the ellipsoid. Of the scene, y points down and z south; its unit is a metre.")  # fmt: skip
+        "above the ellipsoid. Of the scene, y points down and z north; its unit is a metre.")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        parse_triple("place", self.place)
+        if self.place is not None:
+            parse_place(self.place)
+
+
+def parse_place(text: str) -> tuple[float, float, float]:
+    """Parse longitude and latitude in degrees and height in metres, separated by commas.
+
+    Example:
+        >>> parse_place("8.5,47.4,400")
+        (8.5, 47.4, 400.0)
+    """
+    try:
+        longitude, latitude, height = map(float, text.split(","))
+        if abs(longitude) <= 180 and abs(latitude) <= 90 and math.isfinite(height):
+            return longitude, latitude, height
+    except ValueError:
+        pass
+    expected = "LON,LAT,HEIGHT, of -180 to 180 degrees, -90 to 90 degrees and metres"
+    raise ValueError(f"place: expected {expected}, got {text!r}")

@@ -16,6 +16,7 @@ from gsmerge.io.cameras.camera_file import CENTRED_PX
 from gsmerge.types import Cameras
 
 ENDING = ".cameras.json"
+TRACK = "gsmerge"  # name of the track of our settings
 _SAMPLE = 10_000  # Gaussians from which a depth is estimated
 _EFFECTS: dict[str, dict[str, Any]] = {
     "sharpness": {"amount": 0}, "bloom": {"intensity": 1, "blurLevel": 2},
@@ -71,6 +72,11 @@ def vertical_field(cameras: Cameras, view: int) -> float:
     return round(2 * math.atan(cameras.height / (2 * float(cameras.Ks[view, 1, 1]))), 9)
 
 
+def is_own_settings(path: Path) -> bool:
+    """Return whether settings are of :func:`viewer_settings`, by the name of their track."""
+    return f'"{TRACK}"' in path.read_text(encoding="utf-8", errors="replace")
+
+
 def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
     """Return the text of settings for SuperSplat's viewer (its ``settings.json``, version 2): where to look from.
 
@@ -91,7 +97,7 @@ def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
         "values": {"position": [*position, *position], "target": [*target, *target], "fov": [fov, fov]},
     }
     track = {
-        "name": "view", "duration": 1, "frameRate": 1, "loopMode": "none", "interpolation": "spline", "smoothness": 1,
+        "name": TRACK, "duration": 1, "frameRate": 1, "loopMode": "none", "interpolation": "spline", "smoothness": 1,
         "keyframes": keys,
     }  # fmt: skip
     off = {name: {"enabled": False, **zeros} for name, zeros in _EFFECTS.items()}

@@ -36,7 +36,7 @@ from gsmerge.io.formats.arrays import (
 from gsmerge.io.formats.spz import read_packed
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
-from gsmerge.types import Gaussians, number_views
+from gsmerge.types import NO_CAMERAS, Gaussians, number_views
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.table import Contents
@@ -67,7 +67,7 @@ def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
 
     The first is the view that stands nearest to the middle of all, since viewers look from the first.
     """
-    cameras = contents.cameras
+    cameras = contents.cameras if contents.options.viewer_cameras else NO_CAMERAS
     names = contents.names or number_views(len(cameras))
     nodes, lenses, ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
     for i, view in enumerate(ids):

@@ -65,6 +65,7 @@ class Format:
     # Encodes one file by the views and options of the content; None: ``encode`` does without them
     encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
     first_view: bool = False  # Viewers look from its first camera, so one is placed if there is none
+    beside: str = ""  # name of a file that is written beside it; "": none
     settings: str = ""  # name of a file beside it that tells viewers where to look first; "": none
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
@@ -94,6 +95,7 @@ class Format:
 
 
 _page = lazy_functions("gsmerge.pages")
+_SPZ = 17.0, 18.5, 18.9, 19.2
 _SOG = 13.0, 22.0, 36.5, 56.5
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
 PLY = Format(
@@ -108,9 +110,10 @@ LEVELS = Format(
     first_view=True, settings="settings.json", round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
 )  # fmt: skip
 TILESET = Format(
-    "tileset.json", "3D Tiles for Cesium; a .spz in a .glb beside it", _lazy("tileset.read_rows"), None, 3,
+    "tileset.json", "3D Tiles for Cesium: a .spz in a .glb beside it", _lazy("tileset.read_rows"), None, 3,
     holds=Path.is_file, write=_lazy("tileset.write_output"), levels="",
-    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), most=10_000_000,
+    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), most=10_000_000, beside="{stem}.glb",
+    each=_SPZ, rest=_lazy("tileset.least_bytes"), measure=_lazy("tileset.measure"),
 )  # fmt: skip
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
@@ -125,7 +128,7 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     PLY,
     Format(
         ".spz", "Niantic's format; written as version 3 or 2", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
-        encode_contents=_lazy("spz.encode_contents"), most=10_000_000, each=(17.0, 18.5, 18.9, 19.2),
+        encode_contents=_lazy("spz.encode_contents"), most=10_000_000, each=_SPZ,
         round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,),
     ),
     Format(

@@ -1,12 +1,14 @@
 """Read and write 3D Tiles 1.1 for Cesium: a ``tileset.json`` with one tile, a ``.glb`` that holds a ``.spz``.
 
 The ``.glb`` uses ``KHR_gaussian_splatting_compression_spz_2``, which Cesium requires. A node turns the axes of the
-``.spz`` to those of glTF, and Cesium turns y up to z up. On the globe, x points east, y north and z up (EPSG 4978).
+``.spz`` to those of glTF, and Cesium turns y up to z up. Half a turn follows, so that x points east, z north and -y up
+on the globe.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -23,10 +25,13 @@ from gsmerge.io.formats.spz import MAX_DEGREE, encode_contents
 from gsmerge.io.formats.table import Contents
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.settings.placement import parse_triple
+from gsmerge.settings.files import parse_place
+from gsmerge.types import Cameras, Gaussians
 
 FRAMED = 1, 99  # percentiles of the means that the bounds include; a few far Gaussians would make a scene small
 AXIS, SQUARED_ECCENTRICITY = 6378137.0, 0.0066943799901413165  # metres; of the ellipsoid WGS 84
+REST = 3000  # most bytes of the index, and of numbers of bounds in the tile
+PLACED = "the place on the globe is not kept: --set place=LON,LAT,HEIGHT states it again"
 _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # from y up
 
 
@@ -40,7 +45,8 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
     box = [*matmul(turn, (low + high)[:, None] / 2)[:, 0].tolist(), *halves.reshape(-1).tolist()]
     place = contents.options.place
     root = {"boundingVolume": {"box": box}, "geometricError": 0, "refine": "REPLACE", "content": {"uri": tile.name}}
-    root |= {"transform": globe_matrix(place).T.reshape(-1).tolist()} if place else {}
+    on_globe = matmul(np.eye(4) if place is None else globe_matrix(place), HALF_TURN)  # so that photos look north
+    root["transform"] = on_globe.T.reshape(-1).tolist()
     extensions = {"extensionsUsed": [NAME, COMPRESSED], "extensionsRequired": [NAME, COMPRESSED]}
     document = {
         "asset": {"version": "1.1", "generator": "gsmerge"},
@@ -65,7 +71,19 @@ def read_rows(path: Path) -> StoredRows:
     if not is_one:
         raise SceneError(path, "expected a tileset with one tile, a .glb beside it, found another", "name its tiles")
     rows = glb.read_rows(path.with_name(name.name))
-    return replace(rows, bytes_beside=path.with_name(name.name).stat().st_size)
+    placed = [] if np.abs(root.get("transform", np.eye(4).reshape(-1)))[12:15].max() == 0 else [PLACED]
+    return replace(rows, bytes_beside=path.with_name(name.name).stat().st_size, notes=(*rows.notes, *placed))
+
+
+def least_bytes() -> int:
+    """Return the most bytes of a tileset besides those of its ``.spz``."""
+    return REST
+
+
+def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
+    """Return the largest number of bytes of a tileset with these Gaussians, whatever its place."""
+    contents = Contents([gaussians], comments, cameras)
+    return len(_tile_bytes(contents, np.zeros(3), np.zeros(3))) + REST
 
 
 def _tile_bytes(contents: Contents, low: np.ndarray, high: np.ndarray) -> bytes:
@@ -95,7 +113,7 @@ def globe_matrix(place: str) -> np.ndarray:
 
     ``place``: longitude and latitude in degrees and height in metres above the ellipsoid, separated by commas.
     """
-    longitude, latitude, height = parse_triple("place", place)
+    longitude, latitude, height = parse_place(place)
     angles = np.radians([longitude, latitude])
     (sin_lon, sin_lat), (cos_lon, cos_lat) = sin(angles), cos(angles)
     up = np.array([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat])

@@ -228,6 +228,9 @@ def test_settings_start_a_viewer_at_that_view_and_those_of_a_user_stay(scene: Sc
     (track,) = document["animTracks"]  # without one the viewer would turn by itself
     assert document["startMode"] == "animTrack"
     assert track["keyframes"]["values"]["position"] == 2 * camera["initial"]["position"]
+    settings.write_text(settings.read_text().replace("60", "61"))  # of an earlier result
+    write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=True)
+    assert json.loads(settings.read_text()) == document
     settings.write_text("{}")
     write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=True)
     assert settings.read_text() == "{}"

@@ -9,14 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
+from messages import noted, refuses
 
 from gsmerge import Gaussians, read_gaussians, write_gaussians
 from gsmerge.compaction.convert import ConvertOptions, convert_files
+from gsmerge.compaction.outputs import frame_notes
 from gsmerge.errors import SceneError
 from gsmerge.io.formats.spz import spz_bytes
-from gsmerge.io.formats.tileset import globe_matrix
+from gsmerge.io.formats.table import Contents
+from gsmerge.io.formats.tileset import globe_matrix, measure
 from gsmerge.settings.files import FileOptions
+from gsmerge.types import NO_CAMERAS
 
 POLAR_RADIUS = 6356752.314245  # metres, of WGS 84
 
@@ -61,8 +64,33 @@ def test_a_far_gaussian_does_not_enlarge_its_bounds(room: Gaussians, tmp_path: P
 
 def test_a_place_on_the_globe(room: Gaussians, tmp_path: Path) -> None:
     stored = json.loads(convert(room, tmp_path, "10,50,100").read_text())["root"]["transform"]
-    np.testing.assert_array_equal(np.reshape(stored, (4, 4)).T, globe_matrix("10,50,100"))
-    assert "transform" not in json.loads(convert(room, tmp_path / "b").read_text())["root"]
+    matrix = np.reshape(stored, (4, 4)).T @ np.diag([-1, -1, 1, 1])  # half a turn, so that photos look north
+    np.testing.assert_array_equal(matrix, globe_matrix("10,50,100"))
+    unplaced = json.loads(convert(room, tmp_path / "b").read_text())["root"]["transform"]
+    np.testing.assert_array_equal(unplaced, np.diag([-1, -1, 1, 1]).reshape(-1))
+    again = convert_files(ConvertOptions([tmp_path / "web" / "tileset.json"], tmp_path / "copy" / "tileset.json"))
+    assert noted(again["notes"], "place", "kept")
+
+
+@pytest.mark.parametrize("place", ["8.5,47.4", "200,47,0", "8,97,0", "8,47,inf", "a,b,c", ""])
+def test_places_that_are_none(place: str) -> None:
+    with refuses(ValueError, "place", "LON", repr(place)):
+        FileOptions(place=place)
+
+
+def test_what_viewers_see_on_its_side_is_noted(room: Gaussians, tmp_path: Path) -> None:
+    cameras = scenes.arc(2)
+    turned = replace(cameras, viewmats=cameras.viewmats[:, [1, 0, 2, 3]])
+    assert frame_notes(tmp_path / "a.glb", Contents([room], (), cameras)) == []
+    (note,) = frame_notes(tmp_path / "a.glb", Contents([room], (), turned))
+    assert "--up -y" in note
+    assert len(frame_notes(tmp_path / "tileset.json", Contents([room], (), turned))) == 2
+    assert frame_notes(tmp_path / "a.ply", Contents([room], (), turned)) == []
+
+
+def test_its_size_is_at_most_what_a_budget_counts(room: Gaussians, tmp_path: Path) -> None:
+    out = convert(room, tmp_path, "-179.123456,-89.123456,1234567.891")
+    assert out.stat().st_size + out.with_name("tileset.glb").stat().st_size <= measure(room, NO_CAMERAS, ())
 
 
 @pytest.mark.parametrize(
