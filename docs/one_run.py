@@ -283,8 +283,8 @@ def prepare_section(run: Run) -> str:
             entry("moved", prepared.moved),
         ]),
         text(
-            "The frame has its origin at the median of the means. Its unit is the power of two next to the median depth,",
-            "so thresholds mean the same in every scene.",
+            "The frame has its origin at the median of the means. Its unit is the power of two next to the median",
+            "depth, so thresholds mean the same in every scene.",
             say(
                 "The photos show what the Gaussians show, so they are the reference of the fit and of all scores.",
                 prepared.reference.name == "photos" and prepared.reference.score_views == tuple(range(VIEWS)),
@@ -351,8 +351,8 @@ def build_section(run: Run) -> str:
         "## 4. build: the arrows",
         text(
             "[`pipeline.py`](../../gsmerge/pipeline.py) calls the files of `stages/` in turn, and `fit/` after",
-            "`decode_merged`. Each line begins with a function. Not shown are `assign` (a row belongs to the superpixel",
-            "of its pixel) and `refine` (networks stay out).",
+            "`decode_merged`. Each line begins with a function. Not shown are `assign` (a row belongs to the",
+            "superpixel of its pixel) and `refine` (networks stay out).",
         ),
         "\n".join([
             entry("segment_scene: groups.labels", groups.labels, (VIEW, Y, X)),
