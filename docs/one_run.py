@@ -207,21 +207,20 @@ def head(run: Run) -> str:
     return "\n\n".join([
         f"{NOTICE}\n\n# One run",
         text(
-            f"This page follows a scene of {count:,} Gaussians through a run with the default settings,",
-            "`gsmerge.compact(folder)`. The [generator](lab.md) makes the scene:",
+            f"This page says what each step of `gsmerge.compact(folder)` makes of a scene of {count:,} Gaussians.",
+            "The [generator](lab.md) makes the scene:",
             f"{VIEWS} photos of {WIDTH} x {HEIGHT} pixels of a room, their cameras, and a `scene.ply` with one",
-            "Gaussian per pixel, which has the errors of a depth that a network predicts.",
-            "[Architecture](architecture.md) names the rooms of the code, and",
-            "[conventions](../reference/conventions.md) explain names and words.",
+            "Gaussian per pixel, which has the errors of a predicted depth.",
+            "[Conventions](../reference/conventions.md) explain names and words.",
         ),
         text(
-            "Lists give arrays with shape and type, and the values of one row. The row is that of",
-            f"pixel ({X}, {Y}) of view {VIEW}, or of what this pixel has become.",
+            "Lists give arrays with shape and type, and the values of one row:",
+            f"that of pixel ({X}, {Y}) of view {VIEW}, or of what this pixel has become.",
         ),
         f"![One view: photo, superpixels, Feature Gaussians, merged, fitted, result](../images/{PICTURE.name})",
         text(
-            f"All panels show view {VIEW}. Ellipses are contours at one standard deviation. Yellow ones stand for",
-            "pixels of this view alone, blue ones for pixels of several views, and pink is what the pixel has become.",
+            f"All panels show view {VIEW}. Ellipses are contours at one standard deviation: yellow for pixels of this",
+            "view alone, blue for several views, pink for what the pixel has become.",
         ),
     ])  # fmt: skip
 
@@ -244,8 +243,8 @@ def align_section(run: Run) -> str:
             entry("result.pixel_ids", made.pixel_ids, ROW),
         ]),
         text(
-            "A `.ply` does not say which pixel a row belongs to, and exporters differ. `align` assumes an order,",
-            "projects every Gaussian into the camera of its pixel, and measures the distance from the pixel's centre.",
+            "A `.ply` does not say which pixel a row belongs to. `align` assumes an order, projects Gaussians into the",
+            "cameras of their pixels, and measures their distance from the pixels' centres.",
             say(
                 f'Here the first reading, "{recovery.layout.description}", decides: the median distance is',
                 recovery.layout.ids is None and recovery.frame is IDENTITY,
@@ -284,15 +283,14 @@ def prepare_section(run: Run) -> str:
             entry("moved", prepared.moved),
         ]),
         text(
-            "The frame has its origin in the middle of the scene. Its unit is a power of two near the median depth, so",
-            "thresholds mean the same in every scene, and scaling changes no bit.",
+            "The frame has its origin at the median of the means. Its unit is the power of two next to the median",
+            "depth, so thresholds mean the same in every scene.",
             say(
-                "The photos show what the Gaussians show, so they are the reference of the fit and of all scores;",
+                "The photos show what the Gaussians show, so they are the reference of the fit and of all scores.",
                 prepared.reference.name == "photos" and prepared.reference.score_views == tuple(range(VIEWS)),
             ),
-            "otherwise colours of the rows, or renders, would stand in for them.",
             f"Other views confirm the depth of {100 * agreement.confirmed:.0f} % of the pixels.",
-            say("No exposure is changed and no camera moves, because the photos agree as they are.",
+            say("The photos agree as they are, so no exposure changes and no camera moves.",
                 not prepared.moved and prepared.reference.photo_files is None),
         ),
     ])  # fmt: skip
@@ -352,9 +350,9 @@ def build_section(run: Run) -> str:
     return "\n\n".join([
         "## 4. build: the arrows",
         text(
-            "[`pipeline.py`](../../gsmerge/pipeline.py) calls the files of `stages/` in turn, and `fit/` before it",
-            "finishes. Each line begins with a function. Not shown are `assign` (a row belongs to the superpixel of",
-            "its pixel) and `refine` (networks stay out).",
+            "[`pipeline.py`](../../gsmerge/pipeline.py) calls the files of `stages/` in turn, and `fit/` after",
+            "`decode_merged`. Each line begins with a function. Not shown are `assign` (a row belongs to the",
+            "superpixel of its pixel) and `refine` (networks stay out).",
         ),
         "\n".join([
             entry("segment_scene: groups.labels", groups.labels, (VIEW, Y, X)),
@@ -377,11 +375,11 @@ def build_section(run: Run) -> str:
             say("and their depth is likely wrong.", plan.weakens and faint > 0),
         ),
         text(
-            "**`match`** finds Feature Gaussians of different views that overlap and have similar colours, and thus",
+            "**`match`** finds Feature Gaussians of different views that overlap and have similar colours, and so",
             say(
-                f"show one surface. Those of views {', '.join(map(str, features.views[own][:-1]))} and"
-                f" {features.views[own][-1]} form the pixel's cluster.",
-                len(own) > 1 and plan.match.match == "overlap",
+                "show one surface. The pixel's cluster has one of each of the views"
+                f" {', '.join(map(str, features.views[own][:-1]))} and {features.views[own][-1]}.",
+                len({*features.views[own]}) == len(own) > 1 and plan.match.match == "overlap",
             ),
             f"**`merge`** turns {len(features)} into {len(merged)}, one for each cluster; `views` is",
             say("-1 where several views were merged.", int(merged.views[run.merged]) == -1),
@@ -390,19 +388,19 @@ def build_section(run: Run) -> str:
             say("K is 1, so no superpixel gets more.", plan.decode.k == 1 and len(decoded.gaussians) == len(merged)),
         ),
         text(
-            "**`fit_scene`** compares renders with the photos and changes all parameters. Half way it splits the",
-            "Gaussians with the largest errors, and later it drops those that fade.",
-            f"{len(fitted.gaussians):,} are left; {len(children)} of them come from the pixel's.",
-            "As a test, patches of the photos stay out of the first steps, which draw a quarter of all pixels:",
-            f"the PSNR of the patches rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
+            "**`fit_scene`** changes all parameters until renders look like the photos. Half way it splits the",
+            "Gaussians with the largest errors, and later it drops faint ones.",
+            f"{len(fitted.gaussians):,} are left, {len(children)} of them from the pixel's.",
+            "The first steps draw a quarter of all pixels, and leave out patches of the photos.",
+            f"The PSNR of the patches rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
                 "so the fit is accepted.",
                 report.accepted and report.method == "full",
             ),
         ),
         text(
-            f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians that no photo shows, and puts",
-            f"{len(others)} others where cameras between photos see nothing.",
+            f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians, which change no photo by more than",
+            f"rounding does, and puts {len(others)} others where cameras between photos see nothing.",
         ),
     ])  # fmt: skip
 
@@ -427,12 +425,12 @@ def result_section(run: Run) -> str:
         text(
             f"{len(gaussians):,} Gaussians replace {run.prepared.input_scene.num_gaussians:,}.",
             say(
-                "They show the photos better than the input, whose depths are wrong here and there.",
+                "They show the photos better than the input, some of whose depths are wrong.",
                 report.psnr_after > report.psnr_before,
             ),
-            "The fit has seen these photos, so the report also estimates the gain in views that no photo shows. For",
+            "The fit has seen these photos. So the report also estimates the gain in views that no photo shows, by",
             say(
-                "this it makes runs that leave photos out.",
+                "fits that leave photos out.",
                 report.worse is None and new.low > 0,
             ),
         ),
