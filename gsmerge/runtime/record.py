@@ -137,13 +137,16 @@ def _write_to(record: Record) -> Iterator[Record]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Time a block or function as one of ``STAGES``; within another stage, its time counts for the outer stage."""
+    """Time a block or function as a stage; within another stage, its time counts for the outer stage.
+
+    Progress of a name that is not one of ``STAGES`` counts the stages before it.
+    """
     record = _current.get()
     if record is None or record.running is not None:
         yield
         return
     if name not in record.seconds:  # the second part of a stage is not a new step
-        report_progress(name, STAGES.index(name), len(STAGES))
+        report_progress(name, STAGES.index(name) if name in STAGES else len(record.seconds), len(STAGES))
     record.running, start = name, time.perf_counter()
     try:
         yield

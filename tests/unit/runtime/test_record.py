@@ -54,6 +54,17 @@ def test_a_stage_inside_another_is_part_of_it() -> None:
     assert list(record.seconds) == ["prepare"]
 
 
+def test_a_new_stage_needs_no_list() -> None:
+    events: list[tuple[str, int, int]] = []
+    with record_run(lambda *event: events.append(event)) as record:
+        with stage("prepare"):
+            pass
+        with stage("a new one"):
+            pass
+    assert list(record.seconds) == ["prepare", "a new one"]
+    assert events[1] == ("a new one", 1, len(STAGES))
+
+
 def test_a_stage_that_fails_ends() -> None:
     with record_run() as record:
         with pytest.raises(KeyError), stage("prepare"):
