@@ -27,7 +27,6 @@ from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels
 # show mainly such Gaussians. Views of fifteen captures in voxels miss at most .001 of them, at their edges; two
 # of four views of a narrow capture miss .02, and two of five of another .006
 LEAST_OUTSIDE = 0.005
-LEAST_ADDED = 0.2  # a further camera is placed if it adds more than this share of what those before it show
 SOURCES, STEPS_BACK = 4, 8  # most views beside which cameras are placed, and cameras for each that step back
 # Bounds of these: step back as a share of the depth, rotation to the sides, and rotation up or down, degrees
 NEAREST, FARTHEST = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
@@ -70,7 +69,8 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
     sources = cameras[even_views(len(cameras), min(len(cameras), SOURCES))]
     back = outside_cameras(sample.means, sources, STEPS_BACK * len(sources), NEAREST, FARTHEST)
     candidates = concat_cameras(back, _turn(sources))
-    return candidates[choose_cameras(sample, candidates, outside[::step], LEAST_ADDED)]
+    least_added = 0.2  # a further camera is placed if it adds more than this share of what those before it show
+    return candidates[choose_cameras(sample, candidates, outside[::step], least_added)]
 
 
 def _turn(cameras: Cameras) -> Cameras:

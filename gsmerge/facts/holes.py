@@ -39,10 +39,8 @@ GAP = 1 / 53  # beside large empty parts, only gaps narrower than this share of 
 MOST = 0.5  # share of empty pixels from which on the scene may be only a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # candidate depths, relative to the depth of a view's farthest surface
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
-FARTHER = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
 NEIGHBORS = 3  # nearest views that a picture is compared with
 BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
-LEAST = 1e-3  # least weight in this window of pixels that other views see
 SIZE, OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
 BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
 
@@ -213,12 +211,14 @@ def _choose_depths(
     neighbor_rays = [_rays_in(scene.cameras, neighbor, centres[view], rays) for neighbor in neighbors]
     colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
     best_depths, best_costs = depths[0], np.full(len(rays), np.inf, np.float32)
+    min_gain = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
+    min_weight = 1e-3  # least weight in this window of pixels that other views see
     for step, depth in enumerate(depths):
         sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and their number
         for neighbor, (start, along) in zip(neighbors, neighbor_rays, strict=True):
             add_differences(scene.images[neighbor], along, start, depth, colors, pixels, sums)
         total, number = blur(sums, BLUR).reshape(-1, 2)[pixels].T
-        cost = np.where(number > LEAST, total / np.maximum(number, LEAST), np.inf) + FARTHER * step
+        cost = np.where(number > min_weight, total / np.maximum(number, min_weight), np.inf) + min_gain * step
         best_depths, best_costs = np.where(cost < best_costs, depth, best_depths), np.minimum(cost, best_costs)
     return best_depths
 

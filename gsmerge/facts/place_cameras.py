@@ -24,20 +24,15 @@ NUM_VIEWS = 24  # most cameras that are placed
 HELD_OUT = 8  # of so many placed cameras, one is held out from the fit, for scores
 FITTED = 16  # cameras of each kind for a scene without cameras, and half as many on a walk
 SAMPLE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
-EXTENT = (0.05, 0.95)  # quantiles of the positions along each axis between which the scene is assumed to lie
 AROUND = 40  # candidate cameras around the scene
-ABOVE = -0.25  # height of the ring of viewpoints, in its radii; y points down
 FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
-WALKED = 0.6  # length of a walk to each side of the median, as a share of the longest half axis
 DIRECTIONS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length
 WIDE, PIXEL = 5 / 3, 1.5  # field of cameras that look from inside (80 degrees), and their pixel in standard deviations
 PROBE = 96  # pixels per side of the pictures for choosing candidates
 SMALLEST, LARGEST = 96, 640  # pixels per side
 CLEAR = 0.02  # near plane, as a share of the scene's radius
-ENOUGH = 1.0  # blending weight, summed over pixels, at which a Gaussian counts as seen
-LEAST_GAIN = 1e-3  # a camera is added if it raises the opacity shown so far by more than this share
 PAIRS, MIDDLE = 2, 0.5  # nearest views to which each view has a camera between, and its share of the way
 WIDEST = np.pi / 4  # the space between two views is unknown if the angle between them is larger
 # With at most this many views, a fit to renders also gets views between them; more views it does not memorise
@@ -100,8 +95,9 @@ def _place_shown(gaussians: Gaussians) -> Cameras:
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
     centre, half = _extent(thin_out(gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64))
     angles = 2 * np.pi * np.arange(len(inside)) / len(inside)
+    ring_height = -0.25  # height of the ring of viewpoints, in its radii; y points down
     # the first camera sees the front of most models
-    ring = np.stack([sin(angles), np.full(len(angles), ABOVE), -cos(angles)], 1)
+    ring = np.stack([sin(angles), np.full(len(angles), ring_height), -cos(angles)], 1)
     around = replace(inside, viewmats=_around(centre, half, FAR_RADII, normalize(ring)))
     return concat_cameras(around, inside)
 
@@ -203,7 +199,8 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     viewmats = _candidates(centre, half)
     candidates = Cameras(viewmats, np.repeat(_lens(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
     shares = _shares_seen(sample, candidates, CLEAR * float(np.sqrt((half * half).sum())))
-    best = _choose_candidates(shares, num_views, LEAST_GAIN)
+    least_gain = 1e-3  # a camera is added if it raises the opacity shown so far by more than this share
+    best = _choose_candidates(shares, num_views, least_gain)
     size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, LARGEST))
     return Cameras(viewmats[best], np.repeat(_lens(size)[None], len(best), 0), size, size)
 
@@ -215,7 +212,9 @@ def _lens(size: int, field: float = FIELD) -> np.ndarray:
 
 def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centre ``[3]`` and half sides ``[3]`` of the box that contains most of the means ``[n,3]``."""
-    low, high = np.quantile(means, EXTENT, axis=0)
+    # Quantiles of the positions along each axis between which the scene is assumed to lie
+    extent_quantiles = (0.05, 0.95)
+    low, high = np.quantile(means, extent_quantiles, axis=0)
     half = (high - low) / 2
     widest = float(half.max()) if half.max() > 0 else 1.0
     return (low + high) / 2, np.maximum(half, 1e-3 * widest)
@@ -241,7 +240,8 @@ def _walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
     angles = GOLDEN * np.arange(count)
     directions = cos(angles)[:, None] * along + sin(angles)[:, None] * side
     pairs = zip(steps, directions, strict=True)
-    return np.stack([_look(middle + step * WALKED * half.max() * along, direction) for step, direction in pairs])
+    walk_share = 0.6  # length of a walk to each side of the median, as a share of the longest half axis
+    return np.stack([_look(middle + step * walk_share * half.max() * along, direction) for step, direction in pairs])
 
 
 def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -273,7 +273,8 @@ def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndar
 
     def view_shares(view: int) -> np.ndarray:
         sums, _ = contributions(tile_view(splats, **photos.camera(view), near=near))
-        return np.minimum(sums / np.float32(ENOUGH), 1) * splats.opacities
+        seen_weight = 1.0  # blending weight, summed over pixels, at which a Gaussian counts as seen
+        return np.minimum(sums / np.float32(seen_weight), 1) * splats.opacities
 
     return np.stack(parallel_map(view_shares, range(len(candidates))))
 

@@ -15,9 +15,7 @@ from gsmerge.types import Gaussians, Scene
 # holds most Gaussians. The median coefficient of the base colours is at most BRIGHT. Fewer than FEWEST Gaussians
 # are not tested
 LARGE, BRIGHT, FEWEST = 0.25, 10.0, 100
-DENSE = 0.5  # a scene is dense from this number of Gaussians per pixel on
 FLAT, FAINT = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
-SAMPLE_GAUSSIANS = 65536  # these bounds are tested on at least this many Gaussians, if there are as many
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,8 @@ class SceneSize:
     @property
     def is_dense(self) -> bool:
         """Whether there are about as many Gaussians as pixels, so that a share of them is enough to show the photos."""
-        return self.has_own_pixels or self.num_gaussians >= DENSE * self.num_views * self.pixels_per_view > 0
+        min_density = 0.5  # a scene is dense from this number of Gaussians per pixel on
+        return self.has_own_pixels or self.num_gaussians >= min_density * self.num_views * self.pixels_per_view > 0
 
 
 def measure_size(scene: Scene, rendered: bool | None = None) -> SceneSize:
@@ -62,7 +61,8 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
     """
     if len(gaussians) < FEWEST:
         return None
-    sample = gaussians[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
+    sample_gaussians = 65536  # the bounds are tested on at least this many Gaussians, if there are as many
+    sample = gaussians[:: max(1, len(gaussians) // sample_gaussians)]
     means = sample.means.astype(np.float64)
     low, high = quantiles(means, (0.01, 0.99))
     diagonal = float(np.sqrt(((high - low) ** 2).sum()))

@@ -18,7 +18,6 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, make_scene
 
 LEAST = FitOptions().min_contribution  # a view shows a Gaussian from this blending weight in a pixel on, as in a fit
-LEVEL, SIDE = 2, 480  # pictures are smaller by at least this factor, as in a fit's survey; largest side of pictures
 
 
 def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
@@ -28,7 +27,9 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     keeps.
     """
     splats = make_splats(gaussians)
-    pictures = blank_photos(cameras, max(LEVEL, max(cameras.width, cameras.height) / SIDE))
+    min_level = 2  # pictures are smaller by at least this factor, as in a fit's survey
+    max_side = 480  # of pictures, pixels
+    pictures = blank_photos(cameras, max(min_level, max(cameras.width, cameras.height) / max_side))
 
     def list_shown(view: int) -> np.ndarray:
         tiled = tile_view(splats, **pictures.camera(view))

@@ -29,11 +29,8 @@ from gsmerge.photos.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noi
 from gsmerge.runtime.threads import parallel_map
 
 SIGNIFICANT = 2.0  # standard deviations of noise; smaller scores and smaller differences of scores count as noise
-MAX_COMPARED = 4  # photos with the highest scores that are compared with a view part by part
 MIN_EXPLAINED = 0.5  # share of the variance of a view that a photo explains; above it, the photo matches the view
 MIN_CONTRAST = 1 / 255  # root mean square, the rounding of 8 bits; pictures with less contrast cannot be compared
-IMPOSSIBLE = 1e6  # cost of a pair whose shapes differ
-MIN_PER_TASK, MAX_TASKS = 8, 16  # photos per task, and number of tasks; each task reads the pictures of all views
 FIRST_PHOTOS = 256  # evenly spaced photos of a film that are compared first; their best neighbourhoods come next
 
 
@@ -105,7 +102,9 @@ class Assigner:
         """Compare photos with all views."""
         ids = tuple(dict.fromkeys(photos))
         new = [photo for photo in ids if photo not in self._correlations]
-        task_size = max(MIN_PER_TASK, -(-len(new) // MAX_TASKS))
+        # Photos per task, and number of tasks; each task reads the pictures of all views
+        min_per_task, max_tasks = 8, 16
+        task_size = max(min_per_task, -(-len(new) // max_tasks))
 
         def compare(start: int) -> np.ndarray:
             return self._comparer.correlate([self.candidates.read(photo) for photo in new[start : start + task_size]])
@@ -246,10 +245,11 @@ class Assigner:
             return {}
         step, tag = -(-len(photos) // FIRST_PHOTOS), self.candidates.tag
         compared = set(range(0, len(photos), step))  # indices into ``photos``
+        max_compared = 4  # photos with the highest scores that are compared with a view part by part
         while True:
             scores = self.score(photos[index] for index in sorted(compared))
             best = scores.best()
-            columns = {view: np.argsort(-best[view], kind="stable")[:MAX_COMPARED] for view in views}
+            columns = {view: np.argsort(-best[view], kind="stable")[:max_compared] for view in views}
             peaks = {photos.index(scores.photos[column]) for ids in columns.values() for column in ids}
             neighbours = {peak + offset for peak in peaks for offset in range(1 - step, step)}
             neighbours &= set(range(len(photos)))
@@ -332,6 +332,7 @@ def _match(scores: np.ndarray) -> np.ndarray:
         return np.asarray(best)
     from scipy.optimize import linear_sum_assignment  # here because it takes long to load
 
-    rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, IMPOSSIBLE))
+    impossible_cost = 1e6  # cost of a pair whose shapes differ
+    rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, impossible_cost))
     out[rows] = columns
     return out

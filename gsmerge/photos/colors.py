@@ -25,7 +25,6 @@ SOLID = 0.2  # least opacity of a block that is compared; fainter blocks show on
 LEVELS = 33  # number of quantiles of a tone curve
 STEP = 0.05  # change of middle grey by a third of a stop, the smallest exposure step of cameras
 VISIBLE = 0.01  # root mean square of differences that are just visible on plain surfaces
-RIDGE = 1e-6  # ridge of the least squares, relative to the mean square of colours; keeps maps of grey photos finite
 Change = Callable[[np.ndarray], np.ndarray]  # maps colours [...,3]
 Fit = Callable[[np.ndarray, np.ndarray, np.ndarray], Change]  # from colours [n,3] to targets [n,3], weights [n]
 
@@ -88,7 +87,8 @@ def fit_map(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.
     """Fit the linear map ``[4,3]`` of colours to targets by least squares; its last row is a constant."""
     columns = np.concatenate([colors, np.ones((len(colors), 1))], 1).astype(np.float64)
     weighted = columns * weights[:, None]
-    normal = matmul(weighted.T, columns) + RIDGE * len(colors) * np.eye(4)
+    ridge = 1e-6  # ridge of the least squares, relative to the mean square of colours; keeps maps of grey photos finite
+    normal = matmul(weighted.T, columns) + ridge * len(colors) * np.eye(4)
     return solve(normal, matmul(weighted.T, targets.astype(np.float64)))
 
 

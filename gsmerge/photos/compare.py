@@ -49,10 +49,7 @@ from gsmerge.types import PicturedScene
 WINDOW = np.full(5, 1 / 5, np.float32)
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
-HUE_SAMPLE = 2_000  # approximate number of pixels of a photo whose hues are compared, if it has as many
 GREY = 0.25  # of the variation of the Gaussians' hues; photos whose hues vary less are grey
-MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
-LEAST_PERCENT = 1  # of a photo; no note says that less of it differs
 STRAY_PHOTOS = "do not show what the Gaussians show"  # said of photos that are not used
 
 
@@ -121,7 +118,8 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
 
 def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
     """Find the ``views`` whose photos have no hues while their Gaussians have; return the share that photos have."""
-    shares, step = dict[int, float](), 1 + pairs.photos[0].size // (3 * HUE_SAMPLE)
+    hue_sample = 2_000  # approximate number of pixels of a photo whose hues are compared, if it has as many
+    shares, step = dict[int, float](), 1 + pairs.photos[0].size // (3 * hue_sample)
     for view in views:
         weights = pairs.shown.weights[view].reshape(-1)[::step]
         photo, shown = (images[view].reshape(-1, 3)[::step] for images in (pairs.photos, pairs.shown.pictures))
@@ -251,8 +249,9 @@ def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Seq
     toned = {view: changes[view].tones for view in views if changes[view].tones is not None}
     if not toned:
         return
+    middle_grey = 128  # level of 255 at which notes report the change of tone
     factors = [
-        float(curve[:, MIDDLE_GREY].mean()) / (MIDDLE_GREY / 255) for curve in toned.values() if curve is not None
+        float(curve[:, middle_grey].mean()) / (middle_grey / 255) for curve in toned.values() if curve is not None
     ]
     low, high = min(factors), max(factors)
     factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
@@ -266,7 +265,8 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
     """Note in which of some photos something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
     max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
-    if max_percent < LEAST_PERCENT:
+    least_percent = 1  # of a photo; no note says that less of it differs
+    if max_percent < least_percent:
         return
     note(
         f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians"

@@ -31,9 +31,7 @@ from gsmerge.settings.stages import Exposure
 from gsmerge.types import Cameras, PicturedScene, Scene
 
 SAMPLE_PIXELS = 2000  # pixels of a view that are looked up in the other views
-SAME_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
-MIN_PAIRS = 60  # least number of pixels that two views share
 # The following three bounds were chosen on the plain exports of 15 captures. Root mean square of the logarithmic gains:
 # above the bound in nine of ten draws of random gains of 0.8 to 1.25 for five photos, and in six unchanged captures
 DIFFERENT = 0.06
@@ -45,7 +43,6 @@ FOLLOWS, OPPOSED = 0.5, -0.6
 # gains of 0.5 to 2; 0.19 to 0.57 if exposure drifts and compensation loses 1.7 dB or more; 0.67 for four views in a row
 UNEXPECTED = 0.69
 COARSE = 4  # the brightness of a photo is measured on every COARSE-th pixel of every COARSE-th row
-MAX_WEIGHTED_PIXELS = 1000  # pixels up to which the weight of a pair of views grows
 BRIGHT = 1.15  # gain from which on clipped pixels no longer count
 NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
 NEAREST, FARTHER = 6, 2  # a view is compared with the nearest views, and with further views at equal steps of rank
@@ -139,6 +136,7 @@ class _Pixels:
     def look_up(self, view: int, rows: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
         """Find the pixels ``rows`` of a view whose surface another view shows; return their indices and its pixels."""
         poses = self.cameras.viewmats[other].astype(np.float64), self.cameras.Ks[other].astype(np.float64)
+        same_depth = 0.05  # difference of the logarithms of two depths of one surface
         return find_surfaces(
             self.means[view],
             rows,
@@ -147,7 +145,7 @@ class _Pixels:
             *poses,
             self.cameras.width,
             NEAR_PLANE,
-            SAME_DEPTH,
+            same_depth,
         )
 
 
@@ -171,12 +169,13 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
     def measure(row: int) -> list[_Pair]:
         view, pairs = views[row], list[_Pair]()
         rows = sample[pixels.valid[view, sample]]
+        min_pairs = 60  # least number of pixels that two views share
         for other in (views[column] for column in partners[row]):
             found, other_rows = pixels.look_up(view, rows, other)
             here, there = photos[view].take(rows[found], axis=0), photos[other].take(other_rows, axis=0)
             red, green, blue = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).T
             clear = red & green & blue
-            if clear.sum() >= MIN_PAIRS:
+            if clear.sum() >= min_pairs:
                 ratios = log(there[clear].astype(np.float64) / here[clear])
                 pairs.append(_Pair(view, other, medians(ratios), len(ratios)))
         return pairs
@@ -199,8 +198,9 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
     """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; all are zero without pairs."""
     matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
+    max_weighted_pixels = 1000  # pixels up to which the weight of a pair of views grows
     for pair in pairs:
-        ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, MAX_WEIGHTED_PIXELS))
+        ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, max_weighted_pixels))
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])
         right[ends] += weight * np.array([-pair.ratios, pair.ratios])
     matrix[np.diag_indices(num_views)] += 1e-6  # views without pairs get a gain of one

@@ -33,10 +33,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import NONE
 from gsmerge.types import PROTECTED, Cameras, Pixels, StrPath
 
-_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _WHITE = np.uint8(255)
-_JPEG_TEXTURE = 0.2  # largest share of the pixels of a smooth mask that JPEG makes uneven
-_MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
 
 
 class CameraMaskError(SceneError):
@@ -71,14 +68,15 @@ class MaskFiles:
         """Read which pixels ``[h,w]`` of a view count, and their weights; None: all pixels count, with weight 1."""
         photo, counts, importance = self.photos[view] if self.photos else None, None, None
         alpha = None if photo is None else decode_alpha(photo)
+        min_level = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
         if alpha is not None:
             opaque = cut_part(turn_picture(alpha, self.turns[view]), self.part) * _WHITE
-            counts = self._reduce(opaque, view) > _MASK_LEVEL
+            counts = self._reduce(opaque, view) > min_level
         if (mask := self.masks[view]) is not None:
             levels = self._read_levels(mask, view)
             is_light = levels > _WHITE // 2
             light = self._reduce(is_light * _WHITE, view)
-            counts = (light > _MASK_LEVEL) if counts is None else counts & (light > _MASK_LEVEL)
+            counts = (light > min_level) if counts is None else counts & (light > min_level)
             if (levels[is_light] < _WHITE).any():  # the weight is the mean over the pixels that count
                 importance = self._reduce(levels * is_light, view) / np.maximum(light, np.float32(1))
         if (mask := self.protecting[view]) is not None:
@@ -187,7 +185,8 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
         return 0
     photo = photos[view]
     small = cv2.resize(photo, limit_size((photo.shape[1], photo.shape[0]), 2 * SIDE), interpolation=cv2.INTER_AREA)
-    return _texture(grey) > max(_texture(small.mean(-1)) / 2, _JPEG_TEXTURE)  # nearer to the photo's than to a mask's
+    jpeg_texture = 0.2  # largest share of the pixels of a smooth mask that JPEG makes uneven
+    return _texture(grey) > max(_texture(small.mean(-1)) / 2, jpeg_texture)  # nearer to the photo's than to a mask's
 
 
 def _texture(grey: np.ndarray) -> float:
@@ -240,7 +239,8 @@ def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple
     if counts is None:
         return masks, []
     share = float(1 - counts.mean())
-    if share < _MAX_MASKED:
+    max_masked = 0.98  # share of the pixels of photos that masks may leave out
+    if share < max_masked:
         count = int((~counts.all((1, 2))).sum())
         note = f"masks leave out {100 * share:.0f} % of the photos' pixels; {count} of {len(counts)} photos have a mask"
         shown = None if pixels is None or "masks" in files.named or files.masks is None else pixels.shown

@@ -23,7 +23,6 @@ from gsmerge.photos.views import pick_views
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
-_COMPARED = 8  # most photos whose parts are compared with their views
 _BAR_SPREAD = 8  # largest range of a bar's colours, of 255
 
 
@@ -47,7 +46,8 @@ def choose_part(
     """
     proposal = proposal.without_broken() or proposal
     named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
-    views, photos = zip(*(named[i] for i in pick_views(len(named), _COMPARED)), strict=True) if named else ((), ())
+    max_compared = 8  # most photos whose parts are compared with their views
+    views, photos = zip(*(named[i] for i in pick_views(len(named), max_compared)), strict=True) if named else ((), ())
     sizes = [image_size(proposal.pool[photo]) for photo in photos]
     shapes_differ = not all(same_shape(size, sizes[0]) for size in sizes)
     if not photos or shapes_differ or any(map(proposal.tag, photos)):

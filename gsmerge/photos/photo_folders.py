@@ -16,7 +16,6 @@ from gsmerge.io.photo_files import decode_small, image_size, same_shape
 from gsmerge.io.scene_files import list_folders
 from gsmerge.photos.offsets import SIDE
 
-_MAX_FOLDERS = 4  # folders whose photos are compared with the views
 _ROUNDING = 1 / 255  # mean difference of channels that rounding to 8 bits may cause
 _MODEL_FOLDERS = {"sparse", "colmap", "distorted"}  # names of folders that have COLMAP's models
 
@@ -59,7 +58,8 @@ def find_named_photos(
         nested = len(pools[folder]), -len(folder.parts), folder  # the folder itself rather than one above it
         return -count, -num_exact, not folder.is_relative_to(roots[0]), *look, *nested
 
-    best = [folder for count, *_, folder in sorted(map(rank, pools)) if -count > num_known][:_MAX_FOLDERS]
+    max_folders = 4  # folders whose photos are compared with the views
+    best = [folder for count, *_, folder in sorted(map(rank, pools)) if -count > num_known][:max_folders]
     if not best:
         return None
     pool = list(dict.fromkeys(path for folder in best for path in pools[folder]))

@@ -36,7 +36,6 @@ FAINT = 0.1  # opacity of a pixel's Gaussians below which their colours mean lit
 # Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 in exports of
 # nine captures. After a blur of 2 pixels they differ by .39, where Gaussians of wrong depth hide others
 BLUR = 8.0
-DISAGREE = 0.2  # the drawing is used from this mean difference of blurred colours over the channels (sRGB) on
 T = TypeVar("T")
 
 
@@ -98,7 +97,8 @@ def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
     drawn = (drawing / np.maximum(alpha, np.float32(1e-3))[..., None]).clip(0, 1)
     weights = np.minimum(opacity, alpha)  # of the difference of both pictures, which are blurred; a mean over channels
     red, green, blue = np.moveaxis(np.abs(blur((row_picture - drawn) * weights[..., None], BLUR)), -1, 0)
-    agree = (red + green + blue) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6))) < DISAGREE
+    disagreement = 0.2  # the drawing is used from this mean difference of blurred colours over the channels (sRGB) on
+    agree = (red + green + blue) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6))) < disagreement
     solid = transmittance < COVERED
     by_row = (opacity > 0) & ~(solid & ((opacity < FAINT) | ~agree))
     known = by_row | solid

@@ -25,12 +25,12 @@ AROUND = 6  # side of the picture in standard deviations of the local mean
 REACH = 2  # standard deviations at which the local mean is cut off
 MARGIN = 5.0  # standard deviations of noise by which evidence must exceed the noise
 NORMAL = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
-CLOSEST = 0.999  # larger correlations are clipped to it
 
 
 def fisher_z(correlations: np.ndarray) -> np.ndarray:
     """Return Fisher's z, the inverse hyperbolic tangent of correlations."""
-    clipped = correlations.clip(-CLOSEST, CLOSEST)
+    max_correlation = 0.999  # larger correlations are clipped to it
+    clipped = correlations.clip(-max_correlation, max_correlation)
     return np.asarray(0.5 * log((1 + clipped) / (1 - clipped)))
 
 
