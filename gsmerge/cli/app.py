@@ -155,9 +155,6 @@ def root(
     print_help(context)
 
 
-_RETRY_SECONDS = 0.02  # delay before a signal is raised again, if no caller could handle it
-
-
 @contextmanager
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, without unfinished files.
@@ -167,7 +164,8 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     """
 
     def raise_later(number: int) -> None:
-        timer = threading.Timer(_RETRY_SECONDS, signal.raise_signal, (number,))
+        retry_seconds = 0.02  # delay before a signal is raised again, if no caller could handle it
+        timer = threading.Timer(retry_seconds, signal.raise_signal, (number,))
         timer.daemon = True
         timer.start()
 

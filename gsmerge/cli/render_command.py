@@ -12,16 +12,15 @@ from gsmerge.errors import UsageError
 from gsmerge.settings.pictures import CLIPS, PICTURES
 
 MAX_SIDE = 1 << 20  # pixels; larger than any camera, so that pictures keep the size of the cameras
-MAX_DIGITS = 9  # only so many digits of a number of views are read
-SIDES = (16, 16384)  # least and largest width and height of a picture, pixels
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """Parse ``--size``: width and height, separated by an x."""
     match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not all(SIDES[0] <= side <= SIDES[1] for side in size):
-        expected = f"WIDTHxHEIGHT, such as 1920x1080, {SIDES[0]} to {SIDES[1]} pixels each"
+    sides = (16, 16384)  # least and largest width and height of a picture, pixels
+    if not all(sides[0] <= side <= sides[1] for side in size):
+        expected = f"WIDTHxHEIGHT, such as 1920x1080, {sides[0]} to {sides[1]} pixels each"
         raise ValueError(f"expected {expected}, got {text!r}")
     return size
 
@@ -30,7 +29,8 @@ def parse_views(text: str) -> int | str:
     """Parse ``--views``: a number or the name of a view. Digits that begin with 0 are a name."""
     if not re.fullmatch(r"[+-]?[\d.]+", text) or re.fullmatch(r"0\d+", text):
         return text
-    count = int(text[:MAX_DIGITS]) if text.isdecimal() else 0
+    max_digits = 9  # only so many digits of a number of views are read
+    count = int(text[:max_digits]) if text.isdecimal() else 0
     if count < 1:
         raise ValueError(f"expected a number from 1 or the name of a view, got {text}")
     return count

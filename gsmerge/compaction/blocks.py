@@ -53,7 +53,6 @@ T = TypeVar("T")
 # Most superpixels of a block, relative to compaction in one piece. A block takes more if views of other blocks see the
 # same surfaces
 MOST_DENSITY = 2.0
-SEAM_COST = 0.5  # of the fit of seams, as a share of the fits of all blocks
 SURPLUS = 1.03  # Gaussians of all blocks, relative to an exact number; the faintest surplus is dropped
 
 
@@ -137,7 +136,8 @@ def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, co
     costs = RunCosts(settings, view_pixels * len(scene), view_pixels, 1 / count, steps)
     build, [scores] = costs.build(num_gaussians), costs.end([], None)
     merged, fitted = Part(build.stages / count), Part(0.0, build.fits / count)
-    seams = [Part(0.0, SEAM_COST * build.fits)] * (steps > 0)
+    seam_cost = 0.5  # of the fit of seams, as a share of the fits of all blocks
+    seams = [Part(0.0, seam_cost * build.fits)] * (steps > 0)
     return [merged] * count + [fitted] * count + seams + [Part(scores.stages / count)] * count
 
 

@@ -22,7 +22,7 @@ IMPORT_SECONDS = 1.0  # imports, and the constant part of every run
 # For each million pixels of all views together, or each million Gaussians if there are more of these:
 COST_BUILD = 1.0  # superpixels, merging and scores of a result
 COST_INPUT = 0.3  # reading and scoring the input
-COST_NETWORKS = 1.4
+COST_NETWORKS = 1.4  # the shipped networks
 COST_PAPER = 4.5  # the paper's networks, which have more inputs and refine
 COST_PAIRS = 3.0  # merging neighbours pair by pair
 COST_PLACED = 6.0  # drawing a scene without views from placed ones

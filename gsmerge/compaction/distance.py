@@ -27,7 +27,7 @@ TWICE = decibels(1 / 4)  # dB between two distances of which one is twice the ot
 # noise of the Gaussians hardly counts. On fifteen captures a result is .2 dB or more nearer to its input than the input
 # to its photos, and .03 s tell that
 SAMPLE, SIDE, BLUR = 40_000, 80, 1.0
-MOST_PHOTOS, MOST_BETWEEN = 2, 3
+MOST_PHOTOS, MOST_BETWEEN = 2, 3  # most photos, and most cameras between them, that are compared
 
 
 def is_far(near: float | None, far: float | None) -> bool:

@@ -40,12 +40,9 @@ MAX_RUNS = 6  # most builds of a search
 # Bounds of a search by left-out photos. Its slope is the mean of eleven captures below the usual count; a count is near
 # enough at half of a doubling
 MAX_TRIED = 3  # most builds, in addition to the build of the result
-LEFT_OUT_SLOPE, LEFT_OUT_NEAR_DB = 0.3, 0.15  # dB per doubling of the count; dB above a target
-MAX_FACTOR = 4  # a quality target against photos may take at most this many times the usual count
 FAR_DB = (
     6.0  # PSNR is cut at this many dB above a target: larger values, as of the whole input, say little of the slope
 )
-COMPACT_SHARE = 0.5  # a scene is compact already if the result needs more than this share of its Gaussians
 
 T = TypeVar("T")
 
@@ -102,7 +99,8 @@ class CountSearch:
         if plan.keeps_fidelity and not plan.auto_count:
             least = min(limits.default, limits.max_count)
         if not (plan.keeps_fidelity or self.rendered):
-            most = min(most, MAX_FACTOR * limits.default)
+            max_factor = 4  # a quality target against photos may take at most this many times the usual count
+            most = min(most, max_factor * limits.default)
         if self.left_out is not None and self.most:
             most = min(most, self.most)
         return least, most
@@ -110,7 +108,8 @@ class CountSearch:
     def _expected_slope(self) -> tuple[float, float]:
         """Return the dB per doubling of the count to assume at first, and the dB above the target that are enough."""
         if self.left_out is not None:
-            return LEFT_OUT_SLOPE, LEFT_OUT_NEAR_DB
+            left_out_slope, left_out_near_db = 0.3, 0.15  # dB per doubling of the count; dB above a target
+            return left_out_slope, left_out_near_db
         if self.rendered:
             return RENDERS_SLOPE, NEAR_DB
         return SLOPE, PHOTOS_NEAR_DB if self.plan.keeps_fidelity else 0.0
@@ -178,7 +177,8 @@ class CountSearch:
             good = f"show the photos at most {FIDELITY_LOSS:g} dB worse than the input"
         if not self.met:
             return [f"{kept}: each of the {len(self.tried)} counts tried would {short}"]
-        if count > COMPACT_SHARE * limits.num_input:
+        compact_share = 0.5  # a scene is compact already if the result needs more than this share of its Gaussians
+        if count > compact_share * limits.num_input:
             return [f"the scene is compact already: {kept}, since fewer would {short}"]
         return [f"{kept}, about the fewest that {good}"]
 

@@ -40,9 +40,6 @@ from gsmerge.values.arrays import Array, as_array, to_float32
 from gsmerge.values.words import count_words
 
 ORDERS = ("view-major", "none")
-_NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may exceed it
-_EXACT = 1e-5  # the same difference from which on quaternions are normalised
-_MAX_COLOR = 2.0  # largest colour; harmonics may take colours a little beyond 1
 _REMEDIES = {
     C2W_OPENCV: "pass their inverse, torch.linalg.inv(viewmats)",
     W2C_OPENGL: "negate the second and the third row of each",
@@ -194,7 +191,8 @@ def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, l
     check_values(out)
     _check_lengths(out["quats"][valid])
     np.clip(out["opacities"], 0, 1, out=out["opacities"])
-    off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > _EXACT)
+    min_difference = 1e-5  # of a quaternion's length from 1, from which on it is normalised
+    off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > min_difference)
     out["quats"][off] = normalize(out["quats"][off])
     out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
     notes = [count_words(num_bad, "row", "with NaN or inf, set aside")] if num_bad else []
@@ -212,7 +210,8 @@ def _read_base(sh0: Array | None, colors: Array | None) -> np.ndarray:
     if sh0 is not None:
         return _rows("sh0", sh0, 3).reshape(-1, 1, 3)
     rgb = _rows("colors", colors, 3)
-    _expect_unit_range("colors", rgb[np.isfinite(rgb)], _MAX_COLOR - 1)
+    max_color = 2.0  # largest colour; harmonics may take colours a little beyond 1
+    _expect_unit_range("colors", rgb[np.isfinite(rgb)], max_color - 1)
     return rgb_to_sh0(rgb)[:, None]
 
 
@@ -232,8 +231,10 @@ def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
 def _check_lengths(quats: np.ndarray) -> None:
     """Raise SceneError for quaternions of other lengths than 1; a scene may have them, as no stage uses lengths."""
     lengths = np.linalg.norm(quats, axis=1)
-    share = float((np.abs(lengths - 1) > _NOT_UNIT).mean())
-    if share > _FEW:
+    # Difference of a quaternion's length from 1; share of rows that may exceed it
+    max_difference, max_share = 0.01, 0.01
+    share = float((np.abs(lengths - 1) > max_difference).mean())
+    if share > max_share:
         sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
         remedy = "pass torch.nn.functional.normalize(quats, dim=-1)"
         raise SceneError("quats", f"expected unit quaternions wxyz, found {sizes}", remedy)

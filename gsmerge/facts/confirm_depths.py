@@ -38,7 +38,7 @@ THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
 }  # fmt: skip
-MOSTLY = 0.5
+MOSTLY = 0.5  # share of the pixels of a part
 # Useful number of Gaussians per pixel. It is MOST if the share of confirmed pixels is at least SOUND, and falls to the
 # usual share, FEWEST, at a share of WRONG. With more Gaussians a fit memorises the photos (docs/guide/how-many.md).
 # MOST is the largest number at which no capture with as much confirmed depth lost .1 dB in photos that were not used.

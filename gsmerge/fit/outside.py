@@ -51,8 +51,6 @@ MARGIN = 0.15  # a pixel is veiled if its loss (see veil_gradients) is larger: t
 MANY, LIGHT, VEIL = 1000, 0.15, 30
 LEVEL = 3  # size of a picture's pixels in pixels of the photo; at 2 fog is as thin, at 4 it is a fifth thicker
 LEAST_WIDTH = 64  # least width of the pictures, pixels
-LEAST = 0.005  # a picture counts if more than this share of it is empty or solid
-TOUCHED = 1e-9  # a Gaussian takes part in a step if the gradient of its opacity is larger
 SCORED = 12  # most views in which the fog of a result is measured
 
 
@@ -98,7 +96,8 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
     limits = _find_limits(make_splats(sample), views, near, far)
     fog_weight = np.float32(np.clip(len(start) / (MANY * len(photos)), LIGHT, 1.0))
     weights = fog_weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL, 0)).astype(np.float32)
-    ids = np.flatnonzero((limits > 0).mean((1, 2)) > LEAST).tolist()
+    min_share = 0.005  # a picture counts if more than this share of it is empty or solid
+    ids = np.flatnonzero((limits > 0).mean((1, 2)) > min_share).tolist()
     return Outside(replace(views[ids], weights=weights[ids]), limits[ids], near[ids], far[ids]) if ids else None
 
 
@@ -185,7 +184,8 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     image_gradient[..., 0] = -weights * inverse_limits
     g = gradients_of(tiled, depths, image, transmittance, image_gradient, -weights, with_viewmat=False)
     g.colors[:] = 0
-    return g[np.flatnonzero(g.opacities > TOUCHED)]  # Gaussians behind the limit should not gain opacity
+    min_gradient = 1e-9  # a Gaussian takes part in a step if the gradient of its opacity is larger
+    return g[np.flatnonzero(g.opacities > min_gradient)]  # Gaussians behind the limit should not gain opacity
 
 
 def score_fog(splats: Splats, outside: Outside) -> float | None:

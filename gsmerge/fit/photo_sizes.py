@@ -16,9 +16,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import PicturedScene, Scene
 
-AUTO_SCALE = 2.0  # largest scale of "auto": a step takes time by its pixels, and larger photos are rarely sharp
 MIN_AUTO_SCALE = 1.25  # least scale that "auto" uses; below it photos have the size of the views
-ALIKE = 0.01  # share of a scale that rounding of sizes may change
 MAX_GAIN = 2.0  # largest exposure factor that scores compensate
 PATCH = 32  # side of a held-out patch, pixels, at most
 HIDDEN = np.float32(1e-9)  # weight of pixels that neither count nor are held out
@@ -58,7 +56,8 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
     can_enlarge = options.fit == "full" and options.half_res_part < 1
     if requested == "auto":
         enlarges = can_enlarge and auto and largest >= MIN_AUTO_SCALE
-        return (min(largest, AUTO_SCALE) if enlarges else 1.0), None
+        auto_scale = 2.0  # largest scale of "auto": a step takes time by its pixels, and larger photos are rarely sharp
+        return (min(largest, auto_scale) if enlarges else 1.0), None
     if requested == 1:
         return 1.0, None
     if not can_enlarge:
@@ -66,7 +65,8 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
             1.0,
             f"photo_scale {requested:g} is 1: larger photos need the full fit, with steps on photos of full size",
         )
-    if requested > largest * (1 + ALIKE):
+    tolerance = 0.01  # share of a scale that rounding of sizes may change
+    if requested > largest * (1 + tolerance):
         return largest, f"photo_scale {requested:g} is {largest:.3g}: the photos are no larger"
     return float(min(requested, largest)), None
 

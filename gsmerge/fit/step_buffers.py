@@ -20,7 +20,6 @@ from gsmerge.raster.gradient import viewmat_gradient
 from gsmerge.raster.tiled_view import cache_line_rows, hides_most
 from gsmerge.runtime.threads import parallel_map
 
-SPARE = 1.25  # allocated room, as a multiple of the intersections of a view that needs more room
 OF_STATE = ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors")
 OF_SPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 # Arrays that each step sets, with their lengths
@@ -78,7 +77,8 @@ class StepBuffers:
         if is_open:  # lists end where their tiles are opaque, or they would be too long
             self._run(weight.shape, "count_open")
         if table["num_intersections"] > len(self.room["flatten_ids"]):
-            self._make_room(int(SPARE * table["num_intersections"]))
+            room_factor = 1.25  # allocated room, as a multiple of the intersections of a view that needs more room
+            self._make_room(int(room_factor * table["num_intersections"]))
             return self.take(number, photo, weight, drawn, numbers)
         self._run(weight.shape, "deal_open" if is_open else "deal", "blend", "loss", "backward", "update")
         error = float(table.arrays["errors"].sum(dtype=np.float64))

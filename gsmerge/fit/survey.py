@@ -20,7 +20,6 @@ from gsmerge.types import Cameras, Gaussians
 MOST_SCORED = 12  # most photos that a fit is scored on
 ENOUGH = 6  # a survey has enough photos of a Gaussian if its centre is inside this many of them
 FEWER = 0.03  # a photo is added to a survey if more than this share of its Gaussians has fewer photos than ENOUGH
-SAMPLE_GAUSSIANS = 4096  # the photos are chosen by at most about twice this many Gaussians
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +75,8 @@ def choose_views(gaussians: Gaussians, photos: Photos) -> list[int]:
 
     A photo is added if it shows many Gaussians with fewer than ``ENOUGH`` photos so far.
     """
-    means = gaussians.means[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
+    sample_gaussians = 4096  # the photos are chosen by at most about twice this many Gaussians
+    means = gaussians.means[:: max(1, len(gaussians) // sample_gaussians)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
     inside = (depths > NEAR_PLANE) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
     views = scored_views(len(photos))

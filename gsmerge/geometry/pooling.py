@@ -16,7 +16,6 @@ from gsmerge.values.arrays import to_float32
 
 Rule = Literal["depth", "paper"]
 
-MIN_SCALE = 1e-12
 MAX_OPACITY = 0.999  # largest opacity of a merged Gaussian, so that its logit is finite and a later fit can change it
 ROWS_PER_TASK = 4096  # groups that one task pools
 ROWS = 65536  # Gaussians whose footprints one task computes
@@ -139,7 +138,8 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         decompose(covars[rows], scales[rows], quats[rows])  # fills `scales` and `quats`
 
     parallel_map(decompose_rows, range(0, len(covars), ROWS_PER_TASK))
-    return np.maximum(scales, MIN_SCALE), quats
+    min_scale = 1e-12  # world units; replaces scales of 0, because opacities are divided by scales
+    return np.maximum(scales, min_scale), quats
 
 
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:

@@ -21,8 +21,6 @@ from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 from gsmerge.values.arrays import Array
 
 State = TypeVar("State")  # state that a descent changes
-MORTON_BITS = 21  # bits for each axis; three axes fit into 63 bits
-DEPTH_SAMPLE = 50_000  # points; the median depth in a view is measured on about so many
 DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
 # More values than the first number are narrowed down before the median is taken: to those between two shares of a
 # sample of about the second number, which are so far from a half that the median is practically always between them
@@ -193,7 +191,8 @@ def middle_depth(means: np.ndarray, camera: Cameras) -> float:
 
 def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
     """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; ``[1]`` if there are none."""
-    points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
+    depth_sample = 50_000  # points; the median depth in a view is measured on about so many
+    points = means[:: max(1, len(means) // depth_sample)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
     return np.asarray(depths[inside]) if inside.any() else np.ones(1)
@@ -331,9 +330,10 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
     if len(points) == 0:
         return codes
     low, high = points.min(0), points.max(0)
-    steps = (points - low) / np.maximum(high - low, 1e-30) * (2**MORTON_BITS - 1)
+    axis_bits = 21  # bits for each axis; three axes fit into 63 bits
+    steps = (points - low) / np.maximum(high - low, 1e-30) * (2**axis_bits - 1)
     for axis, column in enumerate(steps.astype(np.int64).T):
-        for bit in range(MORTON_BITS):
+        for bit in range(axis_bits):
             codes |= (column >> bit & 1) << (3 * bit + axis)
     return codes
 

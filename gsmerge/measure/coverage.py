@@ -11,8 +11,6 @@ from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.types import Gaussians, Scene
 
-HUGE_SCALE_SHARE = 0.1  # scales above this share of the box's diagonal are huge; they show no detail
-
 
 def extents(gaussians: Gaussians) -> dict[str, Any]:
     """Measure positions and sizes of finite Gaussians, in world units; on a sample if there are many.
@@ -31,9 +29,10 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
     points, largest = gaussians.means[::step].astype(np.float64), gaussians.scales.max(1)
     low, high = np.percentile(points, BOX_QUANTILES, axis=0)
     diagonal = np.linalg.norm(high - low)
+    huge_scale_share = 0.1  # scales above this share of the box's diagonal are huge; they show no detail
     values = (
         diagonal, beyond_scene(points).mean(), floater_share(gaussians), np.median(largest[::step]), largest.max(),
-        (largest[::step] > HUGE_SCALE_SHARE * diagonal).mean(),
+        (largest[::step] > huge_scale_share * diagonal).mean(),
     )  # fmt: skip
     shares = {name: float(value) for name, value in zip(names, values, strict=True)}
     return {"box_low": low.tolist(), "box_high": high.tolist(), **shares}

@@ -43,7 +43,6 @@ from gsmerge.settings.pictures import CLIPS, GIF, PICTURES
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 
-PANEL_VIEWS = 4  # rows of a panel
 SECONDS = 4  # least duration of a clip
 VIEW_FRAMES = 4  # least number of frames for each view of a spline
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
@@ -149,7 +148,8 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     group = _read(options, photos=True)
     scene = group.load.scene
     cameras, photos, pictured = options.resize(scene.cameras), scene.images, scene.photo_views
-    ids = options.choose(scene.names, PANEL_VIEWS)
+    panel_views = 4  # rows of a panel
+    ids = options.choose(scene.names, panel_views)
     names = [re.split(r"[\\/]", scene.names[i])[-1] for i in ids]
 
     def draw(_: int) -> Iterator[Picture]:

@@ -33,7 +33,6 @@ MENDED = (
     "the photos of the input views differ from their Gaussians, or from each other, in tone, exposure or by objects"
     " that cover them; compact mends this, but the scores here use the photos as they are"
 )
-MIN_SEEN_SHARE = 0.1  # if input views have seen less of the held-out pixels, the frames of coordinates may differ
 SPLITS = ("context", "target")  # input views, and held-out views
 INPUT = "input"  # name of the scene itself among the results
 
@@ -297,9 +296,10 @@ def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mend
         losses = (describe_loss(name, psnrs[INPUT], psnr, OWN_PHOTOS) for name, psnr in psnrs.items())
         yield from (Doubt(loss) for loss in losses if loss is not None)
     yield from filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog))
+    min_seen_share = 0.1  # if input views have seen less of the held-out pixels, the frames of coordinates may differ
     if "target" not in splits:
         yield "no held-out views were given; on input views, fitted results score better than on new views"
-    elif (share := splits["target"].visible.mean()) < MIN_SEEN_SHARE:
+    elif (share := splits["target"].visible.mean()) < min_seen_share:
         seen = f"the input views have seen only {100 * share:.0f} % of the held-out views"
         yield Doubt(f"{seen}, which may be of another scene or in another world")
     if photos and mended:

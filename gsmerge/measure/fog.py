@@ -30,7 +30,6 @@ ALL = "all"  # kind of all these cameras together
 SIDE = 480  # largest longer side of the pictures, pixels
 EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: the input is empty below, solid above; a result has a hole below
 MARGIN = 17  # side, in pixels, of the square that erodes empty regions
-FAR_SHARE = 0.1  # fog is far if it is farther than this share of the width from every pixel that the input shows
 VEIL = 0.7  # a result has a veil where its depth is below this share of the input's depth
 VEILED = 0.08  # a result whose worst veil is larger gets a note
 # Spikes are Gaussians at least RATIOS times as long as their second axis, and longer (3 sigma) than the share LONG of
@@ -142,7 +141,8 @@ def draw_outside(splats: Splats, camera: Cameras, near: float, nearest: float) -
 def count_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
     """Return sums over pixels, and numbers of measured pixels, ``[4,2]``: near fog, far fog, holes and veil."""
     empty, solid = (expected.opacities < EMPTY).astype(np.uint8), expected.opacities > SOLID
-    sides = MARGIN, max(MARGIN, 2 * round(FAR_SHARE * empty.shape[1]) + 1)
+    far_share = 0.1  # fog is far if it is farther than this share of the width from every pixel that the input shows
+    sides = MARGIN, max(MARGIN, 2 * round(far_share * empty.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
     fog = [(float(actual.opacities[mask].sum(dtype=np.float64)), float(mask.sum())) for mask in masks]
     covered = expected.beyond > SOLID

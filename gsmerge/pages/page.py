@@ -30,7 +30,6 @@ SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-s
 POLICY = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
 NONE = "-"  # replaces a missing figure
-FASTER = 1.2  # the headline mentions a ratio of drawing times from this value on
 
 
 def view_page(data: ViewData) -> bytes:
@@ -152,7 +151,8 @@ def speed(data: ViewData, place: int = 1) -> float | None:
 
 def speed_words(ratio: float | None) -> str:
     """Return the end of the headline, rounded to one digit from 3 on; "" if a result is not clearly faster."""
-    if ratio is None or ratio < FASTER:
+    min_ratio = 1.2  # the headline mentions a ratio of drawing times from this value on
+    if ratio is None or ratio < min_ratio:
         return ""
     times = f"about {float(f'{ratio:.1g}'):.0f}" if ratio >= 3 else f"{ratio:.1f}"
     return f", {times}\u00a0\u00d7\u00a0faster to draw"

@@ -27,8 +27,6 @@ POLICY = (
 )
 NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}
 MAX_VIEWS = 64  # largest number of viewpoints in the page
-REST = 43_000  # least bytes of a page without viewer: scripts, licences, and picture and textures of one Gaussian
-LONGEST_TITLE = 255  # bytes; a title is a file name
 LICENSED = ("spark", "three", "fflate")
 
 
@@ -40,12 +38,15 @@ def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> 
 
 def least_bytes() -> int:
     """Return the least number of bytes of a page without its Gaussians: the viewer as text, and the rest."""
-    return int(4 / 3 * VIEWER.stat().st_size) + REST
+    # Least bytes of a page without viewer: scripts, licences, and picture and textures of one Gaussian
+    page_bytes = 43_000
+    return int(4 / 3 * VIEWER.stat().st_size) + page_bytes
 
 
 def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
     """Return the largest number of bytes that a page takes with any title."""
-    return len(make_page(gaussians, cameras, "x" * LONGEST_TITLE, comments).encode())
+    longest_title = 255  # bytes; a title is a file name
+    return len(make_page(gaussians, cameras, "x" * longest_title, comments).encode())
 
 
 def _read_licences() -> bytes:

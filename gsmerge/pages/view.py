@@ -27,7 +27,6 @@ from gsmerge.scene.input import as_scene
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
 from gsmerge.values.arguments import check_arguments
 
-MAX_SOLID = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
 HEIGHT = 820  # height of a page in a notebook, pixels
 
 
@@ -113,7 +112,8 @@ def view(
         for name, result in named.items()
         if (moved := getattr(result, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
     }
-    is_light = len(read.gaussians) > MAX_SOLID if light is None else light
+    max_solid = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
+    is_light = len(read.gaussians) > max_solid if light is None else light
     data = collect(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
         [_num_bytes(scene), *(_num_bytes(result) for result in loaded.values())], held_out,

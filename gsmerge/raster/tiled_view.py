@@ -28,9 +28,6 @@ NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
 # Directions are clamped at this share of the image outside its borders, as in gsplat, since the first-order projection
 # is too inexact farther out
 SPARE = 0.15
-FAR_ORIGIN = 16  # means are shifted if their centre is farther from zero than so many times their spread
-ORIGIN_SAMPLE = 4096  # least number of means, if there are as many, from which centre and spread are measured
-CACHE_LINE = 16  # float32 values per cache line
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +72,15 @@ class TiledView:
 
 def _spread_origin(means: Array) -> Array:
     """Return zero, or the centre of Gaussians if they are too far from zero for float32."""
-    sample = means[:: max(1, len(means) // ORIGIN_SAMPLE)].astype(np.float64)
+    origin_sample = 4096  # least number of means, if there are as many, from which centre and spread are measured
+    sample = means[:: max(1, len(means) // origin_sample)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
         return np.zeros(3)
     centre = medians(sample)
     spread = medians(np.abs(sample - centre)).max()
-    return centre if np.abs(centre).max() > FAR_ORIGIN * spread else np.zeros(3)
+    far_origin = 16  # means are shifted if their centre is farther from zero than so many times their spread
+    return centre if np.abs(centre).max() > far_origin * spread else np.zeros(3)
 
 
 def _shift(means: Array, origin: Array) -> Array:
@@ -172,8 +171,9 @@ def _visible(
 
 def cache_line_rows(count: int, width: int) -> Array:
     """Allocate ``[count,width]`` float32 at the start of a cache line, so that short rows do not span two lines."""
-    buffer = np.empty(count * width + CACHE_LINE, np.float32)
-    start = -(buffer.ctypes.data // buffer.itemsize) % CACHE_LINE
+    cache_line = 16  # float32 values per cache line
+    buffer = np.empty(count * width + cache_line, np.float32)
+    start = -(buffer.ctypes.data // buffer.itemsize) % cache_line
     return buffer[start : start + count * width].reshape(count, width)
 
 

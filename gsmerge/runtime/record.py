@@ -23,7 +23,6 @@ STAGES = (
 )  # fmt: skip
 FIT_STEP = "fit: "  # reports of a fit's steps begin with this
 BEFORE_FIT = 0.8  # share of the stages' seconds that pass before the fits
-MAX_NAMED = 4  # largest number of items that a note lists
 # Stages after which memory is released, since other threads have freed much of it
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
@@ -156,8 +155,9 @@ def stage(name: str) -> Iterator[None]:
 
 def list_some(items: Sequence[str], separator: str = ", ") -> str:
     """List the first items for a note, and the number of further ones."""
-    rest = f" and {len(items) - MAX_NAMED} more" if len(items) > MAX_NAMED else ""
-    return separator.join(items[:MAX_NAMED]) + rest
+    max_named = 4  # largest number of items that a note lists
+    rest = f" and {len(items) - max_named} more" if len(items) > max_named else ""
+    return separator.join(items[:max_named]) + rest
 
 
 def note(text: str) -> None:

@@ -26,7 +26,6 @@ from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # size of all photos as floats, up to which photos are not resized unless rows have no pixels
-_FLOAT_PIXEL = 12  # bytes of a pixel as three floats
 _ROUNDING = 1e-6  # pixels
 
 
@@ -140,7 +139,8 @@ def limit_photo_size(
     if size is None:
         return photos, []
     pixels = len(photos) * size[0] * size[1]
-    if not unaligned and (_FLOAT_PIXEL * pixels <= _MAX_BYTES or 2 * rows > pixels):
+    float_pixel = 12  # bytes of a pixel as three floats
+    if not unaligned and (float_pixel * pixels <= _MAX_BYTES or 2 * rows > pixels):
         return photos, []
     transform, notes = _limit(size, max_side)
     return photos if transform is None else keep_photos(transform.photos(photos)), notes

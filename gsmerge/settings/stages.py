@@ -19,7 +19,7 @@ KRule = Literal["saliency", "distortion"]
 
 SEGMENTATIONS = ("rdseg", "bass", "bass-st", "grid")
 SHARE = "4.4%"  # superpixels per pixel by default
-MAX_CHILDREN = 8
+MAX_CHILDREN = 8  # most Gaussians of a superpixel
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # K differs between groups, and is one of these values
 USUAL_K = 1  # the K of "auto", except for a single camera without a long fit
 NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours to compare; measurements: docs/internals/notebook.md

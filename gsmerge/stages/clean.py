@@ -16,10 +16,7 @@ from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
 
 BOX_QUANTILES = (1, 99)  # percentiles of the positions along each axis that bound the scene's box
-OUTLIER_BOX = 10.0  # Gaussians are far from the scene if they lie outside of a box this many times as large
 NEIGHBORS = 8  # number of nearest Gaussians; a floater touches none of them
-TOUCH = 3.0  # two Gaussians touch if their distance is at most this many times the sum of their largest scales
-APART = 3.0  # the nearest Gaussian of a floater is farther away than this many times the median distance
 # A Gaussian hangs across the scene if its second or its largest scale exceeds the first or second share in CURTAIN of
 # half the diagonal of the scene's box, and also exceeds WIDER times the median of this scale. Exports, and results
 # without a fit, have no such Gaussians
@@ -38,7 +35,8 @@ def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.nda
     """
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
     half = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
-    return np.asarray((np.abs(means - (low + high) / 2) > OUTLIER_BOX * half).any(1))
+    outlier_box = 10.0  # Gaussians are far from the scene if they lie outside of a box this many times as large
+    return np.asarray((np.abs(means - (low + high) / 2) > outlier_box * half).any(1))
 
 
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
@@ -54,7 +52,8 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     if len(means) <= NEIGHBORS:
         return np.zeros(len(rows), bool)
     nearest, touched = _nearest_of(means, sizes, rows, 1)
-    isolated = ~touched & (nearest > APART * np.median(nearest))
+    apart_factor = 3.0  # the nearest Gaussian of a floater is farther away than this many times the median distance
+    isolated = ~touched & (nearest > apart_factor * np.median(nearest))
     candidates = np.flatnonzero(isolated)  # most Gaussians touch the nearest one; few need the search for more
     if len(candidates):
         isolated[candidates] = ~_nearest_of(means, sizes, rows[candidates], NEIGHBORS)[1]
@@ -67,7 +66,9 @@ def _nearest_of(means: np.ndarray, sizes: np.ndarray, rows: np.ndarray, count: i
     ``means [n,3]`` and ``sizes [n]`` are those of all rows, of which the ``count`` nearest are near.
     """
     ids, distances = find_nearest(means, count, rows)
-    return distances[:, 0], (distances <= TOUCH * (sizes[rows, None] + sizes[ids])).any(1)
+    # Two Gaussians touch if their distance is at most this many times the sum of their largest scales
+    touch_factor = 3.0
+    return distances[:, 0], (distances <= touch_factor * (sizes[rows, None] + sizes[ids])).any(1)
 
 
 def _sorted_scales(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 # Factors on the optical depth of a group if more views see through it than have a surface at its position: ALONE if no
 # other view has a surface there, DISPUTED if some do
 ALONE, DISPUTED = 0.15, 0.39
-NEAREST_VIEWS = 64  # number of nearest views that are compared; more views hardly change the result
 
 
 def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
@@ -96,6 +95,7 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
     """Lower the optical depth of groups if more views see through them than have a surface at their position."""
     f = features
-    _, same_share, behind_share, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, NEAREST_VIEWS).T
+    nearest_views = 64  # number of nearest views that are compared; more views hardly change the result
+    _, same_share, behind_share, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, nearest_views).T
     factors = np.where(behind_share > same_share, np.where(same_share > 0, DISPUTED, ALONE), 1)
     return replace(features, gains=features.gains * factors.astype(np.float32))

@@ -30,13 +30,11 @@ from gsmerge.types import Cameras, Gaussians
 # Chosen on seven training captures
 SHARE = 0.03  # most new Gaussians, as a share of the fitted ones
 LEVEL = 8  # side of a drawing's pixel in pixels of the views; it is coarse, because the filling is blurred anyway
-BESIDE = -0.1  # position of a camera just beside the views, as a share of the distance to the nearest view
 MARGIN = 0.05  # margin of the drawings on each side, as a share of their sides
 CLEAR, SOLID = 0.1, 0.05  # transmittance above which a pixel is a gap, and below which it shows a surface
 # A surface is not continued if it is nearer than NEARER times the farthest depth in a window around the pixel, whose
 # half side is WINDOW times the width
 WINDOW, NEARER = 0.08, 0.85
-SOFT = 2.0  # standard deviation in pixels of the blur by which colours and inverse depths spread into gaps
 MOST_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
 DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # candidate depths of a Gaussian, relative to the surface's depth
 REACH = 2  # a Gaussian reaches into a picture from at most this many pixels beside it
@@ -59,7 +57,10 @@ def fill_between(
     if max_count == 0 or not 1 < len(cameras) <= MOST_VIEWS:
         return added
     cameras = _small_cameras(cameras)
-    between, splats = _widen(between_cameras(cameras, BESIDE)), make_splats(fitted)
+    # Position of a camera just beside the views, as a share of the distance to the nearest view. Chosen on seven
+    # training captures
+    beside = -0.1
+    between, splats = _widen(between_cameras(cameras, beside)), make_splats(fitted)
     if len(between) == 0:  # all views look in different directions
         return added
     drawings = parallel_map(lambda view: _draw(splats, between, view), range(len(between)))
@@ -200,7 +201,10 @@ def _spread_into_gaps(
     clear &= beyond | lies_between(known)
     image = image / np.maximum(1 - transmittance, 1e-6)[..., None]
     values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
-    sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
+    # Standard deviation in pixels of the blur by which colours and inverse depths spread into gaps. Chosen on seven
+    # training captures
+    blur_pixels = 2.0
+    sums = blur(fill_gaps(values, known) * (clear | known)[..., None], blur_pixels)[clear]
     inverse_depths, colors, weights = sums[:, 0], sums[:, 1:4], sums[:, 4]
     return clear, weights / inverse_depths, colors / weights[:, None]
 

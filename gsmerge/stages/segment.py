@@ -24,14 +24,10 @@ from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 
-DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
 DEPTH_WEIGHT = 1.0  # weight of squared relative depth errors, relative to squared colour errors (sRGB in [0, 1])
-# Weight of squared pixels, relative to squared colours; without it regions become snakes that no Gaussian fits
-COMPACTNESS = 1e-5
 # Largest side of a region, as a share of the image's longer side, because the rasterizer's affine approximation bends
 # larger Gaussians. It is exceeded only if the budget is too small for more regions.
 MAX_EXTENT = 1 / 8
-KNEE_STEP = 1.25  # the slope of the curve is measured over this factor of the count
 KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count; below it, more Gaussians gain too little
 KNEE_FLOOR = 3e-4  # squared error per pixel and channel that remains at every count (noise, views that disagree)
 
@@ -151,7 +147,9 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
         rows = np.empty((2 * count, ROW))
         start = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
         pairs = adjacent_pairs(labels)
-        return *merge_order(pairs, rows, DEPTH_WEIGHT, COMPACTNESS, extent), start, int((usable > 0).sum())
+        # Weight of squared pixels, relative to squared colours; without it regions become snakes that no Gaussian fits
+        compactness = 1e-5
+        return *merge_order(pairs, rows, DEPTH_WEIGHT, compactness, extent), start, int((usable > 0).sum())
 
     merged_views = parallel_map(merge_view, range(len(images)))
     parents, view_heights, growths, starts, num_pixels = zip(*merged_views, strict=True)
@@ -181,7 +179,8 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
     usable = valid & np.isfinite(depths)
     positive = usable & (depths > 0)
     median = float(np.median(depths[positive])) if positive.any() else 1.0
-    clipped = np.clip(depths / median, 1 / DEPTH_RANGE, DEPTH_RANGE)
+    depth_range = 1e3  # depths are clipped to this factor of the view's median
+    clipped = np.clip(depths / median, 1 / depth_range, depth_range)
     return np.ascontiguousarray(np.where(usable, clipped, 0), np.float32)
 
 
@@ -220,6 +219,7 @@ def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     order = np.argsort(counts)
     log_counts, error = log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
     quality = -10 * log10(KNEE_FLOOR + np.maximum(error, 0))
-    before = np.interp(log_counts - log(KNEE_STEP), log_counts, quality)
-    steep = (quality - before) / log(KNEE_STEP) >= KNEE_SLOPE
+    knee_step = 1.25  # the slope of the curve is measured over this factor of the count
+    before = np.interp(log_counts - log(knee_step), log_counts, quality)
+    steep = (quality - before) / log(knee_step) >= KNEE_SLOPE
     return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])

@@ -25,8 +25,6 @@ from gsmerge.settings.compact import PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
-# Earlier Gaussians that are compared with new views
-SAMPLE_GAUSSIANS = 10_000
 # A "world" is a frame of coordinates. It is another one above this ratio: the difference between the colours of the
 # foremost Gaussians and the pictures, divided by their difference from random pixels; 1 is chance. Over batches of 15
 # captures the ratio is at most .87 in the same world and .92 to 1.08 in another one. The side has to be certain.
@@ -122,7 +120,8 @@ def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
         return NOT_KNOWN
     rows, hiding = np.isfinite(np.asarray(before.means)).all(1), means[np.isfinite(means).all(1)]
     pictures = photo_array(views.images)
-    check = check_cameras(before, rows, views.cameras, pictures, SAMPLE_GAUSSIANS, foremost=True, hiding=hiding)
+    sample_gaussians = 10_000  # earlier Gaussians that are compared with new views
+    check = check_cameras(before, rows, views.cameras, pictures, sample_gaussians, foremost=True, hiding=hiding)
     margin = CERTAIN * check.ratio_error
     if check.num_compared < ENOUGH or not abs(check.color_ratio - WORLD_RATIO) > margin:
         return NOT_KNOWN

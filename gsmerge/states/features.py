@@ -39,8 +39,6 @@ from gsmerge.states.extend import NOT_COMPARED, NOT_KNOWN, BatchReport, compare_
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
 from gsmerge.version import __version__
 
-SAMPLE_STEP = 8  # pixels between samples of a view along each axis
-
 
 @dataclass(frozen=True, eq=False)
 class ViewSamples:
@@ -212,7 +210,8 @@ def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
 
 def sample_views(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
     """Sample the foremost Gaussian at the centre of each cell of a grid; with a state, use its grid."""
-    new_shape = -(-cameras.height // SAMPLE_STEP), -(-cameras.width // SAMPLE_STEP)
+    sample_step = 8  # pixels between samples of a view along each axis
+    new_shape = -(-cameras.height // sample_step), -(-cameras.width // sample_step)
     height, width = new_shape if state is None else state.samples.opacities.shape[1:]
     rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
     columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)

@@ -32,7 +32,6 @@ from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
 from gsmerge.values.words import count_words
 
 COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
-LARGEST = 1e37  # absolute value of any number; float32 ends at 3e38
 _MAX_MEMBERS = (1 << 40) - 1  # of a group; larger numbers are damaged
 
 
@@ -169,8 +168,9 @@ def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
 def _numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
     """Return a float32 array; SceneError if it has numbers that would overflow later."""
     array = file.array(name, np.float32, *shape)
-    if not (np.abs(array).max(initial=0) <= LARGEST):  # NaN fails too
-        raise file.error(f"{name}: expected finite numbers up to {LARGEST:g}, found others")
+    largest = 1e37  # absolute value of any number; float32 ends at 3e38
+    if not (np.abs(array).max(initial=0) <= largest):  # NaN fails too
+        raise file.error(f"{name}: expected finite numbers up to {largest:g}, found others")
     return array
 
 

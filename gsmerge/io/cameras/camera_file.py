@@ -22,15 +22,11 @@ from gsmerge.values.arguments import check_arguments
 # Limits of numbers in poses and intrinsics, sides and focal lengths. No camera exceeds them, and larger numbers would
 # overflow in later steps
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6
-_MAX_COEFFICIENT = 1e6  # of a lens; undistorting photos checks the effect of smaller coefficients
-_MAX_FOCAL_SIDES, _MAX_CENTRE_SIDES = 1e5, 1e3  # largest focal length and principal point, in longer sides of the image
-_MAX_ROTATION_ERROR = 0.02  # of the entries of R R^T
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
 
 # A principal point is in the middle if twice it differs by at most these pixels from the image's size
 CENTRED_PX = 1e-3
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
-_OTHER_SIZE = 0.1  # sizes are different if their sides differ by at least this share
 _WHOLE = 1e-3  # pixels; tolerance of a side that is a whole number
 MAX_NORMALISED_FOCAL = 10.0  # a longer focal length is in pixels, and no image is that small
 
@@ -51,7 +47,6 @@ COEFFICIENTS = {  # names of a lens's coefficients, in order
 # Smallest share of an undistorted photo's pixels that lie within the photo. A lens with k1 = 1 / r^2, where r is half
 # of the image's diagonal, is stronger than any real lens and still has a third
 _MIN_SHARE = 0.25
-_GRID = 32  # pixels on each side of the grid on which this share is measured
 
 
 @dataclass(frozen=True)
@@ -196,9 +191,10 @@ def _check_lens(path: StrPath, view: StoredView) -> None:
     """Raise SceneError if a coefficient of a view's lens is too large."""
     if view.lens is None:
         return
+    max_coefficient = 1e6  # of a lens; undistorting photos checks the effect of smaller coefficients
     for name, coefficient in zip(COEFFICIENTS[view.lens.model], view.lens.coefficients, strict=False):
-        if not abs(coefficient) <= _MAX_COEFFICIENT:  # also for NaN
-            problem = f"expected a lens coefficient {name} within +-{_MAX_COEFFICIENT:g}, found {coefficient:g}"
+        if not abs(coefficient) <= max_coefficient:  # also for NaN
+            problem = f"expected a lens coefficient {name} within +-{max_coefficient:g}, found {coefficient:g}"
             text = f"view {view.name}: {problem} ({view.lens.name})"
             raise SceneError(path, text, "correct it, or undistort the images first")
 
@@ -246,16 +242,19 @@ def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> N
 
 def is_orthonormal(axes: np.ndarray) -> bool:
     """Return whether axes ``[3,3]`` are orthonormal up to rounding, mirrored or not."""
-    return bool(np.abs(matmul(axes, axes.T) - np.eye(3)).max() <= _MAX_ROTATION_ERROR)
+    max_rotation_error = 0.02  # of the entries of R R^T
+    return bool(np.abs(matmul(axes, axes.T) - np.eye(3)).max() <= max_rotation_error)
 
 
 def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -> None:
     """Raise SceneError if intrinsics ``[3,3]`` in pixels do not fit an image of (width, height)."""
     if min(size) <= 1:  # not known
         return
+    # Largest focal length and principal point, in longer sides of the image
+    max_focal_sides, max_centre_sides = 1e5, 1e3
     for quantity, pixels, max_sides in (
-        ("a focal length", max(K[0, 0], K[1, 1]), _MAX_FOCAL_SIDES),
-        ("a principal point", np.abs(K[:2, 2]).max(), _MAX_CENTRE_SIDES),
+        ("a focal length", max(K[0, 0], K[1, 1]), max_focal_sides),
+        ("a principal point", np.abs(K[:2, 2]).max(), max_centre_sides),
     ):
         if pixels > max_sides * max(size):
             problem = f"expected {quantity} that fits an image of {size[0]} x {size[1]}, found {pixels:g} pixels"
@@ -312,8 +311,9 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
         return camera_file
     sides = 2 * np.median(camera_file.Ks[:, :2, 2], 0)
     ratios = sides / size
-    has_photo_shape = float(ratios.max()) < (1 + _OTHER_SIZE) * float(ratios.min())
-    if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > _OTHER_SIZE).all():
+    min_difference = 0.1  # sizes are different if their sides differ by at least this share
+    has_photo_shape = float(ratios.max()) < (1 + min_difference) * float(ratios.min())
+    if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > min_difference).all():
         return camera_file
     step = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH
     widths, heights = (np.full(len(camera_file), step * round(side / step)) for side in sides.tolist())
@@ -388,9 +388,10 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
 
 def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
     """Return the share of an undistorted photo's pixels that lie within the photo, measured on a grid."""
-    grid_K = K * np.array([_GRID / size[0], _GRID / size[1], 1.0])[:, None]
-    maps = _rectify_maps(grid_K, lens, (_GRID, _GRID))
-    return float(np.all([(axis >= -0.5) & (axis <= _GRID - 0.5) for axis in maps], 0).mean())
+    grid = 32  # pixels on each side of the grid on which the share is measured
+    grid_K = K * np.array([grid / size[0], grid / size[1], 1.0])[:, None]
+    maps = _rectify_maps(grid_K, lens, (grid, grid))
+    return float(np.all([(axis >= -0.5) & (axis <= grid - 0.5) for axis in maps], 0).mean())
 
 
 def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> PhotoArrays:

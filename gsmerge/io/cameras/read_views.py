@@ -29,7 +29,6 @@ _COEFFICIENTS = (*_DISTORTION, "k5", "k6")
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
 _FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length follows
-_MAX_MODEL = 40  # letters of a camera model's name
 
 
 def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
@@ -114,7 +113,8 @@ def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, A
         return camera
     if values.get(layout.lens) is not None:
         model = values[layout.lens]
-        camera["model"] = str(layout.models.get(model, model)).upper()[:_MAX_MODEL]
+        max_model = 40  # letters of a camera model's name
+        camera["model"] = str(layout.models.get(model, model)).upper()[:max_model]
     if values.get("is_fisheye") is not None:
         camera["is_fisheye"] = values["is_fisheye"]
     if values.get("distortion_params") is not None:

@@ -13,7 +13,6 @@ from gsmerge.errors import SceneError
 from gsmerge.io.formats import arrays
 
 UNUSED = "not used: "  # start of the note
-_MAX_NAMES, _MAX_CHARACTERS = 6, 60  # names in a list of columns, and characters of each
 _MOMENT = "save one moment as a .ply, with positions, rotations and opacities of that time"
 
 
@@ -132,6 +131,7 @@ def describes_places(name: str) -> bool:
 
 def list_names(names: Sequence[str]) -> str:
     """List the names of columns for a message: the first six names, and the number of further names."""
-    num_unlisted = len(names) - _MAX_NAMES
-    listed = ", ".join(name[:_MAX_CHARACTERS] for name in names[:_MAX_NAMES])
+    max_names, max_characters = 6, 60  # names in a list of columns, and characters of each
+    num_unlisted = len(names) - max_names
+    listed = ", ".join(name[:max_characters] for name in names[:max_names])
     return listed + (f" and {num_unlisted} more" if num_unlisted > 0 else "")

@@ -38,7 +38,6 @@ ENTRIES: Mapping[str, type] = {
     "schema": int, "gsmerge": str, "kind": str, "width": int, "height": int, "names": list, "about": dict,
 }  # fmt: skip
 NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0, by the degree
-_LEAST_SCALE = 1e-30  # scale that replaces 0, so that its logarithm is finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +166,8 @@ def read_rows(path: Path) -> StoredRows:
 
     def unpack(block: slice) -> Columns:
         part = rows[block]
-        log_scales = log(np.maximum(part.scales, _LEAST_SCALE))
+        least_scale = 1e-30  # scale that replaces 0, so that its logarithm is finite
+        log_scales = log(np.maximum(part.scales, least_scale))
         return Columns(part.means, part.quats, log_scales, part.opacities, part.sh0[:, 0], part.shN)
 
     sizes = {name: as_array(column).nbytes for name, column in vars(rows).items()}

@@ -14,7 +14,6 @@ from gsmerge.io.first_bytes import PACKAGE
 
 PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
 TIME_LIMIT = 1800  # seconds
-MAX_OUTPUT = 300  # characters of the program's own output in an error
 
 
 def find_program() -> str:
@@ -43,7 +42,8 @@ def run_program(*words: object) -> None:
         lines = (ended.stderr or ended.stdout).decode(errors="replace").strip().splitlines() or ["without output"]
         reason = next((line for line in lines if "Error: " in line), lines[-1]).rpartition("Error: ")[2]
         problem = f"expected {Path(str(words[-1])).name}, it ended with code {ended.returncode}"
-        raise GsmergeError(f"{program}: {problem}: {' '.join(reason.split())[:MAX_OUTPUT]}")
+        max_output = 300  # characters of the program's own output in an error
+        raise GsmergeError(f"{program}: {problem}: {' '.join(reason.split())[:max_output]}")
 
 
 @contextmanager

@@ -94,7 +94,7 @@ class Format:
 
 
 _page = lazy_functions("gsmerge.pages")
-_SOG = 13.0, 22.0, 36.5, 56.5
+_SOG = 13.0, 22.0, 36.5, 56.5  # bytes of a Gaussian, for harmonics of degree 0 to 3
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,

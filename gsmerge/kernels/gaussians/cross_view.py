@@ -11,7 +11,6 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i1, i4, i8, native
 
-LEAF = 16  # runs of at most so many points are not divided
 COLUMNS = 6  # of the sums of :func:`sum_cross_view`
 
 
@@ -31,7 +30,8 @@ def build_tree(points, order, axes, splits):
 
 def make_tree(points):
     """Return order, axes and splits of the tree of finite points ``[n,3]`` in C order."""
-    nodes = 4 << (len(points) // LEAF).bit_length()
+    leaf = 16  # runs of at most so many points are not divided
+    nodes = 4 << (len(points) // leaf).bit_length()
     order, axes, splits = np.arange(len(points)), np.zeros(nodes, np.int8), np.zeros(nodes)
     build_tree(points, order, axes, splits)
     return order, axes, splits

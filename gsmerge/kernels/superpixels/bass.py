@@ -12,7 +12,6 @@ import numpy as np
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, native, u1
 
 COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
-NUM_PASSES = 4  # label passes per update of the parameters
 ROW = 9  # columns of a region's parameters
 
 
@@ -75,6 +74,7 @@ def improve_labels(labels, colours, areas):
     foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
     precision = np.float32(1 / COLOUR_DEVIATION**2)
     rows = fit_regions(labels, colours, areas)
-    for _ in range(NUM_PASSES):
+    num_passes = 4  # label passes per update of the parameters
+    for _ in range(num_passes):
         if label_pass(labels, colours, rows, table, foreign, precision) == 0:
             break

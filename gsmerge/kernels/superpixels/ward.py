@@ -14,8 +14,6 @@ from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, i4, i8, u1
 from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW, region_rows
 
 INVERSE, HEIGHT = 6, 7  # columns of a region's row: 1 / n, and the cost of the merge that made it
-SAMPLE_EDGES = 4096  # edges whose costs the first ceiling is estimated from
-TIE_BREAK = 1e-7  # squared colour that the kernel adds to equal costs, so that flat pictures merge many pairs per round
 
 
 # returns the number of pairs
@@ -44,11 +42,14 @@ def _first_ceiling(pairs, rows, share):
     On photos with 1.5 to 3 times too many regions, the share of edges that are cheaper than that merge at the start is
     close to the share of regions that disappear.
     """
-    step = max(1, len(pairs) // SAMPLE_EDGES)
+    sample_edges = 4096  # edges whose costs the first ceiling is estimated from
+    step = max(1, len(pairs) // sample_edges)
     costs = np.empty(len(pairs) // step, np.float32)
     merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
     rank = min(int(share * len(costs)), len(costs) - 1)
-    return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * TIE_BREAK))
+    # Squared colour that the kernel adds to equal costs, so that flat pictures merge many pairs per round
+    tie_break = 1e-7
+    return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * tie_break))
 
 
 # returns the number of nodes

@@ -20,10 +20,7 @@ from gsmerge.io import atomic_output
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
 from gsmerge.research.charts.measure_run import INPUT
 
-MAX_NAMED = 8  # most scenes that a caption names
-
 PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
-KEY_WIDTH, KEY_LINE = 2.3, 0.135  # width of the legend, and height of its lines, inches
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7B4173", "#8C6D31")  # Okabe, Ito 2008
 MARKERS = "osD^vPX"  # their number is coprime to the number of colours
 DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # each cycle through the colours takes the next dash
@@ -109,7 +106,8 @@ def _against(results: Results, cost: str, name: str, title: str, described: str,
 def _describe_scenes(panel: Panel) -> str:
     """Describe the scenes and the intervals of a panel for the caption."""
     scenes = sorted({scene for line in panel.lines for point in line.points for scene in point.by_scene})
-    listed = f"{', '.join(scenes[:MAX_NAMED])}{', ...' if len(scenes) > MAX_NAMED else ''}"
+    max_named = 8  # most scenes that a caption names
+    listed = f"{', '.join(scenes[:max_named])}{', ...' if len(scenes) > max_named else ''}"
     if len(scenes) <= 1:
         return f"Scene: {listed}; one scene has no intervals."
     return (
@@ -159,10 +157,11 @@ def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
 def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
     """Draw a figure's panels side by side, with one legend beside them."""
     num_panels = len(figure.panels)
-    width = (SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels) + KEY_WIDTH
+    key_width, key_line = 2.3, 0.135  # width of the legend, and height of its lines, inches
+    width = (SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels) + key_width
     names = list(dict.fromkeys(line.name for panel in figure.panels for line in panel.lines))
     names += [INPUT] * (INPUT not in names and any(panel.reference is not None for panel in figure.panels))
-    size = width, max(HEIGHT, KEY_LINE * len(names))
+    size = width, max(HEIGHT, key_line * len(names))
     drawing = Drawing(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.08))
     all_axes = np.atleast_1d(drawing.subplots(1, num_panels))
     for axes, panel in zip(all_axes, figure.panels, strict=True):

@@ -24,7 +24,6 @@ from gsmerge.types import Gaussians, Scene, Views
 RUNS = "runs.jsonl"  # in the folder of a grid
 HELD_OUT = "without --targets no run sees these photos, by which all are judged"
 SCORING = ("score", "input")  # stages of a run that only measure
-MAX_DB = 100.0  # PSNR of equal pictures, since JSON has no infinity
 
 
 @dataclass(frozen=True)
@@ -135,10 +134,11 @@ def score(
     results = {} if gaussians is None else {"result": gaussians}
     evaluation = evaluate(scene, results, targets, replace(options, own=gaussians is None, fog=False))
     scores: dict[str, float] = {}
+    max_db = 100.0  # PSNR of equal pictures, since JSON has no infinity
     for split in evaluation.num_views:
         full, masked = evaluation.results[-1].mean(split)
         for part, quality in (("", full), ("_visible", masked)):
             for name, value in asdict(quality).items():
                 if value is not None and not math.isnan(value):
-                    scores[f"{name}_{split}{part}"] = min(value, MAX_DB)
+                    scores[f"{name}_{split}{part}"] = min(value, max_db)
     return scores

@@ -97,12 +97,12 @@ def generate(
 
 
 RECORD = "generated.json"
-RECORD_VERSION = 3  # increases if the same seed and options give other scenes than before
 
 
 def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
     """Return everything that a scene depends on, as plain values."""
-    return {"record_version": RECORD_VERSION, "seed": seed, "index": index, "options": options.to_dict()}
+    record_version = 3  # increases if the same seed and options give other scenes than before
+    return {"record_version": record_version, "seed": seed, "index": index, "options": options.to_dict()}
 
 
 def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:

@@ -119,7 +119,6 @@ def edge_mask(depth: Array) -> Float:
 
 
 MEAN_FILTER = np.full(7, 1 / 7, np.float32)  # averages 7 pixels
-TEXTURED = 0.05  # standard deviation of grey values, from which an area counts as detailed
 
 
 def texture_mask(image: Float) -> Float:
@@ -127,7 +126,8 @@ def texture_mask(image: Float) -> Float:
     grey = image.mean(2)
     mean, mean_square = (convolve(values, MEAN_FILTER, MEAN_FILTER) for values in (grey, grey * grey))
     deviation = np.sqrt(np.maximum(mean_square - mean * mean, 0))
-    return np.clip(deviation / TEXTURED, 0, 1)
+    min_deviation = 0.05  # standard deviation of grey values, from which an area counts as detailed
+    return np.clip(deviation / min_deviation, 0, 1)
 
 
 def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
@@ -204,14 +204,12 @@ def pixel_gaussians(view: TrueView, lens: Pinhole, noise: Noise, rng: np.random.
     scales = _pixel_scales(depth / lens.focal, noise, rng)
     opacities = noise.opacity_low + (noise.opacity_high - noise.opacity_low) * confidence
     opacities = np.clip(opacities + rng.normal(0, noise.opacity_grain, n), 0.01, 0.995)
-    image = blur(view.image, noise.color_blur) if noise.color_blur > MIN_BLUR else view.image
+    min_blur = 0.2  # least standard deviation of the smoothing of colours, pixels; smaller values change nothing
+    image = blur(view.image, noise.color_blur) if noise.color_blur > min_blur else view.image
     colors = np.clip(image.reshape(-1, 3) + rng.normal(0, noise.color_grain, (n, 3)), 0, 1).astype(np.float32)
     sh0, shN = _harmonics(colors, means, view.c2w[:3, 3], noise, rng)
     columns = (means, quats, scales, opacities, sh0, shN)
     return Gaussians(*(np.ascontiguousarray(column, dtype=np.float32) for column in columns))
-
-
-MIN_BLUR = 0.2  # least standard deviation of the smoothing of colours, pixels; smaller values change nothing
 
 
 def _pixel_scales(footprints: Array, noise: Noise, rng: np.random.Generator) -> Array:

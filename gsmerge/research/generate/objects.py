@@ -215,16 +215,14 @@ def small_object(pal: Palette) -> Shapes:
     return SMALL[pal.rng.integers(len(SMALL))](pal)
 
 
-CLEARANCE = 0.16  # least distance between the middles of small objects, metres
-
-
 def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) -> Shapes:
     """Spread small objects over a rectangle so that they do not touch, with papers and cables between them."""
     rng, out = pal.rng, []
     spots: list[Array] = []
+    clearance = 0.16  # least distance between the middles of small objects, metres
     for _ in range(count * 4):
         spot = rng.uniform(-1, 1, 2) * half
-        if len(spots) < count and all(norm(spot - occupied) > CLEARANCE for occupied in spots):
+        if len(spots) < count and all(norm(spot - occupied) > clearance for occupied in spots):
             spots.append(spot)
             out += place(small_object(pal), (spot[0], -height, spot[1]), yaw=rng.uniform(0, 2 * np.pi))
     for _ in range(rng.integers(0, count // 2 + 1)):

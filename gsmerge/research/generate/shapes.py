@@ -16,7 +16,7 @@ from gsmerge.kernels.matrices import matmul
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
 Pair: TypeAlias = tuple[float, float]
-NUM_WAVES = 4
+NUM_WAVES = 4  # waves that bend the surface of a shape
 NO_WAVES = np.zeros((NUM_WAVES, 5))
 TAPER, AMPLITUDE = 3, 4  # columns of a shape's size, and of its waves
 

@@ -105,19 +105,17 @@ def glyphs(rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
     return out
 
 
-PITCH, WORD_SPACE = 6, 4  # pixels from letter to letter, and additional pixels between words
-
-
 def text_line(rng: np.random.Generator, alphabet: NDArray[np.uint8], height: int, width: int) -> Grey:
     """Draw the ink ``[height,width]`` of one line of words."""
     line = np.zeros((7, max(6, 7 * width // height)), np.uint8)
     column = 0
-    while column < line.shape[1] - PITCH:
+    pitch, word_space = 6, 4  # pixels from letter to letter, and additional pixels between words
+    while column < line.shape[1] - pitch:
         for letter in alphabet[rng.integers(0, len(alphabet), rng.integers(2, 10))]:
-            if column < line.shape[1] - PITCH:
+            if column < line.shape[1] - pitch:
                 line[:, column : column + 5] = letter
-            column += PITCH
-        column += WORD_SPACE
+            column += pitch
+        column += word_space
     return cv2.resize(line.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
 
@@ -366,7 +364,6 @@ def pyramid(texture: Picture) -> list[Picture]:
 
 
 MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4}  # most textures of a kind in a scene
-OTHER_TEXTURES = 3  # most textures of any other kind
 
 
 @dataclass
@@ -385,7 +382,8 @@ class Palette:
         zero in about half of the cases.
         """
         kind = kinds[self.rng.integers(len(kinds))]
-        ids, limit = self.by_kind.setdefault(kind, []), MAX_TEXTURES.get(kind, OTHER_TEXTURES)
+        other_textures = 3  # most textures of any other kind
+        ids, limit = self.by_kind.setdefault(kind, []), MAX_TEXTURES.get(kind, other_textures)
         if len(ids) < limit:
             ids.append(len(self.textures))
             self.textures.append(KINDS[kind](self.rng, self.size).astype(np.float32))

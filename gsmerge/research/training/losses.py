@@ -95,9 +95,6 @@ def window_loss(
     return total
 
 
-MAX_DB = 100.0  # PSNR of windows without an error
-
-
 def draw_window(gaussians: Gaussians, window: Window, background: np.ndarray) -> Tensor:
     """Render a window ``[h,w,3]``, differentiable in the Gaussians."""
     eps2d = window.crop.example.photos.eps2d
@@ -145,7 +142,8 @@ def render_window(window: Window, networks: Networks | None, options: TrainOptio
 def window_psnr(window: Window, image: Tensor) -> float:
     """Compute the PSNR (dB) of a render ``[h,w,3]`` of a window within the mask."""
     error = float(color_loss(image, window.image, window.mask, "mse"))
-    return min(MAX_DB, -10 * float(np.log10(max(error, 1e-12))))
+    max_db = 100.0  # PSNR of windows without an error
+    return min(max_db, -10 * float(np.log10(max(error, 1e-12))))
 
 
 def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
@@ -193,7 +191,6 @@ def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
         return proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
 
 
-GOAL = 0.5  # overlap of the boxes of two children at which the loss is 0
 GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversification
 
 
@@ -239,5 +236,6 @@ def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor
     overlaps = shared / union
     contact = (a.norm(dim=1) + b.norm(dim=1)).clamp_min(1e-12)
     gaps = (away.norm(dim=1) - contact).clamp_min(0) / contact
-    apart = 0.5 * ((GOAL - overlaps) / GOAL) ** 3 + 0.5 * (1 - torch.exp(-3 * gaps))
-    return torch.where(overlaps >= GOAL, ((overlaps - GOAL) / (1 - GOAL)) ** 3, apart)
+    free_overlap = 0.5  # overlap of the boxes of two children at which the loss is 0
+    apart = 0.5 * ((free_overlap - overlaps) / free_overlap) ** 3 + 0.5 * (1 - torch.exp(-3 * gaps))
+    return torch.where(overlaps >= free_overlap, ((overlaps - free_overlap) / (1 - free_overlap)) ** 3, apart)

@@ -41,7 +41,6 @@ from gsmerge.values.arrays import Array, as_array, as_tensor
 
 TINY = 1e-12  # world units
 CONSTANT = slice(6, 8)  # columns of a group without a gradient: log of the number of members, and their mean weight
-MIN_GAP = 1e-3  # least difference of two squared scales in the gradient of axes, over the largest squared scale
 
 
 def features_to_tensors(features: FeatureGaussians) -> FeatureGaussians:
@@ -75,7 +74,8 @@ def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     change = axes.transpose(1, 2) @ (covars - covars.detach()) @ axes  # zero, with a gradient
     squares = scales.square()
     gaps = squares[:, None] - squares[:, :, None]  # [i,j]: square of j minus that of i
-    least = (MIN_GAP * squares[:, 2])[:, None, None]
+    min_gap = 1e-3  # least difference of two squared scales in the gradient of axes, over the largest squared scale
+    least = (min_gap * squares[:, 2])[:, None, None]
     spins = change * gaps / (gaps.square() + least.square()).clamp_min(1e-37)
     grown = scales + change.diagonal(dim1=1, dim2=2) / (2 * scales)
     return grown, rotate_quats(rotate_vectors(axes, skew_vectors(spins)), quats)

@@ -17,8 +17,6 @@ from gsmerge.raster.photos import NEAR_PLANE, Photos, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene, Views
 
-OPAQUE = 0.5  # least alpha of a pixel that the Gaussians cover
-
 
 @dataclass(frozen=True, eq=False)
 class TrainingScene:
@@ -86,4 +84,5 @@ def covered_pixels(covers: np.ndarray) -> np.ndarray:
     left = np.ones(covers.shape[1:], np.float32)
     for cover in covers:
         left *= 1 - cover.astype(np.float32) / 255
-    return left <= 1 - OPAQUE
+    min_alpha = 0.5  # least alpha of a pixel that the Gaussians cover
+    return left <= 1 - min_alpha
