@@ -38,7 +38,7 @@ REASONS = {
     opt.argument("scenes", list[str], "FOLDER|PATTERN|LIST...", "Folders to search for scenes, patterns such as *.ply, "
                  ".ply files, or text files with one of these per line."),
     *opt.panel(
-        opt.INPUT,
+        opt.INPUT_GROUP,
         opt.option("cameras", str, "Cameras: one path for all scenes, or a pattern in which {scene}, {parent} and "
                    "{stem} are replaced by those of each scene; none: without.", wording="beside each"),
         opt.option("images", str, "Folder of the photos: a path or such a pattern; none: without.",
@@ -60,7 +60,7 @@ REASONS = {
     "engine",
     opt.output("Folder for the results. Scenes whose results are already in it are skipped.", default=opt.REQUIRED),
     *opt.panel(
-        opt.OUTPUT,
+        opt.OUTPUT_GROUP,
         opt.option("name", str, "Name of each result; {stem}, {parent}, {index} and {k} are replaced.",
                    default="{stem}.ply", metavar="NAME"),
     ),

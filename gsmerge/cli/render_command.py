@@ -44,7 +44,7 @@ def parse_views(text: str) -> int | str:
                "clip, .mp4, .webm or .gif; a moving line separates two scenes. A folder gets a picture of each camera.",
                default=opt.REQUIRED),
     *opt.panel(
-        opt.OUTPUT,
+        opt.OUTPUT_GROUP,
         opt.option("path", str, "Path of the camera. orbit: about the middle view, orbit:45 by 45 degrees to each "
                    "side; spline: through all views. With ,back:0.5 it moves back by half of the depth. Or a file "
                    "with a camera for each frame.",

@@ -19,7 +19,7 @@ from gsmerge.cli.paths import check_outputs, input_files, write_texts
     opt.output("The page, .html. A page that gsmerge made is replaced.",
                wording="AFTER.compare.html, or BEFORE.view.html, beside it"),
     *opt.panel(
-        opt.OUTPUT,
+        opt.OUTPUT_GROUP,
         opt.switch("light", "Show BEFORE only in pictures, and AFTER in 3D; the page has a third of the size."),
     ),
     "open",

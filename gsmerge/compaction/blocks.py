@@ -53,7 +53,7 @@ T = TypeVar("T")
 # Most superpixels of a block, relative to compaction in one piece. A block takes more if views of other blocks see the
 # same surfaces
 MOST_DENSITY = 2.0
-SURPLUS = 1.03  # Gaussians of all blocks, relative to an exact number; the faintest surplus is dropped
+BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to an exact number; the faintest surplus is dropped
 
 
 def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
@@ -105,7 +105,7 @@ def compact_in_blocks(
             growth = sum(start.count for start in starts) / max(1, len(joined))
             if limit is not None and options.budget.is_filled:
                 # blocks drop new Gaussians that belong to other blocks, so each needs a surplus to reach the number
-                growth = max(growth, SURPLUS * limit / max(1, len(joined)))
+                growth = max(growth, BLOCK_SURPLUS * limit / max(1, len(joined)))
         shared_start = work.share((joined, owners))
         fitted = list(adopt_records(work.run("fit", fit_block, count, each_start(starts, shared_start, growth))))
         joined, owners = join_parts([gaussians for gaussians, _ in fitted])
@@ -242,7 +242,7 @@ def block_options(
         settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels
     if limit is not None:
-        settings["budget"] = max(1, round(SURPLUS * factor * limit * len(block.views) / len(scene)))
+        settings["budget"] = max(1, round(BLOCK_SURPLUS * factor * limit * len(block.views) / len(scene)))
     elif isinstance(superpixels, str) and superpixels.endswith("%"):
         share = min(1.0, min(factor, MOST_DENSITY) * parse_share(superpixels))
         settings["superpixels"] = share_text(round(share, 6))

@@ -32,8 +32,9 @@ COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.25  # per million Gaussians that it draws
 THREAD_GAIN = 0.35  # speed of each thread after the first, relative to the first
 TRIAL_SHARE = 0.25  # of the trial that estimates new views, as a share of building the result
-TRIES, TRIES_OF_RENDERS = 3, 1  # counts that a search usually builds, by photos and by renders of the input
-SAMPLE_GAUSSIANS = 10_000  # from which the mean share inside a view is estimated
+# Counts that a search usually builds, by photos and by renders of the input
+USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
+INSIDE_GAUSSIANS = 10_000  # from which the mean share inside a view is estimated
 PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
 
 
@@ -79,7 +80,7 @@ class RunCosts:
 
 def mean_inside(scene: Scene) -> float:
     """Measure the mean share of a scene's Gaussians that lie in a view, on a sample; 1 without views."""
-    return float(np.mean(shares_inside(scene, SAMPLE_GAUSSIANS) or [1.0]))
+    return float(np.mean(shares_inside(scene, INSIDE_GAUSSIANS) or [1.0]))
 
 
 def expected_parts(
@@ -91,7 +92,7 @@ def expected_parts(
     ``has_target``: counts are tried until a PSNR is met. ``has_curve``: the scene's curve is measured first, down to
     a loss of ``max_drop`` dB. ``rendered``: renders of the input stand for photos.
     """
-    tries = (TRIES_OF_RENDERS if rendered else TRIES) if has_target else 1
+    tries = (USUAL_BUILDS_OF_RENDERS if rendered else USUAL_BUILDS) if has_target else 1
     parts = [costs.build(count)] * tries
     if has_curve and not (has_target or rendered):
         shares, steps = (KNEE_SHARES, KNEE_STEPS) if max_drop is None else (DROP_SHARES, DROP_STEPS)

@@ -15,8 +15,8 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Cameras, Gaussians
 
-SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
-TRIES, MAX_REBUILDS = 8, 2  # files that are measured to choose what is dropped; builds after the first one
+BUILD_SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
+MOST_MEASURED, MAX_REBUILDS = 8, 2  # files that are measured to choose what is dropped; builds after the first one
 
 
 Rebuild = Callable[[int | None], Candidate]  # a count -> a candidate of all views, built, cleaned up and scored
@@ -51,9 +51,9 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
         # unseen Gaussians were dropped from the requested number; the bytes that they free are not filled up
         requested = max(count, built[-1].count or 0)
         full_size = rest + (size - rest) * requested / max(count, 1)  # bytes with the dropped Gaussians
-        room = min(int(SURPLUS * count * (max_bytes - rest) / max(size - rest, 1)), plan.limits.most)
+        room = min(int(BUILD_SURPLUS * count * (max_bytes - rest) / max(size - rest, 1)), plan.limits.most)
         near_share = 0.97  # share of the size that a build has to reach
-        is_near = full_size >= near_share * max_bytes or room <= SURPLUS * requested
+        is_near = full_size >= near_share * max_bytes or room <= BUILD_SURPLUS * requested
         most_dropped = 0.08  # largest share of the Gaussians that is dropped after the last build
         fits = room >= (1 - most_dropped) * count and is_near
         return None if fits or len(built) > MAX_REBUILDS else room
@@ -84,7 +84,7 @@ def drop_to_bytes(
     low, high = 0, len(gaussians)  # counts: the largest that is known to fit, and the largest that may fit
     best, count = gaussians[:0], len(gaussians)
     full_share = 0.985  # no further Gaussian is put back from this share of the size on
-    for _ in range(TRIES):
+    for _ in range(MOST_MEASURED):
         trial = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
         size = measure_bytes(trial, file, cameras, names)
         if size <= max_bytes:

@@ -20,7 +20,7 @@ from gsmerge.runtime.record import add_seconds, begin_part, choose, record_part,
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-FOREIGN = 0.1  # a Gaussian is at a seam if more than this share of its weights is in views of other blocks
+FOREIGN_SHARE = 0.1  # a Gaussian is at a seam if more than this share of its weights is in views of other blocks
 SEAM_VIEW_STEPS = 2  # steps for each view
 # Blocks are parts of one room if at least the share ROOM_SHARE of the Gaussians is at seams. Then each view gets
 # ROOM_VIEW_STEPS steps
@@ -75,7 +75,7 @@ def find_seams(
     for number, _, ids, weights in _view_weights(splats, starts):
         total[ids] += weights
         foreign[ids] += np.where(owners[ids] == number, 0, weights)
-    at_seam = foreign > FOREIGN * total
+    at_seam = foreign > FOREIGN_SHARE * total
     seam_share = 0.1  # seams are fitted to a view if more than this share of its weights is on Gaussians at seams
     # measured a second time, because the weights of all views would not fit into memory
     for number, view, ids, weights in _view_weights(splats, starts):

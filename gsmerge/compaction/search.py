@@ -30,19 +30,17 @@ from gsmerge.runtime.record import begin_part, choose, current_record, note, rec
 from gsmerge.stages.segment import knee_count
 
 # dB of PSNR per doubling of the count, assumed until two counts were tried: against photos, and against renders
-SLOPE, RENDERS_SLOPE = 1.0, 3.0
-CLOSE = 1.15  # two counts are the same up to this ratio
-NEAR_DB = 0.6  # a count is near enough at this many dB above a target for renders, which is CLOSE at their slope
+PHOTOS_SLOPE, RENDERS_SLOPE = 1.0, 3.0
+SAME_COUNT_RATIO = 1.15  # two counts are the same up to this ratio
+# A count is near enough at this many dB above a target for renders, which is SAME_COUNT_RATIO at their slope
+NEAR_DB = 0.6
 # The same bound for photos that decide the default count. It is less than FIDELITY_LOSS, because the whole input has no
 # loss at all
 PHOTOS_NEAR_DB = 0.2
 MAX_RUNS = 6  # most builds of a search
-# Bounds of a search by left-out photos. Its slope is the mean of eleven captures below the usual count; a count is near
-# enough at half of a doubling
-MAX_TRIED = 3  # most builds, in addition to the build of the result
-FAR_DB = (
-    6.0  # PSNR is cut at this many dB above a target: larger values, as of the whole input, say little of the slope
-)
+MAX_TRIED = 3  # most builds of a search by left-out photos, in addition to the build of the result
+# PSNR is cut at this many dB above a target, because larger values, as of the whole input, say little of the slope
+FAR_DB = 6.0
 
 T = TypeVar("T")
 
@@ -108,11 +106,13 @@ class CountSearch:
     def _expected_slope(self) -> tuple[float, float]:
         """Return the dB per doubling of the count to assume at first, and the dB above the target that are enough."""
         if self.left_out is not None:
-            left_out_slope, left_out_near_db = 0.3, 0.15  # dB per doubling of the count; dB above a target
+            # dB per doubling of the count, the mean of eleven captures below the usual count; and dB above a target, at
+            # which a count is near enough, since that is half of a doubling
+            left_out_slope, left_out_near_db = 0.3, 0.15
             return left_out_slope, left_out_near_db
         if self.rendered:
             return RENDERS_SLOPE, NEAR_DB
-        return SLOPE, PHOTOS_NEAR_DB if self.plan.keeps_fidelity else 0.0
+        return PHOTOS_SLOPE, PHOTOS_NEAR_DB if self.plan.keeps_fidelity else 0.0
 
     @property
     def tried(self) -> dict[int, float]:
@@ -284,7 +284,7 @@ def level_counts(finest: int, plan: Plan) -> list[int]:
 
 
 def next_count(
-    tried: Mapping[int, float], target: float, least: int, most: int, slope: float = SLOPE, near: float = 0.0
+    tried: Mapping[int, float], target: float, least: int, most: int, slope: float = PHOTOS_SLOPE, near: float = 0.0
 ) -> int:
     """Choose the next count to try in the search for the fewest Gaussians that reach a PSNR, within 15 %.
 
@@ -297,7 +297,7 @@ def next_count(
     if above is not None and tried[above] <= target + near:
         return above
     if above is not None and below is not None:
-        if above <= below * CLOSE:
+        if above <= below * SAME_COUNT_RATIO:
             return above
         width = float(log(above / below))  # of the interval between the two counts; PSNR is linear in it
         rise = (min(tried[above], target + FAR_DB) - tried[below]) / width

@@ -25,7 +25,7 @@ from gsmerge.geometry.transforms import (
     move_views,
     without_common_motion,
 )
-from gsmerge.kernels.compare_views import COLUMNS, compare_views
+from gsmerge.kernels.compare_views import SCRATCH_COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur
 from gsmerge.kernels.raster.sh import view_colors
@@ -36,13 +36,13 @@ from gsmerge.types import PicturedScene
 
 SIDES = (60, 120, 240)  # longer side of the photos in pixels, one size after the other
 BORDER = 2  # width in pixels of the border that is not compared
-SAMPLE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
+POSE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
 # Compared pixels of a view, and most steps, at the first size. They are fewer, because right poses need them as well
 FIRST_PIXELS, FIRST_STEPS = 600, 2
-NEIGHBOURS = 4  # other views with which a view is compared
-STEPS = 6  # most Gauss-Newton steps at each size
+POSE_NEIGHBOURS = 4  # other views with which a view is compared
+POSE_STEPS = 6  # most Gauss-Newton steps at each size
 TOGETHER = 16  # pairs per task
-BLUR = 0.7  # blur of the photos, standard deviation in pixels
+POSE_BLUR = 0.7  # blur of the photos, standard deviation in pixels
 # Detail of photos is finer than this blur, in pixels. Highlights are smooth, and move with the camera as if its pose
 # were wrong. If poses follow them, what is drawn on the surfaces agrees less, by more than CHANCE standard errors
 DETAIL, CHANCE = 2.0, 2.0
@@ -100,12 +100,12 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     viewmats = start
     for side in sides:
         check = side == sides[0] != sides[-1] and not always
-        level = _make_level(scene, pairs, largest / side, FIRST_PIXELS if check else SAMPLE_PIXELS)
+        level = _make_level(scene, pairs, largest / side, FIRST_PIXELS if check else POSE_PIXELS)
         viewmats, final = _descend(level, viewmats, check=check)
         before = _compare(level, start)
         if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, final, end=side == sides[-1])):
             return None
-    detail = _make_level(scene, pairs, largest / sides[-1], SAMPLE_PIXELS, detail=True)
+    detail = _make_level(scene, pairs, largest / sides[-1], POSE_PIXELS, detail=True)
     worse = _compare(detail, viewmats).costs - _compare(detail, start).costs
     if not always and worse.sum() > CHANCE * np.sqrt((worse * worse).sum()):
         return None
@@ -130,7 +130,7 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
         cosines = matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3])  # of the viewing directions
         overlap = seen_shares * cosines.clip(0)
         ranked = [int(i) for i in np.argsort(-overlap, kind="stable") if i != view and i in candidates]
-        for neighbour in ranked[:NEIGHBOURS]:
+        for neighbour in ranked[:POSE_NEIGHBOURS]:
             if overlap[neighbour] > min_overlap:
                 pairs |= {(view, neighbour), (neighbour, view)}
     return np.array(sorted(pairs), np.int64)
@@ -151,7 +151,7 @@ def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: 
 
     def sample_view(view: int) -> tuple[np.ndarray, ...]:
         grey = photos.images[view].mean(-1, dtype=np.float32)
-        grey = blur(grey, BLUR) - (blur(grey, DETAIL) if detail else np.float32(0))
+        grey = blur(grey, POSE_BLUR) - (blur(grey, DETAIL) if detail else np.float32(0))
         down, right = np.gradient(grey)
         rows = fronts[view][nearest]
         depth = camera_depths(means[rows], scene.cameras.viewmats[view])
@@ -196,7 +196,7 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
 
     ``check``: take few steps, and only one step if it moves no view far.
     """
-    max_steps = FIRST_STEPS if check else STEPS
+    max_steps = FIRST_STEPS if check else POSE_STEPS
     early_px = 1.0  # poses are considered right if the first step moves all views by less than this, in pixels
     min_step = 1e-4  # a smaller step, in radians and canonical units, is the last
     for step in range(max_steps + 1):
@@ -236,7 +236,7 @@ def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
         compare_views(
             level.points, level.greys, level.starts, level.pairs, viewmats, level.start, level.Ks, level.pictures,
             level.depths, NEAR_PLANE, BORDER, level.scale, begin, min(begin + TOGETHER, count),
-            np.empty((COLUMNS, max_points)), np.empty(max_points, np.int64), *vars(evidence).values(),
+            np.empty((SCRATCH_COLUMNS, max_points)), np.empty(max_points, np.int64), *vars(evidence).values(),
         )  # fmt: skip
 
     parallel_map(compare_pairs, range(0, count, TOGETHER))

@@ -17,7 +17,8 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, make_scene
 
-LEAST = FitOptions().min_contribution  # a view shows a Gaussian from this blending weight in a pixel on, as in a fit
+# A view shows a Gaussian from this blending weight in a pixel on, as in a fit
+SHOWN_WEIGHT = FitOptions().min_contribution
 
 
 def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
@@ -33,7 +34,7 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
     def list_shown(view: int) -> np.ndarray:
         tiled = tile_view(splats, **pictures.camera(view))
-        return tiled.ids[list_contributions(tiled)[1] >= LEAST]
+        return tiled.ids[list_contributions(tiled)[1] >= SHOWN_WEIGHT]
 
     counts = np.zeros(len(gaussians), np.int32)
     for shown in in_turn(list_shown, range(len(pictures))):

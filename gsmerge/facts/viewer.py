@@ -22,7 +22,8 @@ ALIKE = 0.5  # angles have to vary less than half as much as sizes, as logarithm
 # from both sides
 LIKELY = 1.1
 CELLS = 100  # directions, half of which the scene has to cover
-FREE, NEAR = 0.25, 0.05  # free radius around a viewer, as a share of the distance that so few Gaussians fall short of
+# Free radius around a viewer, as a share of the distance that so few Gaussians fall short of
+FREE, NEAR_SHARE = 0.25, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ def find_viewer(gaussians: Gaussians) -> Viewer | None:
     angles = sizes / distances
     if 2 * num_cells < CELLS or _spread(angles) >= ALIKE * _spread(sizes):
         return None
-    return Viewer(place, FREE * float(np.quantile(distances, NEAR)), median(angles))
+    return Viewer(place, FREE * float(np.quantile(distances, NEAR_SHARE)), median(angles))
 
 
 def _look_around(means: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:

@@ -18,8 +18,8 @@ from gsmerge.types import PicturedScene, Scene
 
 MIN_AUTO_SCALE = 1.25  # least scale that "auto" uses; below it photos have the size of the views
 MAX_GAIN = 2.0  # largest exposure factor that scores compensate
-PATCH = 32  # side of a held-out patch, pixels, at most
-HIDDEN = np.float32(1e-9)  # weight of pixels that neither count nor are held out
+PATCH_PIXELS = 32  # side of a held-out patch, pixels, at most
+HIDDEN_WEIGHT = np.float32(1e-9)  # weight of pixels that neither count nor are held out
 
 
 def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
@@ -104,7 +104,7 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
     """Return training weights ``[h,w]`` float32 per view: 0 on held-out patches, the photo's weights elsewhere.
 
-    Pixels with a weight below 1 are not held out; a weight of 0 is replaced by ``HIDDEN``.
+    Pixels with a weight below 1 are not held out; a weight of 0 is replaced by ``HIDDEN_WEIGHT``.
     """
     return [training_weight(photos, view, share, seed) for view in range(len(photos))]
 
@@ -114,7 +114,7 @@ def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.nd
 
     If the photo counts in several patches, at least one of them is held out.
     """
-    size = max(1, min(PATCH, min(photos.height, photos.width) // 4))
+    size = max(1, min(PATCH_PIXELS, min(photos.height, photos.width) // 4))
     rows, columns = -(-photos.height // size), -(-photos.width // size)
     random = np.random.default_rng([seed, view])
     counting = np.ones((rows, columns), bool) if photos.weights is None else _counting_patches(photos, view, size)
@@ -127,7 +127,7 @@ def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.nd
     if photos.weights is None:
         return full.astype(np.float32)
     weights = photos.weights[view]
-    return np.where(weights == 1, full.astype(np.float32), np.maximum(weights, HIDDEN))
+    return np.where(weights == 1, full.astype(np.float32), np.maximum(weights, HIDDEN_WEIGHT))
 
 
 def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.fit.edges import Edges
 from gsmerge.fit.outside import Outside
-from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
+from gsmerge.fit.photo_sizes import HIDDEN_WEIGHT, reduced, training_weights
 from gsmerge.kernels.elementary import power
 from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
@@ -87,8 +87,8 @@ class FitRun:
     """A prepared full fit: weights of the pixels, dropout, and the share of the first steps."""
 
     job: FitJob
-    # [h,w] float32 weights of each photo at half size: 0 on held-out patches, if the fit is scored on them, `HIDDEN` on
-    # pixels that neither steps nor scores use, 1 elsewhere
+    # [h,w] float32 weights of each photo at half size: 0 on held-out patches, if the fit is scored on them,
+    # `HIDDEN_WEIGHT` on pixels that neither steps nor scores use, 1 elsewhere
     weights: list[np.ndarray]
     # [h,w] float32 weights in steps, of each photo at each size: 0 on hidden pixels, elsewhere the importance of the
     # pixel. Held-out patches are 0 only at half size
@@ -145,9 +145,9 @@ def prepare_fit(job: FitJob) -> FitRun:
     first_pixels = None
     if options.scored:
         whole = training_weights(photos[0], options.holdout, job.seed)
-        first_pixels = tuple((weight != 0) & (weight != HIDDEN) for weight in whole)
+        first_pixels = tuple((weight != 0) & (weight != HIDDEN_WEIGHT) for weight in whole)
         weights = reduced(whole, photos[1])
-        train_weights = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
+        train_weights = [np.where(weight == HIDDEN_WEIGHT, np.float32(0), weight) for weight in weights]
         if len(photos[0]) == 1:  # no other photo shows the held-out patches, so the fit is scored on all pixels
             weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
     step_weights = everywhere, _weigh(train_weights, photos[1]), *larger

@@ -110,7 +110,7 @@ class StepBuffers:
         spans, tiles, corners = 2 * self.threads, columns * lines, (columns + 1) * (lines + 1)
         shapes: dict[str, tuple[int, ...]] = {
             "image": (height, width, 3), "gradient": (height, width, 3), "transmittance": (height, width),
-            "errors": (height,), "terms": (self.threads, image_loss.ROWS, image_loss.TERMS, line),
+            "errors": (height,), "terms": (self.threads, image_loss.DERIVATIVE_ROWS, image_loss.TERMS, line),
             "rows": (self.threads, image_loss.EDGE_ROWS, line), "light": (tiles,),
         }  # fmt: skip
         counts = {"corners": (spans, corners), "counts": (spans, tiles), "offsets": (tiles + 1,)}

@@ -18,8 +18,9 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
 MOST_SCORED = 12  # most photos that a fit is scored on
-ENOUGH = 6  # a survey has enough photos of a Gaussian if its centre is inside this many of them
-FEWER = 0.03  # a photo is added to a survey if more than this share of its Gaussians has fewer photos than ENOUGH
+ENOUGH_PHOTOS = 6  # a survey has enough photos of a Gaussian if its centre is inside this many of them
+# A photo is added to a survey if more than this share of its Gaussians has fewer photos than ENOUGH_PHOTOS
+FEWER_SHARE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +74,7 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
 def choose_views(gaussians: Gaussians, photos: Photos) -> list[int]:
     """Choose the photos of a survey: the scored photos, and further ones.
 
-    A photo is added if it shows many Gaussians with fewer than ``ENOUGH`` photos so far.
+    A photo is added if it shows many Gaussians with fewer than ``ENOUGH_PHOTOS`` photos so far.
     """
     sample_gaussians = 4096  # the photos are chosen by at most about twice this many Gaussians
     means = gaussians.means[:: max(1, len(gaussians) // sample_gaussians)]
@@ -82,7 +83,7 @@ def choose_views(gaussians: Gaussians, photos: Photos) -> list[int]:
     views = scored_views(len(photos))
     num_photos = inside[views].sum(0)
     for view in spread_views(len(photos)):
-        if view not in views and (inside[view] & (num_photos < ENOUGH)).sum() > FEWER * inside[view].sum():
+        if view not in views and (inside[view] & (num_photos < ENOUGH_PHOTOS)).sum() > FEWER_SHARE * inside[view].sum():
             views.append(view)
             num_photos += inside[view]
     return sorted(views)

@@ -21,12 +21,13 @@ from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 from gsmerge.values.arrays import Array
 
 State = TypeVar("State")  # state that a descent changes
-DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
+SH_DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
 # More values than the first number are narrowed down before the median is taken: to those between two shares of a
 # sample of about the second number, which are so far from a half that the median is practically always between them
 FEW_VALUES, SAMPLE_VALUES, AROUND_MEDIAN = 1 << 17, 1 << 14, (0.47, 0.53)
+NORMAL_SPREAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
 NEAREST_ROWS = 1 << 14  # points per task of a search for the nearest ones
-BRIGHT = np.float32(20.0)  # harmonic of degree 0 so large that no colour is clipped at 0
+BRIGHT_SH0 = np.float32(20.0)  # harmonic of degree 0 so large that no colour is clipped at 0
 
 
 def quat_to_rotmat(quats: np.ndarray) -> np.ndarray:
@@ -351,7 +352,7 @@ def harmonics_rotation(num: int, rotation: np.ndarray) -> np.ndarray:
 
     Each degree is fitted to the same colours in rotated directions, which is exact.
     """
-    directions = normalize(np.random.default_rng(0).normal(size=(DIRECTIONS, 3)))
+    directions = normalize(np.random.default_rng(0).normal(size=(SH_DIRECTIONS, 3)))
     before = harmonics_in(matmul(directions, rotation), num)
     after = harmonics_in(directions, num)
     return solve(matmul(after.T, after), matmul(after.T, before))
@@ -367,7 +368,7 @@ def harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
     """Evaluate the higher harmonics in directions ``[d,3]``; return ``[d,num]`` float64."""
     means = directions.astype(np.float32)
     count = len(means)
-    sh0 = np.full((count, 1, 3), BRIGHT)
+    sh0 = np.full((count, 1, 3), BRIGHT_SH0)
     ids = np.arange(count, dtype=np.int32)
     degree0_colors = np.empty((count, 3), np.float32)
     colors = np.empty((count, 3), np.float32)

@@ -19,7 +19,7 @@ from gsmerge.geometry.transforms import (
 from gsmerge.io.cameras.viewer_cameras import order_views
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.measure.fog import CAMERAS
+from gsmerge.measure.fog import FOG_CAMERAS
 from gsmerge.types import Cameras
 
 PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
@@ -109,7 +109,7 @@ def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]
     Returns one of the cameras of :mod:`gsmerge.measure.fog`, and its distance, in world units, from the pivot of its
     turn.
     """
-    back, turn = CAMERAS["turned"][-1]
+    back, turn = FOG_CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
     viewmat = step_outside(middle.viewmats[0], depth, back, turn)
     return replace(middle, viewmats=viewmat[None]), (1 + back) * depth

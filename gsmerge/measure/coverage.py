@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.measure.visibility import MAX_SAMPLE_GAUSSIANS, inside_views
+from gsmerge.measure.visibility import VISIBILITY_GAUSSIANS, inside_views
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.types import Gaussians, Scene
@@ -25,7 +25,7 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
     names = ("diagonal", "share_outliers", "share_floaters", "scale_median", "scale_max", "share_huge")
     if len(gaussians) == 0:
         return {"box_low": [0.0] * 3, "box_high": [0.0] * 3, **dict.fromkeys(names, 0.0)}
-    step = -(-len(gaussians) // MAX_SAMPLE_GAUSSIANS)
+    step = -(-len(gaussians) // VISIBILITY_GAUSSIANS)
     points, largest = gaussians.means[::step].astype(np.float64), gaussians.scales.max(1)
     low, high = np.percentile(points, BOX_QUANTILES, axis=0)
     diagonal = np.linalg.norm(high - low)
@@ -47,7 +47,7 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
     """
     if len(scene) == 0:
         return []
-    shares = shares_inside(scene, MAX_SAMPLE_GAUSSIANS)
+    shares = shares_inside(scene, VISIBILITY_GAUSSIANS)
     pixels: list[float | None] = [None] * len(scene)
     if scene.has_own_pixels:
         grid, covered = scene.get_pixels(), scene.covered

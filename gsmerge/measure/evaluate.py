@@ -20,7 +20,7 @@ from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.photos.views import pick_views
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
-from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
+from gsmerge.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.input import check_scene
@@ -179,7 +179,7 @@ class _Renderer:
         Also return a mask ``[h,w]`` of the pixels in which the Gaussians have an opacity of at least a half.
         """
         drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.options.antialiased)
-        return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED)
+        return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED_TRANSMITTANCE)
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
         """Render one view ``[h,w,3]``."""
@@ -381,7 +381,7 @@ def _score_view(
     """Add to a score the quality of a render over all pixels, over the seen pixels, and over the ``covered`` pixels."""
     photo, seen = split.views.images[view], split.visible[view]
     share = None if covered is None else float(covered.mean())
-    inside = covered if share is not None and share < WHOLE else None
+    inside = covered if share is not None and share < WHOLE_SHARE else None
     full, masked, covered_quality = _qualities(image, photo, (None, seen, inside))
     full, masked = _add_lpips((full, masked), image, photo, seen, nets)
     score = replace(score, full=full, masked=masked)

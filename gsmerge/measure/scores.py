@@ -9,7 +9,7 @@ from typing import Any
 from gsmerge.measure.documents import csv_text, document_head, note_entries, text_table, wrap_line
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.measure.fog import ALL, Fog
-from gsmerge.raster.photos import WHOLE
+from gsmerge.raster.photos import WHOLE_SHARE
 from gsmerge.runtime.memory import human_bytes, human_share
 
 Row = Sequence[str]
@@ -19,17 +19,18 @@ KINDS = {"context": "input", "target": "held-out"}  # words for the views of a s
 SIMPLE = ("psnr", "ssim")  # measures that are also taken over the pixels that the input covers
 COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
-OUTSIDE = {
+OUTSIDE_COLUMNS = {
     "fog_near": "near fog", "fog_far": "far fog", "holes": "holes", "veil": "veil", "veil_worst": "worst veil",
     "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
 # Columns that a narrow terminal omits, in this order
 OMITTED_FIRST = ("bytes each", "smaller by", "ms/view", "kept")
-MASKED = "_visible"  # suffix of measures over the pixels that the input views have seen
-COVERED = "_covered"  # suffix of measures over the pixels that the input covers
+MASKED_SUFFIX = "_visible"  # suffix of measures over the pixels that the input views have seen
+COVERED_SUFFIX = "_covered"  # suffix of measures over the pixels that the input covers
 CSV_COLUMNS = (
     "schema_version", "result", "num_gaussians", "ratio", "split", "view", "visible_share",
-    *METRICS, *(name + MASKED for name in METRICS), *(name + COVERED for name in ("share", *SIMPLE)), *OUTSIDE,
+    *METRICS, *(name + MASKED_SUFFIX for name in METRICS), *(name + COVERED_SUFFIX for name in ("share", *SIMPLE)),
+    *OUTSIDE_COLUMNS,
 )  # fmt: skip
 
 
@@ -89,13 +90,13 @@ def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, An
 
 def _covered(share: float | None, quality: Quality) -> dict[str, float | None]:
     """Convert the share of covered pixels and the scores over them."""
-    return {"share" + COVERED: share} | {name + COVERED: getattr(quality, name) for name in SIMPLE}
+    return {"share" + COVERED_SUFFIX: share} | {name + COVERED_SUFFIX: getattr(quality, name) for name in SIMPLE}
 
 
 def _flat(pair: Pair) -> dict[str, float | None]:
     """Convert the scores over all and over visible pixels to one dictionary."""
     full, masked = map(asdict, pair)
-    return full | {name + MASKED: value for name, value in masked.items()}
+    return full | {name + MASKED_SUFFIX: value for name, value in masked.items()}
 
 
 def evaluation_csv(document: Mapping[str, Any]) -> str:
@@ -103,7 +104,7 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
     rows = []
     for result in document["results"]:
         shared = {"schema_version": document["schema_version"], "result": result["name"]}
-        shared |= {name: result[name] for name in ("num_gaussians", "ratio", *OUTSIDE)}
+        shared |= {name: result[name] for name in ("num_gaussians", "ratio", *OUTSIDE_COLUMNS)}
         rows += [shared | view for view in result["views"]]
     return csv_text(CSV_COLUMNS, rows)
 
@@ -118,9 +119,9 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     )
     for split in document["num_views"]:
         yield from _quality_tables(document, split)
-    outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
+    outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE_COLUMNS)) for result in results]
     heading = "Faults seen from outside that the input does not have: shares of the picture, less is better"
-    yield heading, ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
+    yield heading, ("", *OUTSIDE_COLUMNS.values()), [row for row in outside if any(row[1:])]
 
 
 def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[Table]:
@@ -137,10 +138,10 @@ def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[Table]:
     )
     yield f"{views}, {seen}", ("", *COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
     input_mean = next(iter(results[0]["mean"].values()))  # over the input views, if they are measured
-    lacks_pixels = (input_mean["share" + COVERED] or 1) < WHOLE
+    lacks_pixels = (input_mean["share" + COVERED_SUFFIX] or 1) < WHOLE_SHARE
     heading = f"{views}, over the pixels that the input covers"
     yield heading, ("", "of all", *(COLUMNS[name] for name in SIMPLE)), [
-        (name, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, SIMPLE, COVERED))
+        (name, f"{100 * mean['share' + COVERED_SUFFIX]:.0f} %", *_cells(mean, SIMPLE, COVERED_SUFFIX))
         for name, mean in means if lacks_pixels
     ]  # fmt: skip
 
@@ -167,7 +168,7 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
     )
 
 
-def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED) -> Iterator[str]:
+def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED_SUFFIX) -> Iterator[str]:
     """Format the figures over visible pixels, or those with another ``suffix``; missing figures become ""."""
     for name in names:
         yield _number(score[name + suffix], 2 if name == "psnr" else 3)

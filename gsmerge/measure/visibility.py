@@ -16,7 +16,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
 Points = NDArray[np.float64]  # [n,3]
-MAX_SAMPLE_GAUSSIANS = 200_000  # largest sample on which a share is measured
+VISIBILITY_GAUSSIANS = 200_000  # largest sample on which a share is measured
 _CHUNK = 1 << 16  # points processed at a time; the first ones often show all pixels
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from gsmerge.geometry.pooling import Members, feature_to_gaussians
 from gsmerge.kernels.networks.tokens import describe_groups, describe_parts, place_frames
 from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
-from gsmerge.networks.options import GROUP, MEMBER, PART
+from gsmerge.networks.options import GROUP_COLUMNS, MEMBER_COLUMNS, PART_COLUMNS
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, as_array
 
@@ -30,7 +30,7 @@ class GroupFeatures:
     sizes: Array  # [g] geometric mean of the two largest scales, world units
     footprints: np.ndarray  # [g] size of one pixel, world units
     views: np.ndarray  # [g] int64 view of the frame
-    group: Array  # [g,GROUP] numbers that describe the whole group
+    group: Array  # [g,GROUP_COLUMNS] numbers that describe the whole group
 
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
@@ -48,21 +48,21 @@ def describe_features(
     ``views [g]`` is the view of each Feature Gaussian, ``num_members [g]`` its number of members, and ``stats [g,7]``
     its agreement with other views.
     """
-    bare = make_group_features(features, views, np.zeros((len(features), GROUP), np.float32), cameras)
-    base, group = bare.base, np.empty((len(features), GROUP), np.float32)
+    bare = make_group_features(features, views, np.zeros((len(features), GROUP_COLUMNS), np.float32), cameras)
+    base, group = bare.base, np.empty((len(features), GROUP_COLUMNS), np.float32)
     sums = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
     describe_groups(
         base.means, base.scales, base.opacities, base.sh0, *sums, num_members, bare.footprints,
         bare.frames, bare.sizes, _viewmats(cameras), views, group,
     )  # fmt: skip
-    group[:, GROUP - NUM_STATS :] = np.nan_to_num(stats)
+    group[:, GROUP_COLUMNS - NUM_STATS :] = np.nan_to_num(stats)
     return replace(bare, group=group)
 
 
 def make_group_features(
     features: FeatureGaussians, views: np.ndarray, group: np.ndarray, cameras: Cameras
 ) -> GroupFeatures:
-    """Assemble the networks' inputs from known ``views [g]`` and numbers ``group [g,GROUP]``."""
+    """Assemble the networks' inputs from known ``views [g]`` and numbers ``group [g,GROUP_COLUMNS]``."""
     base = contiguous(feature_to_gaussians(features))
     frames, sizes = np.empty((len(features), 3, 3), np.float32), np.empty(len(features), np.float32)
     place_frames(base.means, base.scales, _viewmats(cameras), views, frames, sizes)
@@ -99,17 +99,21 @@ def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras)
 
 
 def part_tokens(
-    parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures, columns: int = PART
+    parts: Gaussians | Members,
+    ids: np.ndarray,
+    owners: np.ndarray,
+    group_features: GroupFeatures,
+    columns: int = PART_COLUMNS,
 ) -> np.ndarray:
     """Make tokens that describe the Gaussians ``ids [n]`` relative to their groups ``owners [n]``.
 
-    Returns ``[n,columns]``. The first PART columns are written for all Gaussians, the others up to MEMBER only for
-    members.
+    Returns ``[n,columns]``. The first PART_COLUMNS columns are written for all Gaussians, the others up to
+    MEMBER_COLUMNS only for members.
     """
     g, out = group_features, np.zeros((len(ids), columns), np.float32)
     describe_parts(
         parts.means, parts.quats, parts.scales, parts.opacities, parts.sh0, g.base.means, g.base.sh0, g.frames,
-        g.sizes, g.footprints, ids.astype(np.int64, copy=False), owners, columns == MEMBER, out,
+        g.sizes, g.footprints, ids.astype(np.int64, copy=False), owners, columns == MEMBER_COLUMNS, out,
     )  # fmt: skip
     return out
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     import jinja2
 
 # Content security policy: a page may run only its own scripts and styles, which the policy names by their hashes
-PICTURES = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
+PICTURES_POLICY = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
 # Spark decodes in WebAssembly and sorts in a worker; its text contains both as data: addresses
-SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
+SOLID_POLICY = f"{PICTURES_POLICY} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
 NONE = "-"  # replaces a missing figure
@@ -51,7 +51,7 @@ def view_page(data: ViewData) -> bytes:
     own = reference_words(data)[1]
     page = render_template(
         "view.html",
-        policy=SOLID,
+        policy=SOLID_POLICY,
         data=data,
         results=results,
         table=results_table(data),

@@ -26,7 +26,7 @@ POLICY = (
     " worker-src data: blob:; connect-src data: blob:"
 )
 NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}
-MAX_VIEWS = 64  # largest number of viewpoints in the page
+MAX_VIEWPOINTS = 64  # largest number of viewpoints in the page
 LICENSED = ("spark", "three", "fflate")
 
 
@@ -63,7 +63,7 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
     viewpoints = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
     start = 0 if is_free else median_camera(viewpoints)  # the first placed viewpoint is outside
     poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
-    views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWS)), start})
+    views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWPOINTS)), start})
     inside = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, comments)}
     return render_template(
         "site.html", policy=POLICY, title=title, count=len(gaussians), names=NAMES,

@@ -27,7 +27,7 @@ from gsmerge.scene.input import as_scene
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
 from gsmerge.values.arguments import check_arguments
 
-HEIGHT = 820  # height of a page in a notebook, pixels
+NOTEBOOK_HEIGHT = 820  # height of a page in a notebook, pixels
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,7 +41,7 @@ class Page:
         return f"Page({self.headline}, {human_bytes(len(self.text))})"
 
     def _repr_html_(self) -> str:
-        style = f"width: 100%; height: {HEIGHT}px; border: 0"
+        style = f"width: 100%; height: {NOTEBOOK_HEIGHT}px; border: 0"
         return f'<iframe srcdoc="{html.escape(self.text)}" style="{style}" allowfullscreen></iframe>'
 
     @check_arguments

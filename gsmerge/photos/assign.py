@@ -23,9 +23,9 @@ import numpy as np
 
 from gsmerge.geometry.transforms import median
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.photos.offsets import NEAR_PIXELS, SIDE, TOLERANCE, PhotoOffsets, find_offsets
+from gsmerge.photos.offsets import NEAR_PIXELS, OFFSET_PIXELS, ZERO_OFFSET, PhotoOffsets, find_offsets
 from gsmerge.photos.pictures import ViewPictures
-from gsmerge.photos.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
+from gsmerge.photos.scores import NOISE_MARGIN, SCORE_PIXELS, Comparer, fisher_z, measure_noise
 from gsmerge.runtime.threads import parallel_map
 
 SIGNIFICANT = 2.0  # standard deviations of noise; smaller scores and smaller differences of scores count as noise
@@ -45,7 +45,9 @@ class Assignment(NamedTuple):
 class Candidates:
     """Photos that may show the views of a scene."""
 
-    read: Callable[[int], np.ndarray]  # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to SIDE pixels
+    read: Callable[
+        [int], np.ndarray
+    ]  # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to OFFSET_PIXELS pixels
     count: int
     tag: Callable[[int], int]  # photo -> orientation in its EXIF tag, 0 to 7
 
@@ -87,7 +89,7 @@ class Assigner:
     """
 
     def __init__(self, show: Callable[[int], ViewPictures], candidates: Candidates) -> None:
-        small = show(SIZES[-1])
+        small = show(SCORE_PIXELS[-1])
         self.candidates, self._show = candidates, show
         self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
         self._offsets = dict[tuple[int, Assignment], PhotoOffsets | None]()
@@ -96,7 +98,7 @@ class Assigner:
     @cached_property
     def shown(self) -> ViewPictures:
         """Pictures of the views, large enough to search for parts."""
-        return self._show(SIDE)
+        return self._show(OFFSET_PIXELS)
 
     def score(self, photos: Iterable[int]) -> _Scores:
         """Compare photos with all views."""
@@ -149,7 +151,7 @@ class Assigner:
             [np.zeros(0), *(view_offsets.distances for view_offsets in other_offsets if view_offsets)]
         )
         threshold = 2 * float(np.median(distances)) if len(distances) else 0.0
-        return replace(offsets, tolerance=TOLERANCE + min(threshold, NEAR_PIXELS)).verdict is False
+        return replace(offsets, tolerance=ZERO_OFFSET + min(threshold, NEAR_PIXELS)).verdict is False
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
         """Check the photos that names or their order propose for views.
@@ -185,7 +187,7 @@ class Assigner:
             correlation = scores.correlations[view, columns[row], assignment.orientation]
             matches = score > least or correlation**2 > MIN_EXPLAINED
             matches = matches and score > highest - SIGNIFICANT
-            is_clear = score > MARGIN and score >= highest
+            is_clear = score > NOISE_MARGIN and score >= highest
             if is_clear and exact:
                 out[view], confirmed[view] = assignment, True
             elif matches or (not self.has_contrast[view] and scores.fits(assignment)):
@@ -232,7 +234,7 @@ class Assigner:
             if similarity is not None:
                 return similarity
             score = scores.of(*pair)
-            return 1 - MARGIN / score if score > MARGIN else 0.0  # always below the similarity of parts
+            return 1 - NOISE_MARGIN / score if score > NOISE_MARGIN else 0.0  # always below the similarity of parts
 
         return _choose(pairs, parallel_map(compare, pairs))
 

@@ -26,7 +26,7 @@ from gsmerge.io.photo_files import (
 )
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.photos.offsets import SIDE
+from gsmerge.photos.offsets import OFFSET_PIXELS
 from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
@@ -174,7 +174,7 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     A picture of several colours is one for certain. A grey one may be if it changes from pixel to pixel as the photo of
     its view does, unless most of its pixels have one of two levels, as in masks with soft edges.
     """
-    picture = np.rint(decode_small(mask, SIDE) * _WHITE)
+    picture = np.rint(decode_small(mask, OFFSET_PIXELS) * _WHITE)
     spread = np.ptp(picture, axis=-1)
     if spread.mean() > 1:
         colors = picture[spread >= spread.max() / 2]
@@ -184,7 +184,9 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     if np.median(np.abs(grey - np.where(grey > middle, white, black))) <= 1:
         return 0
     photo = photos[view]
-    small = cv2.resize(photo, limit_size((photo.shape[1], photo.shape[0]), 2 * SIDE), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        photo, limit_size((photo.shape[1], photo.shape[0]), 2 * OFFSET_PIXELS), interpolation=cv2.INTER_AREA
+    )
     jpeg_texture = 0.2  # largest share of the pixels of a smooth mask that JPEG makes uneven
     return _texture(grey) > max(_texture(small.mean(-1)) / 2, jpeg_texture)  # nearer to the photo's than to a mask's
 

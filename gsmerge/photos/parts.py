@@ -16,7 +16,7 @@ from gsmerge.io.photo_files import ASPECT_TOLERANCE, WHOLE, decode_image, image_
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.photos.assign import Assigner, Assignment, Candidates
 from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_parts, sharpen
-from gsmerge.photos.offsets import SIDE
+from gsmerge.photos.offsets import OFFSET_PIXELS
 from gsmerge.photos.pictures import show_views
 from gsmerge.photos.scene_photos import Proposal
 from gsmerge.photos.views import pick_views
@@ -59,9 +59,9 @@ def choose_part(
         with suppress(SceneError):
             whole = decode_image(proposal.pool[photos[number]], size)
             above, below, left, right = count_bars(whole, _BAR_SPREAD)
-            small = resize_to(size, limit_size(size, 4 * SIDE)).photos([whole])[0]
+            small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
             return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
-        return np.zeros((SIDE, SIDE, 3), np.float32), np.zeros(4)
+        return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)
 
     pictures, bars = zip(*parallel_map(read, range(len(photos))), strict=True)
     left, above, right, below = np.median(bars, 0).tolist()
@@ -71,7 +71,7 @@ def choose_part(
     if grid_fit is None:
         inner = sharpen(inner, sizes[0], shape)
     fits += list_parts(sizes[0], shape if grid_fit is None else None, inner)
-    fit = choose_fit(show_views(scene, SIDE)[views], pictures, fits)
+    fit = choose_fit(show_views(scene, OFFSET_PIXELS)[views], pictures, fits)
     if isinstance(fit, GridFit) or fit == WHOLE_FIT:
         return None
     candidates = Candidates(lambda photo: fit.cut(pictures[photo]), len(photos), lambda _: 0)

@@ -14,7 +14,7 @@ from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import IMAGE_SUFFIXES, propose_images
 from gsmerge.io.photo_files import decode_small, image_size, same_shape
 from gsmerge.io.scene_files import list_folders
-from gsmerge.photos.offsets import SIDE
+from gsmerge.photos.offsets import OFFSET_PIXELS
 
 _ROUNDING = 1 / 255  # mean difference of channels that rounding to 8 bits may cause
 _MODEL_FOLDERS = {"sparse", "colmap", "distorted"}  # names of folders that have COLMAP's models
@@ -69,7 +69,7 @@ def find_named_photos(
 def is_grey(path: Path) -> bool:
     """Return whether an image file has no colours, as masks and depths; False where it cannot be read."""
     with suppress(SceneError):
-        return bool(np.ptp(decode_small(path, SIDE), axis=-1).mean() <= _ROUNDING)
+        return bool(np.ptp(decode_small(path, OFFSET_PIXELS), axis=-1).mean() <= _ROUNDING)
     return False
 
 

@@ -43,7 +43,7 @@ from gsmerge.kernels.pictures import turn_picture
 from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
 from gsmerge.photos.colors import cut_blocks
 from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
-from gsmerge.photos.offsets import SIDE, correlate_parts
+from gsmerge.photos.offsets import OFFSET_PIXELS, correlate_parts
 from gsmerge.photos.photo_folders import capture_folder, count_pixels, find_named_photos
 from gsmerge.photos.pictures import Pairs, ViewPictures, show_views
 from gsmerge.photos.scores import stands_out
@@ -309,9 +309,9 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
 
     def read(photo: int) -> np.ndarray:
         try:
-            small = decode_small(proposal.pool[photo], SIDE)
+            small = decode_small(proposal.pool[photo], OFFSET_PIXELS)
         except SceneError:  # an unreadable photo is black and fits no view
-            small = np.zeros((SIDE, SIDE, 3), np.float32)
+            small = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
         small = proposal.fit.cut(small)
         return small if fit is None else fit.cut(small)
 
@@ -355,7 +355,7 @@ def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
     """Find how the photos that show a scene's views were resized and cropped to the grid of its rows."""
     simple, *other_fits = list_fits((scene.cameras.width, scene.cameras.height))
     views = range(len(scene))
-    shown, chosen = show_views(scene, SIDE), list[np.ndarray | None]()
+    shown, chosen = show_views(scene, OFFSET_PIXELS), list[np.ndarray | None]()
     assigner = Assigner(partial(show_views, scene), _list_candidates(proposal, None))
     for view, likely in assigner.list_likely(views, range(len(proposal.pool))).items():
         photos = [turn_picture(assigner.candidates.read(photo), turn) for photo, turn in likely]
@@ -381,7 +381,9 @@ def has_nearer_colors(scene: Scene, other: Scene) -> bool:
 
     images = scene.images
     assert images is not None
-    return stands_out(measure(images, show_views(other, SIDE)) - measure(images, show_views(scene, SIDE)))
+    return stands_out(
+        measure(images, show_views(other, OFFSET_PIXELS)) - measure(images, show_views(scene, OFFSET_PIXELS))
+    )
 
 
 def name_by_photos(

@@ -27,7 +27,7 @@ EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
 NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
 # Directions are clamped at this share of the image outside its borders, as in gsplat, since the first-order projection
 # is too inexact farther out
-SPARE = 0.15
+SPARE_SHARE = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ def camera_numbers(
 ) -> Array:  # fmt: skip
     """Return the numbers of a camera in the order of the kernels."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    spare_x, spare_y = SPARE * width / fx, SPARE * height / fy
+    spare_x, spare_y = SPARE_SHARE * width / fx, SPARE_SHARE * height / fy
     camera = np.zeros(projection.CAMERA, np.float32)
     camera[projection.ROTATION : projection.SHIFT] = viewmat[:3, :3].ravel()
     camera[projection.SHIFT : projection.FX] = viewmat[:3, 3]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsmerge.geometry.pooling import ROWS, Members, Moments, Rule, pool_members
+from gsmerge.geometry.pooling import FOOTPRINT_ROWS, Members, Moments, Rule, pool_members
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import cross_view_stats
@@ -65,11 +65,11 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
     labels = np.empty(len(members.pixels), np.int32)
 
     def label(start: int) -> None:
-        rows = slice(start, start + ROWS)
+        rows = slice(start, start + FOOTPRINT_ROWS)
         pixels = members.pixels[rows]
         labels[rows] = np.where(pixels >= 0, flat[pixels] + offsets[pixels // scene.pixels_per_view], -1)
 
-    parallel_map(label, range(0, len(labels), ROWS))
+    parallel_map(label, range(0, len(labels), FOOTPRINT_ROWS))
     starts, ids = group_members(labels, int(counts.sum()))
     sizes = np.diff(starts)
     has_members, views = sizes > 0, np.repeat(np.arange(len(scene)), groups.counts)

@@ -28,7 +28,7 @@ COLOR_WEIGHT = 0.6  # weight of squared distances of harmonics of degree 0, rela
 POWERS = 1.0, 0.3
 FLATNESS = 0.01  # least scale, relative to the largest, so that the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4  # least opacity of Gaussians that are merged, so that masses stay positive
-WIDER = 0.05  # most growth of scales for each doubling of the merged number; without it gaps would open
+MOST_WIDENING = 0.05  # most growth of scales for each doubling of the merged number; without it gaps would open
 CELLS_PER_TASK = 256  # cells that a thread merges at a time
 NEXT_AXIS = [1, 2, 0]  # the axis after each axis, so that products with it cover the three pairs of axes
 
@@ -67,7 +67,7 @@ def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) 
     round_share = 0.25  # least share of the Gaussians that remains after a round
     while len(cloud) > count:
         cloud = _merge_round(cloud, max(count, int(round_share * len(cloud))))
-    return gaussians_of(cloud, gaussians, WIDER)
+    return gaussians_of(cloud, gaussians, MOST_WIDENING)
 
 
 def cloud_of(g: Gaussians) -> Cloud:

@@ -20,12 +20,13 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
-SIDE = 480.0  # length in pixels of the longer side to which gradients are scaled
-# Sky is blue and brighter than DARK, or brighter than WHITE with less chroma than GREY
-DARK, WHITE, GREY = 0.35, 0.75, 0.12
-FAR = 3.0  # the sky is more than this many times as far away as the rest
-LEAST_VIEWS, LEAST_SHARE = 2, 0.2  # fewest views that show sky, and least share of all views; fewer may be mistaken
-MAX_SAMPLE_GAUSSIANS = 200_000  # most Gaussians whose depths are compared
+GRADIENT_PIXELS = 480.0  # length in pixels of the longer side to which gradients are scaled
+# Sky is blue and brighter than DARK_SKY, or brighter than WHITE_SKY with less chroma than GREY_SKY
+DARK_SKY, WHITE_SKY, GREY_SKY = 0.35, 0.75, 0.12
+FAR_RATIO = 3.0  # the sky is more than this many times as far away as the rest
+# Fewest views that show sky, and least share of all views; fewer may be mistaken
+LEAST_SKY_VIEWS, LEAST_SKY_SHARE = 2, 0.2
+SKY_GAUSSIANS = 200_000  # most Gaussians whose depths are compared
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
@@ -52,7 +53,7 @@ def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict
         for view, region in regions.items()
         if _pales_downwards(photos[view], region) or _is_far(means, cameras[[view]], region)
     }
-    return shown if len(shown) >= max(LEAST_VIEWS, LEAST_SHARE * len(photos)) else {}
+    return shown if len(shown) >= max(LEAST_SKY_VIEWS, LEAST_SKY_SHARE * len(photos)) else {}
 
 
 def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:
@@ -71,19 +72,19 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
 
 def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
     """Return whether a region ``[h,w]`` is several times as far away as the rest of the picture."""
-    (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // MAX_SAMPLE_GAUSSIANS))], camera)
+    (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // SKY_GAUSSIANS))], camera)
     inside = (depths > 0) & is_inside(pixels, camera)
     x, y = pixels[inside].astype(int).T
     in_region, depths = region[y, x], depths[inside]
     if not in_region.any() or in_region.all():
         return False
-    return bool(np.median(depths[in_region]) > FAR * np.median(depths[~in_region]))
+    return bool(np.median(depths[in_region]) > FAR_RATIO * np.median(depths[~in_region]))
 
 
 def sky_region(photo: np.ndarray) -> np.ndarray:
     """Return a mask ``[h,w]`` of smooth blue or white regions at a photo's upper border; empty if they are small."""
     height, width = photo.shape[:2]
-    scale = max(height, width) / SIDE
+    scale = max(height, width) / GRADIENT_PIXELS
     sigma = max(1.5 * scale, 0.5)
     upper = photo[: round(4 * sigma) + 3]  # the blurred upper border depends on these rows alone
     least_area, least_top = 0.02, 0.4  # least share of the picture, and of its upper border, that is sky
@@ -102,8 +103,8 @@ def _like_sky(soft: np.ndarray, scale: float) -> np.ndarray:
     right, down = (reduce(np.maximum, np.moveaxis(np.abs(slope), 2, 0)) / 8 for slope in sobel(soft))
     red, green, blue = colors = np.moveaxis(soft, 2, 0)
     bright, dark = reduce(np.maximum, colors), reduce(np.minimum, colors)  # takes a tenth of the time of max(2)
-    is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK)
-    is_white = (bright > WHITE) & (bright - dark < GREY)
+    is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK_SKY)
+    is_white = (bright > WHITE_SKY) & (bright - dark < GREY_SKY)
     max_gradient = 0.02  # largest gradient of a colour per pixel
     return np.asarray((np.sqrt(right * right + down * down) * scale < max_gradient) & (is_blue | is_white))
 

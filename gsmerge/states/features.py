@@ -35,7 +35,14 @@ from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
 from gsmerge.stages.superpixels import scene_saliency
-from gsmerge.states.extend import NOT_COMPARED, NOT_KNOWN, BatchReport, compare_worlds, number_names, refuse_other_world
+from gsmerge.states.extend import (
+    NOT_COMPARED,
+    UNKNOWN_WORLD,
+    BatchReport,
+    compare_worlds,
+    number_names,
+    refuse_other_world,
+)
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
 from gsmerge.version import __version__
 
@@ -151,7 +158,7 @@ def extend_features(
             saliency = group_saliency(features, members, corners)
             extended = _join(state, features, saliency, context, samples, plan.match)
     numbers = {"num_views": len(prepared_scene), "num_input": scene.num_gaussians, "num_new": len(features)}
-    notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == NOT_KNOWN else [])]
+    notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == UNKNOWN_WORLD else [])]
     report = BatchReport(
         **numbers, num_gaussians=len(extended), num_kept=0, pictures=prepared.reference.name, views={},
         sh_degree=scene.gaussians.sh_degree, seconds=record.seconds,
@@ -191,7 +198,7 @@ def _view_names(state: FeatureState | None, prepared: Prepared) -> tuple[str, ..
 def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
     """Compare the world of a canonical scene with that of a state; SceneError for another one, unless allowed."""
     if state is None:
-        return NOT_KNOWN
+        return UNKNOWN_WORLD
     world = compare_worlds(feature_to_gaussians(state.refined), scene, scene.gaussians.means)
     refuse_other_world(world, options)
     return world

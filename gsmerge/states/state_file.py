@@ -24,7 +24,7 @@ from gsmerge.io.formats.gsm import (
     write_scene,
 )
 from gsmerge.networks.checkpoint import build_networks
-from gsmerge.networks.options import CORRECTED, GROUP
+from gsmerge.networks.options import CORRECTED, GROUP_COLUMNS
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.scene.read import load_scene
 from gsmerge.states.features import FeatureState, ViewSamples
@@ -128,7 +128,7 @@ def _read_features(file: GsmFile) -> FeatureState:
         views=_whole_numbers(file, "views", g, 0, num_views),
         num_members=_whole_numbers(file, "num_members", g, 1, _MAX_MEMBERS + 1),
         saliency=file.finite("saliency", np.float64, g),
-        group=_numbers(file, "group", g, GROUP),
+        group=_numbers(file, "group", g, GROUP_COLUMNS),
         cameras=cameras,
         frame=Frame(file.finite("origin", np.float64, 3), unit),
         networks=weights,

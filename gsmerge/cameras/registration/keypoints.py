@@ -14,9 +14,9 @@ from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.raster.photos import row_pictures
 from gsmerge.types import Scene
 
-SIDE = 1600  # longest side of a photo in which keypoints are searched, pixels
-GREY = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
-RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
+KEYPOINT_PIXELS = 1600  # longest side of a photo in which keypoints are searched, pixels
+GREY_WEIGHTS = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
+MATCH_RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +81,13 @@ def find_keypoints(scene: Scene) -> list[Photo]:
 def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a picture ``[h,w,3]`` uint8 of a view, and its intrinsics.
 
-    The picture is the largest photo, reduced to SIDE pixels. Without photos it has the base colours of the Gaussians.
+    The picture is the largest photo, reduced to KEYPOINT_PIXELS pixels. Without photos it has the base colours of the
+    Gaussians.
     """
     if scene.large_photos is not None:
         large = scene.large_photos
         photo = large.read(large.ids[view])
-        share = min(1.0, SIDE / max(large.width, large.height))
+        share = min(1.0, KEYPOINT_PIXELS / max(large.width, large.height))
         size = max(1, round(large.width * share)), max(1, round(large.height * share))
         scale = np.array([[size[0] / large.width], [size[1] / large.height], [1.0]])
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if share < 1 else photo
@@ -104,7 +105,7 @@ def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarr
     min_side = 8  # least side of a photo in which keypoints are searched, pixels
     wide = max(min_side, round(width * max(stretch, 1)))
     high = max(min_side, round(height / min(stretch, 1)))
-    grey = ((picture.astype(np.int32) * GREY).sum(-1) >> 8).astype(np.uint8)
+    grey = ((picture.astype(np.int32) * GREY_WEIGHTS).sum(-1) >> 8).astype(np.uint8)
     max_keypoints = 4000  # most keypoints of a photo
     contrast = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
     finder = cv2.SIFT.create(max_keypoints, contrastThreshold=contrast)
@@ -180,6 +181,6 @@ def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
     best = distances.argmin(1)
     two_best = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
-    is_clear = two_best[:, 0] < RATIO**2 * two_best[:, 1]
+    is_clear = two_best[:, 0] < MATCH_RATIO**2 * two_best[:, 1]
     matched = is_clear & (distances.argmin(0)[best] == np.arange(len(a)))
     return np.flatnonzero(matched), best[matched]

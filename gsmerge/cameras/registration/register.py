@@ -18,6 +18,7 @@ from gsmerge.cameras.registration.keypoints import End, KeypointMatches, Photo, 
 from gsmerge.cameras.registration.similarities import compose, fit_similarities, invert_similarity, round_similarity
 from gsmerge.geometry.transforms import (
     IDENTITY,
+    NORMAL_SPREAD,
     Damping,
     Similarity,
     camera_depths,
@@ -31,13 +32,12 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
 DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
-NORMAL = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
 NORMAL_2D = 1 / 1.1774  # standard deviation of two normal components, divided by the median length of their vector
 AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
 LOOSE = (100.0, 10.0, 2.0, 2.0)  # multiples of AGREE in each round; the first are large because chains of scenes drift
 MIN_MATCHES = 16  # agreeing matches of two connected scenes; unrelated photos have up to 5
 DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
-SIZE = 7  # parameters of a step: rotation, shift, logarithm of the scale
+NUM_PARAMETERS = 7  # parameters of a step: rotation, shift, logarithm of the scale
 
 Similarities = Sequence[Similarity | None]
 _Fit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]  # similarities; their cost, its curvature and slope
@@ -203,7 +203,7 @@ def _measure_spreads(
     values = [_both_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
     lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
     ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
-    spread = NORMAL * float(lower_median(ratios))
+    spread = NORMAL_SPREAD * float(lower_median(ratios))
     min_pixels = 0.2  # least measured standard deviation of a keypoint, pixels
     pixels = max(NORMAL_2D * float(lower_median(np.concatenate(lengths))), min_pixels)
     measured = [replace(pair, spread=min(pixels, pair.spread)) for pair in matches]
@@ -273,7 +273,7 @@ def _refine(
     def step(state: _Fit, damping: float) -> _Fit | None:
         current, (_, curvature, slope) = state
         scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
-        steps = -solve(curvature + np.diag(scale), slope).reshape(-1, SIZE)
+        steps = -solve(curvature + np.diag(scale), slope).reshape(-1, NUM_PARAMETERS)
         if not np.isfinite(steps).all():
             return None
         moved = list(current)
@@ -295,11 +295,11 @@ def _normal_equations(
     similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, free: Sequence[int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return Cauchy's cost of the residuals, its curvature and its slope with respect to steps of the free scenes."""
-    size = len(free) * SIZE
+    size = len(free) * NUM_PARAMETERS
     curvature = np.zeros((size, size))
     slope = np.zeros(size)
     cost = 0.0
-    columns = {scene: slice(i * SIZE, (i + 1) * SIZE) for i, scene in enumerate(free)}
+    columns = {scene: slice(i * NUM_PARAMETERS, (i + 1) * NUM_PARAMETERS) for i, scene in enumerate(free)}
     half_weight = 4.0  # squared residual at which the weight of a match halves
     for pair in matches:
         forward = _between(similarities, pair.scenes)
@@ -313,10 +313,10 @@ def _normal_equations(
             jacobians = {pair.scenes[source]: source_jacobian, pair.scenes[1 - source]: target_jacobian}
             jacobians = {scene: jacobian for scene, jacobian in jacobians.items() if scene in columns}
             for scene, jacobian in jacobians.items():
-                weighted = (weights[:, None, None] * jacobian).reshape(-1, SIZE).T
+                weighted = (weights[:, None, None] * jacobian).reshape(-1, NUM_PARAMETERS).T
                 slope[columns[scene]] += matmul(weighted, residuals.values.reshape(-1))
                 for second, second_jacobian in jacobians.items():
-                    block = matmul(weighted, second_jacobian.reshape(-1, SIZE))
+                    block = matmul(weighted, second_jacobian.reshape(-1, NUM_PARAMETERS))
                     curvature[columns[scene], columns[second]] += block
     return cost, curvature, slope
 

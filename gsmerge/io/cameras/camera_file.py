@@ -26,7 +26,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) 
 
 # A principal point is in the middle if twice it differs by at most these pixels from the image's size
 CENTRED_PX = 1e-3
-PATCH = 14  # sides of vision transformers' inputs are multiples of it
+PATCH_SIDE = 14  # sides of vision transformers' inputs are multiples of it
 _WHOLE = 1e-3  # pixels; tolerance of a side that is a whole number
 MAX_NORMALISED_FOCAL = 10.0  # a longer focal length is in pixels, and no image is that small
 
@@ -305,7 +305,7 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     """Set the size of cameras without a size to twice their principal point, if photos have clearly another size.
 
     ``size`` is (width, height) of the photos. The new size must have the shape of the photos. Fractional sides are
-    rounded to multiples of ``PATCH``, since the inputs of networks have such sides.
+    rounded to multiples of ``PATCH_SIDE``, since the inputs of networks have such sides.
     """
     if size is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file
@@ -315,7 +315,7 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     has_photo_shape = float(ratios.max()) < (1 + min_difference) * float(ratios.min())
     if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > min_difference).all():
         return camera_file
-    step = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH
+    step = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH_SIDE
     widths, heights = (np.full(len(camera_file), step * round(side / step)) for side in sides.tolist())
     return replace(camera_file, widths=widths, heights=heights)
 

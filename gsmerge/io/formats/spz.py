@@ -51,7 +51,7 @@ _MAX_EXTENSIONS = 1 << 20  # bytes of all extension records
 GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # first bytes of versions 1 to 3, and of 4
 SYSTEM, UNIX = 9, b"\3"  # byte of a gzip header that names the operating system, and the value that is always written
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel if the scene fills 1,000 pixels
-LARGEST = 2**23 - 1
+LARGEST_POSITION = 2**23 - 1
 _SHIFTS = (20, 10, 0)  # of the three smaller components of a rotation in its word
 COLOR_SCALE = 0.15  # factor of sh0, so that colours slightly outside [0, 1] can be stored
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
@@ -270,14 +270,14 @@ def choose_fraction(means: np.ndarray, fine: int) -> int:
         return 0
     size = np.median(reduce(np.maximum, (np.abs(axis - np.median(axis)) for axis in means.T)))
     fine_enough = fine - _octave(max(size, 1e-6))
-    no_overflow = _octave(LARGEST / max(np.abs(means).max(), 1e-6))
+    no_overflow = _octave(LARGEST_POSITION / max(np.abs(means).max(), 1e-6))
     max_fraction = 23  # bits; a position has 24, one of them for its sign
     return int(np.clip(min(fine_enough, no_overflow), 0, max_fraction))
 
 
 def fix_means(means: np.ndarray, fraction: int) -> np.ndarray:
     """Quantise means to ``fraction`` bits after the binary point."""
-    return np.clip(np.round(means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
+    return np.clip(np.round(means * 2.0**fraction), -LARGEST_POSITION, LARGEST_POSITION).astype("<i4")
 
 
 def spz_columns(

@@ -7,7 +7,7 @@ Then a phase is one call without arguments on every thread, see ``gsmerge/kernel
 from __future__ import annotations
 
 from gsmerge.kernels.gaussians.optimise import COLUMNS
-from gsmerge.kernels.raster.image_loss import EDGE_ROWS, ROWS, TERMS
+from gsmerge.kernels.raster.image_loss import DERIVATIVE_ROWS, EDGE_ROWS, TERMS
 from gsmerge.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
 from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
 
@@ -33,7 +33,7 @@ STEP = Table(
     offsets=i8("ends", out=True), light=f4("tiles", out=True), flatten_ids=i4("room", out=True),
     slots=f4("room", SUMS, out=True), image=f4("height", "width", 3, out=True),
     transmittance=f4("height", "width", out=True), gradient=f4("height", "width", 3, out=True),
-    errors=f4("height", out=True), terms=f4("threads", ROWS, TERMS, "line", out=True),
+    errors=f4("height", out=True), terms=f4("threads", DERIVATIVE_ROWS, TERMS, "line", out=True),
     rows=f4("threads", EDGE_ROWS, "line", out=True), photo=f4("height", "width", 3), weight=f4("height", "width"),
     camera=f4(CAMERA), eye=f4(3), background=f4(3), loss_weights=f4(2), rates=f4(COLUMNS), limits=f4(5), betas=f4(2),
     regs=f4(2),

@@ -26,8 +26,8 @@ from gsmerge.types import Gaussians
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-NEIGHBORS = 10  # with 16 a real capture gains 0.03 dB, in 1.5 times the time
-CHUNK = 65536  # Gaussians per piece of work
+GREEDY_NEIGHBORS = 10  # with 16 a real capture gains 0.03 dB, in 1.5 times the time
+CHUNK_GAUSSIANS = 65536  # Gaussians per piece of work
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # rows and columns of the upper triangle of a covariance
 
 
@@ -63,11 +63,11 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 
     with use_threads() as threads:
         tree = cKDTree(cloud.means, balanced_tree=False, compact_nodes=False)
-        _, nearest = tree.query(cloud.means, min(NEIGHBORS + 1, len(cloud)), workers=threads)
+        _, nearest = tree.query(cloud.means, min(GREEDY_NEIGHBORS + 1, len(cloud)), workers=threads)
     nearest = nearest.astype(np.int32)
 
     def chunk_pairs(start: int) -> tuple[Ints, Ints, Floats]:
-        chunk = nearest[start : start + CHUNK]
+        chunk = nearest[start : start + CHUNK_GAUSSIANS]
         rows = np.repeat(np.arange(start, start + len(chunk)), chunk.shape[1])
         neighbors = chunk.reshape(-1).astype(np.int64)
         candidates = (neighbors <= rows).nonzero()[0]  # the row itself, or pairs that the lower row may list too
@@ -77,7 +77,7 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
         left, right = np.minimum(rows, neighbors)[keep], np.maximum(rows, neighbors)[keep]
         return left, right, pair_costs(cloud, left, right)
 
-    chunks = parallel_map(chunk_pairs, range(0, len(cloud), CHUNK))
+    chunks = parallel_map(chunk_pairs, range(0, len(cloud), CHUNK_GAUSSIANS))
     left, right, costs = (np.concatenate(column) for column in zip(*chunks, strict=True))
     return left, right, costs
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 from gsmerge.measure.documents import csv_text
-from gsmerge.pages.page import PICTURES, data_uri, render_template
+from gsmerge.pages.page import PICTURES_POLICY, data_uri, render_template
 from gsmerge.research.charts.figures import Figure
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Results, size_label
 from gsmerge.research.charts.measure_run import HELD_OUT, RunRecord
@@ -30,7 +30,7 @@ def make_page(
     words = "; ".join([words, *list_held_out_notes(records)])
     return render_template(
         "charts.html",
-        policy=PICTURES,
+        policy=PICTURES_POLICY,
         names=names,
         words=words + (f"; {len(failed)} failed" if failed else ""),
         part=PARTS[results.part],

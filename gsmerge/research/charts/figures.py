@@ -20,7 +20,7 @@ from gsmerge.io import atomic_output
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
 from gsmerge.research.charts.measure_run import INPUT
 
-PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
+PANEL_WIDTH, SINGLE_WIDTH, PANEL_HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7B4173", "#8C6D31")  # Okabe, Ito 2008
 MARKERS = "osD^vPX"  # their number is coprime to the number of colours
 DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # each cycle through the colours takes the next dash
@@ -161,7 +161,7 @@ def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
     width = (SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels) + key_width
     names = list(dict.fromkeys(line.name for panel in figure.panels for line in panel.lines))
     names += [INPUT] * (INPUT not in names and any(panel.reference is not None for panel in figure.panels))
-    size = width, max(HEIGHT, key_line * len(names))
+    size = width, max(PANEL_HEIGHT, key_line * len(names))
     drawing = Drawing(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.08))
     all_axes = np.atleast_1d(drawing.subplots(1, num_panels))
     for axes, panel in zip(all_axes, figure.panels, strict=True):

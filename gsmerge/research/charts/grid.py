@@ -14,7 +14,7 @@ from gsmerge.compaction.methods import find_method
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions
-from gsmerge.research.charts.lines import SIZES
+from gsmerge.research.charts.lines import SIZE_SETTINGS
 from gsmerge.research.charts.measure_run import ChartScene, RunRecord, describe
 from gsmerge.scene.content_hash import content_hash, digest, fill_template, list_files, list_photos, scene_name
 from gsmerge.settings.compact import OURS, CompactOptions
@@ -53,8 +53,8 @@ def list_settings(grid: Grid, fixed: Mapping[str, Any]) -> list[tuple[str, dict[
     Baselines get the settings that they use. Raises UsageError if a method or setting is unknown or impossible, or if
     a program is missing.
     """
-    sizes = [{name: value} for name in SIZES for value in grid.get(name, ())] or [{}]
-    others = {name: values for name, values in grid.items() if name not in (*SIZES, "method")}
+    sizes = [{name: value} for name in SIZE_SETTINGS for value in grid.get(name, ())] or [{}]
+    others = {name: values for name, values in grid.items() if name not in (*SIZE_SETTINGS, "method")}
     runs: dict[str, tuple[str, dict[str, Any]]] = {INPUT: (INPUT, {})}
     for method in grid.get("method", (OURS,)):
         uses = None if method == OURS else find_method(options_of(method, {})).uses

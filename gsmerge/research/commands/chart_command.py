@@ -46,7 +46,7 @@ class ChartOptions(Settings):
     ),
     opt.settings_option(CompactOptions, ChartOptions, example="lpips=none"),
     *opt.panel(
-        opt.INPUT,
+        opt.INPUT_GROUP,
         opt.option("targets", str, "Cameras of held-out photos: one file, or with {scene}, {parent} and {stem} of each "
                    "scene in it."),
     ),

@@ -20,12 +20,12 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack, rotate
 from gsmerge.research.generate.textures import Picture, pyramid
 
-FAR = 1e6  # depth of pixels without a surface
+NO_SURFACE_DEPTH = 1e6  # depth of pixels without a surface
 SAMPLE_RAYS = 2  # rays per pixel and axis for the colours; depth is measured at the pixel's centre
 KEY_MAPS, KEY_SIZE = 5, 640  # number of shadow maps of the direct light, for soft shadows, and their side in pixels
 AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # number and side of the shadow maps of the light from all sides
 GLOW = 0.7  # brightness of glowing shapes, relative to a white wall in full light
-RIM = 0.25  # strength of reflections at grazing angles, relative to the gloss
+GRAZING_STRENGTH = 0.25  # strength of reflections at grazing angles, relative to the gloss
 
 Float: TypeAlias = NDArray[Any]  # float32
 
@@ -125,7 +125,7 @@ def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
 def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
     """Cast ``samples`` x ``samples`` rays for each pixel."""
     h, w = lens.height * samples, lens.width * samples
-    hits = Hits(np.full((h, w), FAR), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
+    hits = Hits(np.full((h, w), NO_SURFACE_DEPTH), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
     c2w = np.ascontiguousarray(c2w, dtype=np.float64)
     eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()
@@ -296,7 +296,7 @@ def _shade(
     halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
     shine = gloss * direct * power(np.clip((normals * halfway).sum(1), 0, 1), 8 + 120 * gloss)
     grazing = (1 + (normals * rays).sum(1)).clip(0, 1)
-    rim = RIM * gloss * (grazing * grazing) ** 2  # grazing views reflect more (Schlick 1994)
+    rim = GRAZING_STRENGTH * gloss * (grazing * grazing) ** 2  # grazing views reflect more (Schlick 1994)
     key, ambient = light.key.astype(np.float32), light.ambient.astype(np.float32)
     out = albedo * (key * direct[:, None] + ambient * indirect[:, None])
     out += shine[:, None] * key + rim[:, None] * ambient

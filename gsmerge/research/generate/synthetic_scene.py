@@ -17,7 +17,7 @@ from gsmerge.kernels.pictures import blur
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
 from gsmerge.research.generate.objects import room
 from gsmerge.research.generate.photograph import (
-    FAR,
+    NO_SURFACE_DEPTH,
     SAMPLE_RAYS,
     Float,
     Hits,
@@ -38,7 +38,7 @@ from gsmerge.types import Cameras, Gaussians
 
 FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
 SWING = 35  # largest angle between -z and a camera, seen from the focus, degrees
-HEIGHT = 0.9, 1.8  # range of the height of cameras above the ground, metres
+CAMERA_HEIGHTS = 0.9, 1.8  # range of the height of cameras above the ground, metres
 Path = Callable[[float], Array]  # position along a path, 0 to 1 -> camera-to-world matrix [4,4]
 
 
@@ -62,8 +62,8 @@ def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Path:
     arc_degrees = 15, 60  # range of the angle that a path has around the focus, degrees
     span = rng.uniform(min(arc_degrees[0], limit), min(arc_degrees[1], limit))
     start = rng.uniform(-SWING, SWING - span)
-    distance, height = rng.uniform(*stage.distance), rng.uniform(*HEIGHT)
-    swing = rng.uniform(0, 0.4) * (HEIGHT[1] - HEIGHT[0])
+    distance, height = rng.uniform(*stage.distance), rng.uniform(*CAMERA_HEIGHTS)
+    swing = rng.uniform(0, 0.4) * (CAMERA_HEIGHTS[1] - CAMERA_HEIGHTS[0])
     phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
 
     def pose(s: float) -> Array:
@@ -77,7 +77,7 @@ def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Path:
 
 def is_usable(hits: Hits) -> bool:
     """Return True if a view's camera is outside all shapes and not too close to any."""
-    depth = hits.depth[hits.depth < FAR]
+    depth = hits.depth[hits.depth < NO_SURFACE_DEPTH]
     min_hits = 0.6  # least share of a usable view's rays that hit a shape
     if depth.size < min_hits * hits.depth.size:
         return False
@@ -145,7 +145,7 @@ class _Shoot:
         ``deviation [2,3]`` is the random error of the pose, see :func:`_perturb_pose`.
         """
         hits = trace(self.lit.shapes, self.poses[place], self.lens, 1)
-        depth = np.minimum(hits.depth, FAR) * self.noise.unit
+        depth = np.minimum(hits.depth, NO_SURFACE_DEPTH) * self.noise.unit
         pose = _perturb_pose(self.exported_pose(place), self.noise, float(np.median(depth)), deviation)
         normals = matmul(hits.normals, self.to_export[:3, :3].T).astype(np.float32)
         size = self.lens.width, self.lens.height

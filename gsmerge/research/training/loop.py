@@ -26,7 +26,7 @@ from torch.nn import Parameter
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.corrections import LOGIT
+from gsmerge.networks.corrections import LOGIT_COLUMN
 from gsmerge.photos.views import even_views
 from gsmerge.research.training.examples import Example, draw_views, recolor
 from gsmerge.research.training.losses import render_window, window_loss, window_psnr
@@ -168,7 +168,7 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
     with torch.no_grad():
         for module in networks.heads.values():
             assert isinstance(module, Head)
-            module.out.bias[LOGIT] += options.opacity_shift
+            module.out.bias[LOGIT_COLUMN] += options.opacity_shift
     if all(row["psnr_learned"] < rows[-1]["psnr_learned"] for row in rows[:-1]):
         save_checkpoint(out / "best.safetensors", networks.weights(), training)
     save_checkpoint(out / "last.safetensors", networks.weights(), training)

@@ -191,7 +191,7 @@ def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
         return proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
 
 
-GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversification
+GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of the diversification
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
@@ -208,7 +208,7 @@ def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tens
     weights = (volumes[left] * volumes[right]).clamp_min(1e-30).sqrt()
     profile = overlap_profile(gaussians, left, right)
     opacity = (gaussians.opacities[left] - gaussians.opacities[right]).square()
-    return (weights * (GEOMETRY * profile + OPACITY * opacity)).sum() / weights.sum()
+    return (weights * (GEOMETRY_WEIGHT * profile + OPACITY_WEIGHT * opacity)).sum() / weights.sum()
 
 
 def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from sweeps import sweep
 from gsmerge.kernels import elementary
 from gsmerge.kernels.networks.layers import GELU, PLAIN, TANH, attend, dense, normalise, pack, padded, scratch_size
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
-from gsmerge.networks.options import GROUP, MEMBER, PART, SLOTS, NetworkOptions, weight_shapes
+from gsmerge.networks.options import GROUP_COLUMNS, MEMBER_COLUMNS, PART_COLUMNS, SLOTS, NetworkOptions, weight_shapes
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 SHAPES = [(0, 3, 2), (1, 1, 1), (1, 5, 3), (5, 16, 16), (7, 48, 48), (13, 19, 50), (6, 0, 4)]
@@ -149,12 +149,12 @@ def inputs_of(name: str, options: NetworkOptions, count: int) -> tuple[np.ndarra
     """Random inputs of a network: some tokens do not count."""
     kind, _, slots = name.partition(".")
     width, tokens = {
-        "encoder": (MEMBER, options.members), "merger": (PART + options.latent, 5),
-        "refiner": (PART + 1 + options.latent, options.neighbors + 1), "heads": (PART, int(slots or 1)),
+        "encoder": (MEMBER_COLUMNS, options.members), "merger": (PART_COLUMNS + options.latent, 5),
+        "refiner": (PART_COLUMNS + 1 + options.latent, options.neighbors + 1), "heads": (PART_COLUMNS, int(slots or 1)),
     }[kind]  # fmt: skip
     mask = np.random.default_rng(1).random((count, tokens)) < 0.7
     mask[:, 0] = True
-    table, group = some(count, tokens, width, seed=2), some(count, GROUP, seed=3)
+    table, group = some(count, tokens, width, seed=2), some(count, GROUP_COLUMNS, seed=3)
     return (some(count, options.latent), group, table, mask) if kind == "heads" else (table, mask, group)
 
 

@@ -10,13 +10,13 @@ import scenes
 from messages import says
 from tiny_scene import rotation
 
-from gsmerge.fit.outside import HIGH, LOW, PLACES
+from gsmerge.fit.outside import PLACES, STEP_BACK_HIGH, STEP_BACK_LOW
 from gsmerge.fit.outside import outside_cameras as place_views
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.kernels import elementary
 from gsmerge.measure.fog import (
     ALL,
-    CAMERAS,
+    FOG_CAMERAS,
     HAZE,
     VEILED,
     Fog,
@@ -69,7 +69,7 @@ def fog_of(given: Gaussians, result: Gaussians, seen: Cameras | None = None, nea
 
 def figures(kinds: dict[str, Fog]) -> np.ndarray:
     """Near fog, far fog, holes and veils ``[3,5]``, of cameras stepped back, turned, and all."""
-    return np.array([list(vars(kinds[kind]).values()) for kind in (*CAMERAS, ALL)], float)
+    return np.array([list(vars(kinds[kind]).values()) for kind in (*FOG_CAMERAS, ALL)], float)
 
 
 def test_the_input_itself_has_no_fog() -> None:
@@ -146,7 +146,7 @@ def test_missing_pieces_are_holes() -> None:
 
 
 def test_nothing_empty_and_nothing_solid() -> None:
-    kinds = (*CAMERAS, ALL)
+    kinds = (*FOG_CAMERAS, ALL)
     assert fog_of(curtain(0.95), curtain(0.95)) == dict.fromkeys(kinds, Fog(None, None, 0.0, 0.0, 0.0, 0.0, 0.0))
     assert fog_of(curtain(0.5), curtain(0.2)) == dict.fromkeys(kinds, Fog(spikes=0.0, strokes=0.0))
 
@@ -217,7 +217,7 @@ def test_no_fit_looks_from_where_it_is_measured(views: int) -> None:
     """Cameras outside are a fiftieth of the depth apart, or look elsewhere by a degree."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(views, 32, 24))
     points = scene.gaussians.means
-    fitted = place_views(points, scene.cameras, max(PLACES, views), LOW, HIGH)
+    fitted = place_views(points, scene.cameras, max(PLACES, views), STEP_BACK_LOW, STEP_BACK_HIGH)
     for _, camera, depth in outside_cameras(scene.gaussians, scene.cameras):
         apart = np.linalg.norm(fitted.centres - camera.centres, axis=1) / depth
         cosines = (fitted.viewmats[:, 2, :3] * camera.viewmats[0, 2, :3]).sum(1)

@@ -247,7 +247,7 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
 
 
 def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(data, "MAX_VIEWS", 1)
+    monkeypatch.setattr(data, "MAX_SHOWN_VIEWS", 1)
     actual = collect("room", small, {"half": small.gaussians[::2]}, (2, 1))
     everything = evaluate(small, {"half": small.gaussians[::2]}, None, EvaluateOptions(lpips=())).results[1].scores
     assert 1 <= len(actual.views) <= 2

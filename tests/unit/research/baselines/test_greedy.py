@@ -49,7 +49,7 @@ def slow_greedy(gaussians: Gaussians, count: int) -> list[Blob]:
         pairs = set()
         for i, blob in enumerate(blobs):
             far = [float(np.linalg.norm(blob.mean - other.mean)) for other in blobs]
-            nearest = [j for j in np.argsort(far, kind="stable") if j != i][: greedy.NEIGHBORS]
+            nearest = [j for j in np.argsort(far, kind="stable") if j != i][: greedy.GREEDY_NEIGHBORS]
             pairs |= {(min(i, int(j)), max(i, int(j))) for j in nearest}
         limit = len(blobs) - count
         chosen: list[tuple[int, int]] = []
