@@ -83,7 +83,7 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
     model = _choose_model(points, pixels, (width, height), bound) if bound <= limit else None
     if model is None or model.worst_px > limit:
         return None
-    # Of the focal length, relative. It is larger where points are nearly a plane in front of the camera
+    # Relative uncertainty of the focal length. It is larger where points are nearly a plane in front of the camera
     max_uncertainty = 0.05
     if focal_uncertainty(points, pixels, model.Ks, model.poses) > max_uncertainty:
         return None

@@ -128,9 +128,8 @@ def _photos_confirm(pairs: Correspondences, images: np.ndarray, given: Cameras, 
     motions = matmul(invert(given.viewmats), moved.viewmats)[pairs.views]
     points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
     better_share = 0.96  # the given poses are better if they reduce the disagreement between photos to this share
-    return _disagreement(points, pairs, images, given) < better_share * _disagreement(
-        pairs.points, pairs, images, moved
-    )
+    limit = better_share * _disagreement(pairs.points, pairs, images, moved)
+    return _disagreement(points, pairs, images, given) < limit
 
 
 def _disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:

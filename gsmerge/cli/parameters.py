@@ -45,7 +45,7 @@ METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH",
 STYLES = ("bar", "json")  # of progress
 REQUIRED = Parameter.empty
 LIST_SETTINGS = "help"  # value for which --set prints all settings
-SEED = "GSMERGE_SEED"  # environment variable: the seed of commands that are given none
+SEED_VARIABLE = "GSMERGE_SEED"  # environment variable: the seed of commands that are given none
 
 SETTINGS = {
     setting.name: setting for kind in (EvaluateOptions, Engine, PlacementOptions, CompactOptions)
@@ -93,8 +93,9 @@ class Args(SimpleNamespace):
         for name in options.keys() & pairs.keys():
             raise UsageError(f"--set {name}: expected this setting once, got --{name.replace('_', '-')} too")
         values = options | pairs
-        if "seed" in settings and "seed" not in values and os.environ.get(SEED):  # an empty one counts as not set
-            values["seed"] = parse_value(SEED, os.environ[SEED], settings["seed"])
+        # An empty variable counts as not set
+        if "seed" in settings and "seed" not in values and os.environ.get(SEED_VARIABLE):
+            values["seed"] = parse_value(SEED_VARIABLE, os.environ[SEED_VARIABLE], settings["seed"])
         return values
 
     def settings(self, **changes: Any) -> CompactOptions:

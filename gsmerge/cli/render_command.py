@@ -66,13 +66,13 @@ def render(args: opt.Args) -> None:
     """Draw scenes: a clip of before and after, a panel with the photos, or a picture for each camera."""
     kind = _choose_kind(args)
     from gsmerge.measure import drawings
-    from gsmerge.measure.camera_path import parse_path
+    from gsmerge.measure.camera_path import parse_camera_path
     from gsmerge.measure.documents import document_head, note_entries
 
     files = args.files(args.scenes[0])
     framing = drawings.frame_files(files, args.cameras, args.images)
     inputs = (*args.scenes, *input_files(files), *input_files(framing))
-    if args.path is not None and parse_path(args.path) is None:  # the path is a file
+    if args.path is not None and parse_camera_path(args.path) is None:  # the path is a file
         inputs = (*inputs, Path(args.path))
     if args.output.suffix.lower() in (*PICTURES, *CLIPS):
         # A picture in a scene's folder may be replaced, unless it is a photo
@@ -118,10 +118,10 @@ def _choose_kind(args: opt.Args) -> str:
 
 def _check_path(args: opt.Args) -> None:
     """Raise UsageError for an unknown path, or for ``--frames`` with a path that is a file."""
-    from gsmerge.measure.camera_path import parse_path
+    from gsmerge.measure.camera_path import parse_camera_path
 
     with opt.usage_errors():
-        if parse_path(args.path) is not None:
+        if parse_camera_path(args.path) is not None:
             return
     if not Path(args.path).exists():
         expected = "orbit, spline or a file of cameras"

@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.compaction.curve import DROP_SHARES, DROP_STEPS, KNEE_SHARES, KNEE_STEPS, curve_counts
 from gsmerge.facts.counts import LEVEL_FACTOR, CountLimits
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.runtime.record import Part
+from gsmerge.runtime.record import RunPart
 from gsmerge.settings.compact import OURS
 from gsmerge.types import Scene
 
@@ -50,7 +50,7 @@ class RunCosts:
     merges_pairs: bool = False
     is_placed: bool = False  # The views are placed, since the scene has none
 
-    def build(self, count: float, steps: int | None = None) -> Part:
+    def build(self, count: float, steps: int | None = None) -> RunPart:
         """Return the part that builds ``count`` Gaussians, with a fit of ``steps`` (None: as the run)."""
         settings, steps = self.settings, self.steps if steps is None else steps
         method = settings["method"]
@@ -60,19 +60,19 @@ class RunCosts:
             work += COST_PAPER if "paper" in (settings["recipe"], settings["checkpoint"]) else COST_NETWORKS
         view_pixels = min(self.num_pixels, PLACED_PIXELS) if self.is_placed else self.view_pixels
         step = COST_STEP * view_pixels + COST_DRAWN * self.inside * count
-        return Part(self.num_pixels * work / 1e6, steps * step / 1e6)
+        return RunPart(self.num_pixels * work / 1e6, steps * step / 1e6)
 
-    def end(self, counts: Sequence[float], trial: Part | None) -> list[Part]:
+    def end(self, counts: Sequence[float], trial: RunPart | None) -> list[RunPart]:
         """Return the parts that follow a result: levels of ``counts`` Gaussians, a trial, the scores of the input."""
         work = COST_PLACED if self.is_placed else COST_INPUT
-        return [*map(self.build, counts), *([] if trial is None else [trial]), Part(self.num_pixels * work / 1e6)]
+        return [*map(self.build, counts), *([] if trial is None else [trial]), RunPart(self.num_pixels * work / 1e6)]
 
-    def trial(self, count: float) -> Part:
+    def trial(self, count: float) -> RunPart:
         """Return the part of the trial that estimates new views of ``count`` Gaussians, in two rounds."""
         build = self.build(count)
-        return Part(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)
+        return RunPart(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)
 
-    def seconds(self, parts: Sequence[Part], num_views: int, threads: int) -> float:
+    def seconds(self, parts: Sequence[RunPart], num_views: int, threads: int) -> float:
         """Return the wall time of a run with these parts, imports included."""
         work = sum(part.seconds for part in parts)
         return IMPORT_SECONDS + work / (1 + THREAD_GAIN * max(0, min(threads, num_views) - 1))
@@ -86,7 +86,7 @@ def mean_inside(scene: Scene) -> float:
 def expected_parts(
     costs: RunCosts, limits: CountLimits, count: float, *, has_target: bool, has_curve: bool, max_drop: float | None,
     rendered: bool, levels: int, has_trial: bool,
-) -> list[Part]:  # fmt: skip
+) -> list[RunPart]:  # fmt: skip
     """Return the parts of a run for a result of ``count`` Gaussians.
 
     ``has_target``: counts are tried until a PSNR is met. ``has_curve``: the scene's curve is measured first, down to

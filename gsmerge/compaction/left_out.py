@@ -86,7 +86,7 @@ def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
     return float(np.average(scores[seen], weights=shares[seen]))
 
 
-def choose_views(views: Sequence[int]) -> tuple[list[int], list[int]]:
+def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
     """Choose views to leave out in each of two rounds: evenly spread among ``views``, without neighbours in a round."""
     count = min(MOST_LEFT_OUT, max(1, len(views) // LEFT_OUT_PART))
     spread = [views[i] for i in pick_views(len(views), 2 * count)]

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from gsmerge.compaction.left_out import LEAST_SEEN, can_leave_out, choose_views, leave_out, mean_seen
+from gsmerge.compaction.left_out import LEAST_SEEN, can_leave_out, choose_left_out, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.transforms import camera_distances
 from gsmerge.io.formats.arrays import ExpectedScores
@@ -100,7 +100,7 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     begin_part()
     with record_part(silent=True) as record:
         share = min(1.0, USUAL * float(power(count / (USUAL * pixels), LESS)))
-        chosen = choose_views(prepared.reference.score_views)
+        chosen = choose_left_out(prepared.reference.score_views)
         rounds = [_score_round(prepared, views, plan, build, share) for views in chosen]
         scores = [round_scores for round_scores in rounds if round_scores is not None]
     add_seconds({"new views": sum(record.seconds.values())})

@@ -18,7 +18,7 @@ from gsmerge.compaction.curve import (
     curve_knee,
     measure_curve,
 )
-from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, choose_views, leave_out, mean_seen
+from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, choose_left_out, leave_out, mean_seen
 from gsmerge.compaction.scores import covers_all, may_leave_gaps, measure_input, measure_renders
 from gsmerge.facts.counts import LEVEL_FACTOR
 from gsmerge.facts.prepare import Prepared
@@ -231,7 +231,7 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
     if plan.fit.fit == "none" or not (has_target or plan.max_drop is not None or plan.auto_count):
         return None
     if can_leave_out(prepared):
-        for views in choose_views(prepared.reference.score_views):
+        for views in choose_left_out(prepared.reference.score_views):
             if left_out := leave_out(prepared.scene, views, prepared):
                 return left_out
     if prepared.reference.name == PHOTOS and not plan.auto_count:

@@ -21,7 +21,7 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import normalize, rgb_to_sh0
-from gsmerge.io.bounds import check_pixels
+from gsmerge.io.bounds import check_image_size
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,
     C2W_OPENGL,
@@ -34,12 +34,12 @@ from gsmerge.io.cameras.camera_file import (
 from gsmerge.io.formats.read import clear_invalid, clear_rows, find_empty
 from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.input import TOLERANCE, check_cameras, check_numbers, check_values
+from gsmerge.scene.input import TOLERANCE, check_numbers, check_poses, check_values
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
 from gsmerge.values.arrays import Array, as_array, to_float32
 from gsmerge.values.words import count_words
 
-ORDERS = ("view-major", "none")
+TENSOR_ORDERS = ("view-major", "none")
 _REMEDIES = {
     C2W_OPENCV: "pass their inverse, torch.linalg.inv(viewmats)",
     W2C_OPENGL: "negate the second and the third row of each",
@@ -105,8 +105,8 @@ def compact_tensors(
         >>> len(gsmerge.compact_tensors(**columns, **views, effort="draft", budget=300).gaussians)
         300
     """
-    if order not in ORDERS:
-        raise ValueError(f"order: expected one of {', '.join(ORDERS)}, got {order!r}")
+    if order not in TENSOR_ORDERS:
+        raise ValueError(f"order: expected one of {', '.join(TENSOR_ORDERS)}, got {order!r}")
     columns = {
         "means": _rows("means", means, 3),
         "quats": _rows("quats", quats, 4),
@@ -265,7 +265,7 @@ def _read_views(
     intrinsics = _matrices("Ks", Ks, ((3, 3),), views)
     poses = np.tile(np.eye(4), (views, 1, 1))
     poses[:, : matrices.shape[1]] = matrices
-    check_cameras(poses, intrinsics)
+    check_poses(poses, intrinsics)
     for view, K in enumerate(intrinsics):
         if max(K[0, 0], K[1, 1]) < MAX_NORMALISED_FOCAL <= min(width, height):
             problem = f"view {view}: expected intrinsics in pixels, found a focal length of {K[0, 0]:.3g}"
@@ -304,7 +304,7 @@ def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple
         if photos.ndim < 4 or photos.shape[-1] != 3:
             raise _image_error(photos, "[V, H, W, 3]")
         views, height, width = photos.shape[-4:-1]
-    check_pixels("shape", width, height)
+    check_image_size("shape", width, height)
     return views, height, width
 
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.facts.pixels import find_pixels
-from gsmerge.facts.place_cameras import CANDIDATE_GAUSSIANS, choose_cameras
+from gsmerge.facts.place_cameras import CANDIDATE_GAUSSIANS, choose_showing
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.kernels.elementary import arctan2
@@ -70,7 +70,7 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
     back = outside_cameras(sample.means, sources, STEPS_BACK * len(sources), BESIDE_LOW, BESIDE_HIGH)
     candidates = concat_cameras(back, _turn(sources))
     least_added = 0.2  # a further camera is placed if it adds more than this share of what those before it show
-    return candidates[choose_cameras(sample, candidates, outside[::step], least_added)]
+    return candidates[choose_showing(sample, candidates, outside[::step], least_added)]
 
 
 def _turn(cameras: Cameras) -> Cameras:

@@ -180,10 +180,10 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
     candidates = np.concatenate([beside[None], np.maximum(beyond, beside)])
     depth = _choose_depths(scene, view, holes, rays, candidates)
     eye, size = cameras.centres[view], NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
-    return make_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
+    return make_round_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
 
 
-def make_gaussians(
+def make_round_gaussians(
     eye: np.ndarray, rays: np.ndarray, depths: np.ndarray, size: float, colors: np.ndarray, num_higher: int
 ) -> Gaussians:
     """Make round Gaussians at ``depths [n]`` along ``rays [n,3]`` from ``eye``, with ``colors [n,3]`` (sRGB).

@@ -20,7 +20,8 @@ from gsmerge.geometry.pooling import pixel_sizes
 from gsmerge.geometry.transforms import find_nearest
 from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
 from gsmerge.raster.images import ONE_AT_A_TIME
-from gsmerge.raster.photos import EPS2D, NEAR_PLANE
+from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.raster.tiled_view import EPS2D
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT

@@ -263,7 +263,7 @@ def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return viewmat
 
 
-def choose_cameras(sample: Gaussians, candidates: Cameras, counting: np.ndarray, least_added: float) -> list[int]:
+def choose_showing(sample: Gaussians, candidates: Cameras, counting: np.ndarray, least_added: float) -> list[int]:
     """Choose candidates that show as much as possible of the ``counting [n]`` Gaussians of a canonical sample.
 
     The next candidate has to add more than the share ``least_added`` of what those before it show.

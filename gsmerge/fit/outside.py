@@ -120,9 +120,8 @@ def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarra
     def view_limits(view: int) -> np.ndarray:
         depths, transmittance = blend_depths(_tile(splats, views, view, near[view]), far[view])
         opacities = 1 - transmittance
-        return np.where(mark_empty(opacities), np.inf, np.where(opacities > SOLID_OPACITY, depths, 0)).astype(
-            np.float32
-        )
+        limits = np.where(opacities > SOLID_OPACITY, depths, 0)
+        return np.where(mark_empty(opacities), np.inf, limits).astype(np.float32)
 
     return np.stack(list(in_turn(view_limits, range(len(views)))))
 

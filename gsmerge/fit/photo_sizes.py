@@ -10,7 +10,8 @@ import numpy as np
 
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.raster.metrics import decibels
-from gsmerge.raster.photos import EPS2D, Photos, scene_photos, with_pixel_values
+from gsmerge.raster.photos import Photos, scene_photos, with_pixel_values
+from gsmerge.raster.tiled_view import EPS2D
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions

@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.fit.fit_state import FitState
 from gsmerge.kernels.raster import image_loss
 from gsmerge.kernels.raster.project import BLOCK, CAMERA, CONIC, POSE, SUMS, TILE
-from gsmerge.kernels.raster.step import PHASES, PIECE, STEP, fit_phase
+from gsmerge.kernels.raster.step import PHASES, STEP, THREAD_GAUSSIANS, fit_phase
 from gsmerge.kernels.signature import FilledTable
 from gsmerge.raster.gradient import viewmat_gradient
 from gsmerge.raster.tiled_view import cache_line_rows, hides_most
@@ -48,7 +48,10 @@ class StepBuffers:
         self.gaussians |= {name: np.empty(n, np.int32) for name in ("ids", "order")}
         self.gaussians |= {name: np.empty(n, np.uint64) for name in ("keys", "spare")}
         self.gaussians |= {name: np.zeros(size, np.float32) for name, size in OF_STEP.items()}
-        self.gaussians |= {"conics": cache_line_rows(n, CONIC), "num_kept": np.empty(-(-n // PIECE), np.int64)}
+        self.gaussians |= {
+            "conics": cache_line_rows(n, CONIC),
+            "num_kept": np.empty(-(-n // THREAD_GAUSSIANS), np.int64),
+        }
         self.gaussians |= {"g_poses": np.empty((-(-n // BLOCK) * self.moves_camera, POSE), np.float32)}
         self.gaussians |= {"fixed": self.state.fixed.view(np.uint8)}
         self.gaussians |= {name: getattr(self.state, name) for name in OF_STATE}

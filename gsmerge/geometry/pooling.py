@@ -20,15 +20,8 @@ MAX_OPACITY = 0.999  # largest opacity of a merged Gaussian, so that its logit i
 ROWS_PER_TASK = 4096  # groups that one task pools
 FOOTPRINT_ROWS = 65536  # Gaussians whose footprints one task computes
 # Columns of a group in the output of the kernel `pool`
-POOLED_MEAN, POOLED_COVAR, POOLED_WEIGHT, POOLED_MASS, POOLED_EXTINCTION, POOLED_FOOTPRINT, POOLED_COLUMNS = (
-    slice(0, 3),
-    slice(3, 9),
-    9,
-    10,
-    11,
-    12,
-    13,
-)
+POOLED_MEAN, POOLED_COVAR, POOLED_WEIGHT, POOLED_MASS = slice(0, 3), slice(3, 9), 9, 10
+POOLED_EXTINCTION, POOLED_FOOTPRINT, POOLED_COLUMNS = 11, 12, 13  # the last is the number of columns
 FULL_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # entries of an upper triangle xx xy xz yy yz zz in a flattened 3 x 3 matrix
 
 

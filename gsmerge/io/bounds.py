@@ -158,7 +158,7 @@ def read_json(path: Path) -> Any:
         raise SceneError(path, f"expected JSON, found other text ({error})") from error
 
 
-def check_pixels(path: StrPath, width: int, height: int) -> None:
+def check_image_size(path: StrPath, width: int, height: int) -> None:
     """Raise SceneError if an image size is not positive or has more than 2^26 pixels."""
     if width < 1 or height < 1:
         raise SceneError(path, f"expected a positive image size, found {width} x {height}")

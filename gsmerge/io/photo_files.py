@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
+from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_image_size, read_errors
 from gsmerge.io.first_bytes import refuse_picture
 from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
@@ -101,7 +101,7 @@ def decode_images(paths: Sequence[Path]) -> PhotoArrays:
         if (w, h) != size:
             problem = f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {files[0]}"
             raise SceneError(path, problem, "resize them to one size")
-    return decode_views(paths, [0] * len(paths), size) if files else []
+    return decode_photos(paths, [0] * len(paths), size) if files else []
 
 
 def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
@@ -113,7 +113,7 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
         raise SceneError(paths[0].parent, f"{problem}, {found}", "reduce their size, or leave some out")
 
 
-def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size, part: Part = WHOLE) -> PhotoArrays:
+def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size, part: Part = WHOLE) -> PhotoArrays:
     """Decode a part of the turned photo of each view to ``[h,w,3]`` uint8 of one ``size``; black without a file.
 
     If photos are large, they are decoded at each use; else a photo that several views have is decoded once. SceneError
@@ -383,7 +383,7 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
         raise SceneError(path, problem, "reduce its size") from error
     except Exception as error:  # a damaged header may make the library raise any error
         raise _unreadable(path) from error
-    check_pixels(path, width, height)
+    check_image_size(path, width, height)
     return (width, height), max(_COPIES[0] * _CHANNELS, _CHANNELS + pixel_bytes)
 
 

@@ -45,7 +45,7 @@ class CameraPath:
     back: float = 0.0
 
 
-def parse_path(text: str) -> CameraPath | None:
+def parse_camera_path(text: str) -> CameraPath | None:
     """Parse a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``; None for a file name.
 
     Raises:

@@ -38,7 +38,7 @@ MAX_VIDEO_PIXELS = 1 << 23  # per frame, a little more than 3840 x 2160; encoder
 MAX_GIF_PIXELS = 1 << 27  # of all frames together; more take over 400 MB of memory, and files too large to send
 GIF_SAMPLE = 1 << 20  # pixels from which the palette of a GIF is made
 OPENCV = "opencv-contrib-python-headless"
-FOLDER = "name a folder instead, for one picture a frame"
+FOLDER_HINT = "name a folder instead, for one picture a frame"
 LINE = 32  # height of a line of text at scale 1, pixels
 
 
@@ -182,7 +182,7 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
             _write_gif(temporary, list(frames), fps)
             return "GIF"
         if str(temporary).encode(errors="ignore") != os.fsencode(temporary):
-            raise SceneError(path, "expected a folder whose name is UTF-8, as OpenCV needs it for videos", FOLDER)
+            raise SceneError(path, "expected a folder whose name is UTF-8, as OpenCV needs it for videos", FOLDER_HINT)
         even_frames = (
             np.pad(frame, [(0, side % 2) for side in frame.shape[:2]] + [(0, 0)], mode="edge") for frame in frames
         )
@@ -242,7 +242,9 @@ def _open_writer(
     os.stat(str(temporary))  # if the folder has vanished, this raises an error with the reason
     names = " and ".join(name for _, name in encoders)
     raise SceneError(
-        path, f"this OpenCV has none of the encoders {names}, so it cannot write it", f"{FOLDER}, or install {OPENCV}"
+        path,
+        f"this OpenCV has none of the encoders {names}, so it cannot write it",
+        f"{FOLDER_HINT}, or install {OPENCV}",
     )
 
 

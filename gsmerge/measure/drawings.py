@@ -16,9 +16,9 @@ from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
-from gsmerge.measure.camera_path import parse_path, sample_path, viewing_depth
+from gsmerge.measure.camera_path import parse_camera_path, sample_path, viewing_depth
 from gsmerge.measure.clip import (
-    FOLDER,
+    FOLDER_HINT,
     H264,
     MAX_GIF_PIXELS,
     MAX_VIDEO_PIXELS,
@@ -221,7 +221,7 @@ def _check_frames(output: Path, width: int, height: int, count: int) -> None:
     """Raise SceneError if the frames of a clip would take too much memory to encode."""
     if width * height > MAX_VIDEO_PIXELS:
         problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels per frame of a video, found {width} x {height}"
-        raise SceneError(output, problem, FOLDER)
+        raise SceneError(output, problem, FOLDER_HINT)
     if output.suffix.lower() == GIF and count * width * height > MAX_GIF_PIXELS:
         problem = f"expected at most {MAX_GIF_PIXELS:,} pixels in a GIF, found {count} x {width} x {height}"
         raise SceneError(output, problem, "lower --size or --frames, or name a .mp4")
@@ -230,7 +230,7 @@ def _check_frames(output: Path, width: int, height: int, count: int) -> None:
 def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
     """Read the scenes, and make the cameras of a path; also return the near plane and the ids of its views."""
     assert options.path is not None
-    path = parse_path(options.path)
+    path = parse_camera_path(options.path)
     file = None if path else Path(options.path)
     framing = options.framing
     has_own = framing.cameras is not None or framing.images is not None or read_sharp_camera(framing.ply) is not None

@@ -49,7 +49,7 @@ class Quality:
     lpips_alex: float | None = None  # at least 0, lower is closer
 
 
-Pair = tuple[Quality, Quality]  # over all pixels, and over the pixels that the input views have seen
+QualityPair = tuple[Quality, Quality]  # over all pixels, and over the pixels that the input views have seen
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class ResultScores:
     def __repr__(self) -> str:
         return f"ResultScores({self.name!r}, {self.num_gaussians:,} Gaussians, {len(self.scores)} views)"
 
-    def mean(self, split: str) -> Pair:
+    def mean(self, split: str) -> QualityPair:
         """Average the scores of a split's views.
 
         Returns the mean scores over all pixels, and over the pixels that the input views have seen. ValueError for
@@ -404,7 +404,9 @@ def _qualities(image: np.ndarray, photo: np.ndarray, masks: Sequence[NDArray[np.
     return [Quality(*next(scores)) if mask is None or mask.any() else Quality() for mask in pixels]
 
 
-def _add_lpips(pair: Pair, image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]) -> Pair:
+def _add_lpips(
+    pair: QualityPair, image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]
+) -> QualityPair:
     """Add LPIPS to the qualities over all pixels, and over the pixels that the input views have seen."""
     if not nets:
         return pair

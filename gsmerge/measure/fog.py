@@ -90,12 +90,12 @@ def measure_fog(
     reference_splats = make_splats(reference)
     splats = {name: make_splats(result) for name, result in results.items()}
     pictures: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}  # kind of camera, and counts
-    outside = list(outside_cameras(reference, cameras))
+    outside = list(fog_cameras(reference, cameras))
     for number, (kind, camera, depth) in enumerate(outside):
         progress("views from outside", number, len(outside))
-        expected = draw_outside(reference_splats, camera, near, FOG_NEAR_PLANE * depth)
+        expected = draw_depths(reference_splats, camera, near, FOG_NEAR_PLANE * depth)
         for name in results:
-            counts = count_pixels(expected, draw_outside(splats[name], camera, near, FOG_NEAR_PLANE * depth))
+            counts = sum_pixels(expected, draw_depths(splats[name], camera, near, FOG_NEAR_PLANE * depth))
             pictures[name].append((kind, np.concatenate([counts, count_spikes(results[name], camera, near)])))
     return {
         name: {
@@ -117,7 +117,7 @@ def describe_fog(name: str, fog: Fog) -> str | None:
     return f"{name}: seen from outside, the result shows {' and '.join(faults)}" if faults else None
 
 
-def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras, float]]:
+def fog_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras, float]]:
     """Yield for each outside picture its kind, its camera, and the median depth of the view where the camera starts."""
     cameras = shrink_cameras(cameras, FOG_PIXELS)
     for view in pick_views(len(cameras), VIEWS):
@@ -129,7 +129,7 @@ def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[st
                 yield kind, replace(camera, viewmats=viewmat[None]), depth
 
 
-def draw_outside(splats: Splats, camera: Cameras, near: float, nearest: float) -> OutsidePicture:
+def draw_depths(splats: Splats, camera: Cameras, near: float, nearest: float) -> OutsidePicture:
     """Draw opacities beyond ``near``, and opacities and depths beyond ``nearest`` (world units), in one camera."""
     views = [
         tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=plane)
@@ -139,7 +139,7 @@ def draw_outside(splats: Splats, camera: Cameras, near: float, nearest: float) -
     return OutsidePicture(1 - transmittance, 1 - transmittance_beyond, depths)
 
 
-def count_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
+def sum_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
     """Return sums over pixels, and numbers of measured pixels, ``[4,2]``: near fog, far fog, holes and veil."""
     empty, solid = (expected.opacities < FOG_EMPTY).astype(np.uint8), expected.opacities > FOG_SOLID
     far_share = 0.1  # fog is far if it is farther than this share of the width from every pixel that the input shows
@@ -166,7 +166,7 @@ def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarr
 
 
 def mean_fog(counts: np.ndarray) -> Fog:
-    """Divide the sums of :func:`count_pixels` and :func:`count_spikes`, ``[pictures,6,2]``, by the numbers of pixels.
+    """Divide the sums of :func:`sum_pixels` and :func:`count_spikes`, ``[pictures,6,2]``, by the numbers of pixels.
 
     Veils are divided in each picture, and then averaged.
     """

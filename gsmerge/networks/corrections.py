@@ -20,14 +20,8 @@ from gsmerge.types import FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, like
 
 # Columns of a correction
-MEAN_COLUMNS, SIZE_COLUMNS, ROTATION_COLUMNS, LOGIT_COLUMN, COLOR_COLUMNS, MASS_COLUMN = (
-    slice(0, 3),
-    slice(3, 6),
-    slice(6, 9),
-    9,
-    slice(10, 13),
-    13,
-)
+MEAN_COLUMNS, SIZE_COLUMNS, ROTATION_COLUMNS = slice(0, 3), slice(3, 6), slice(6, 9)
+LOGIT_COLUMN, COLOR_COLUMNS, MASS_COLUMN = 9, slice(10, 13), 13  # the last is only in corrections of Feature Gaussians
 HALF = 0.5  # share of the bounds that each stage before the decoder may use
 CORRECTION_ROWS = 8192  # rows per task
 

@@ -35,7 +35,7 @@ class GroupFeatures:
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
     """Compute the networks' inputs for Feature Gaussians."""
-    views = choose_views(features, members, cameras)
+    views = choose_token_views(features, members, cameras)
     stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
     return describe_features(features, views, np.diff(features.starts), stats, cameras)
 
@@ -83,7 +83,7 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
     return np.ascontiguousarray(as_array(cameras.viewmats), np.float64)
 
 
-def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
+def choose_token_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
     """Choose a view ``[g]`` int64 for each Feature Gaussian: its own, or after merging the view of most opacity."""
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)

@@ -106,7 +106,7 @@ class ViewData:
         return any(view.held_out for view in self.views)
 
 
-def collect(
+def collect_page_data(
     title: str,
     scene: Scene,
     results: Mapping[str, Gaussians],
@@ -150,7 +150,7 @@ def _collect(
     *,
     light: bool,
 ) -> ViewData:
-    """Make the content of a page from an evaluation and its stills; see :func:`collect`."""
+    """Make the content of a page from an evaluation and its stills; see :func:`collect_page_data`."""
     pictures = photo_array(evaluation.pictures)
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}

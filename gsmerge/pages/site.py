@@ -15,13 +15,13 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
-from gsmerge.pages.page import VIEWER, base64_text, camera_numbers, data_uri, describe_gain, render_template
+from gsmerge.pages.page import VIEWER, base64_text, data_uri, describe_gain, page_camera, render_template
 from gsmerge.photos.views import even_views
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
 # Only its own scripts; Spark has data: addresses and a worker in its text
-POLICY = (
+SITE_POLICY = (
     "default-src 'none'; img-src data:; style-src {style}; script-src {script} blob: 'wasm-unsafe-eval';"
     " worker-src data: blob:; connect-src data: blob:"
 )
@@ -66,7 +66,7 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
     views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWPOINTS)), start})
     inside = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, comments)}
     return render_template(
-        "site.html", policy=POLICY, title=title, count=len(gaussians), names=NAMES,
+        "site.html", policy=SITE_POLICY, title=title, count=len(gaussians), names=NAMES,
         poster=data_uri(poster, "image/webp"), licences=data_uri(_read_licences(), "text/plain"),
         inside={NAMES[name]: base64_text(content) for name, content in inside.items()},
         gain=None if expected is None else describe_gain(*expected.bounds),
@@ -74,7 +74,7 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
         json_data={
             "names": NAMES, "free": is_free, "start": views.index(start),
             "views": [
-                camera_numbers(viewpoints[[view]], middle_depth(gaussians.means, viewpoints[[view]])) for view in views
+                page_camera(viewpoints[[view]], middle_depth(gaussians.means, viewpoints[[view]])) for view in views
             ],
         },
     )  # fmt: skip

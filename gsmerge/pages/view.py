@@ -19,7 +19,7 @@ from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.read import GaussianFile, read_gaussians
 from gsmerge.io.scene_files import find_scene_files, scene_title
-from gsmerge.pages.data import collect
+from gsmerge.pages.data import collect_page_data
 from gsmerge.pages.page import headline, view_page
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
@@ -114,7 +114,7 @@ def view(
     }
     max_solid = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
     is_light = len(read.gaussians) > max_solid if light is None else light
-    data = collect(
+    data = collect_page_data(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
         [_num_bytes(scene), *(_num_bytes(result) for result in loaded.values())], held_out,
         cameras=cameras, new_gains=gains, light=is_light, progress=progress or (lambda *_: None),

@@ -45,9 +45,8 @@ class Assignment(NamedTuple):
 class Candidates:
     """Photos that may show the views of a scene."""
 
-    read: Callable[
-        [int], np.ndarray
-    ]  # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to OFFSET_PIXELS pixels
+    # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to OFFSET_PIXELS pixels
+    read: Callable[[int], np.ndarray]
     count: int
     tag: Callable[[int], int]  # photo -> orientation in its EXIF tag, 0 to 7
 

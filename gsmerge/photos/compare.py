@@ -33,7 +33,7 @@ from gsmerge.photos.colors import (
     vary_in_hue,
 )
 from gsmerge.photos.photo_change import PhotoChange, change_large
-from gsmerge.photos.pictures import PICTURE_PIXELS, Pairs, ViewPictures, draw_views, pair_photos, show_views
+from gsmerge.photos.pictures import PICTURE_PIXELS, Pairs, ViewPictures, draw_canonical, pair_photos, show_views
 from gsmerge.photos.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.photos.scores import stands_out
 from gsmerge.photos.views import camera_kinds
@@ -135,7 +135,7 @@ def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedSc
     if scene.has_own_pixels:
         colors = row_pictures(scene)[views]
     else:
-        colors = draw_views(scene.gaussians, scene.cameras[views], max(scene.images.shape[1:3])).pictures
+        colors = draw_canonical(scene.gaussians, scene.cameras[views], max(scene.images.shape[1:3])).pictures
     for view, picture in zip(views, colors, strict=True):
         changes[view] = PhotoChange(cover=np.full(picture.shape[:2], True), colors=picture, bright=False)
     note(

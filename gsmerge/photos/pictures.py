@@ -108,7 +108,7 @@ def show_views(scene: Scene, side: int | None = None, frame: Frame | None = None
         return _show_rows(scene, PICTURE_PIXELS) if side is None else _show_rows(scene, 2 * side).shrink(side)
     sampled = Scene(thin_out(scene.gaussians, PICTURE_GAUSSIANS), scene.cameras, None, None, scene.names)
     canonical, _ = canonicalise(sampled, frame)
-    shown = draw_views(canonical.gaussians, canonical.cameras, side or PICTURE_PIXELS)
+    shown = draw_canonical(canonical.gaussians, canonical.cameras, side or PICTURE_PIXELS)
     inside = pixel_weights(scene.masks, *shown.weights.shape[2:0:-1])
     return shown if inside is None else replace(shown, weights=shown.weights * (inside == 1))
 
@@ -134,7 +134,7 @@ def _sample_grid(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
     return slice(None), pixels, pixels
 
 
-def draw_views(gaussians: Gaussians, cameras: Cameras, side: int) -> ViewPictures:
+def draw_canonical(gaussians: Gaussians, cameras: Cameras, side: int) -> ViewPictures:
     """Render canonical Gaussians, and divide their transparency out."""
     blank = blank_photos(cameras, max(1.0, max(cameras.width, cameras.height) / side))
     renders = photo_errors(gaussians, blank, lambda _, image, transmittance: (image, 1 - transmittance))

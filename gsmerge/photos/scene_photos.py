@@ -31,8 +31,8 @@ from gsmerge.io.photo_files import (
     Size,
     decode_image,
     decode_images,
+    decode_photos,
     decode_small,
-    decode_views,
     image_size,
     orientation_turn,
     part_size,
@@ -267,7 +267,7 @@ def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_
             width, height = part
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
             raise SceneError(proposal.folder, problem)
-    return replace(photos, pictures=decode_views(paths, turns, proposal.fit.stretch(size), proposal.fit.part))
+    return replace(photos, pictures=decode_photos(paths, turns, proposal.fit.stretch(size), proposal.fit.part))
 
 
 def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:

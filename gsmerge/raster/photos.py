@@ -14,7 +14,7 @@ from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
 from gsmerge.raster.metrics import MAX_PSNR, psnr_within
-from gsmerge.raster.tiled_view import Splats, make_splats, tile_view
+from gsmerge.raster.tiled_view import EPS2D, Splats, make_splats, tile_view
 from gsmerge.runtime.memory import make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -31,7 +31,6 @@ TILE_STEP, LEAST_TILES = 13, 100
 MASKED_WEIGHT = np.float32(0.1)  # weight of pixels outside masks; with a weight of 0 the Gaussians there would drift
 COVERED_TRANSMITTANCE = np.float32(0.5)  # transmittance below which a pixel counts as covered by Gaussians
 WHOLE_SHARE = 0.98  # share of covered pixels from which on the whole view counts as covered
-EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
 
 class RenderScore(NamedTuple):

@@ -20,11 +20,11 @@ from gsmerge.values.arrays import distinct
 
 Array = NDArray[Any]
 
-PIECE = 1 << 13  # least number of Gaussians or intersections per thread
+THREAD_PIECE = 1 << 13  # least number of Gaussians or intersections per thread
 # Intersections of a view, and mean intersections per Gaussian. Above both, most Gaussians are hidden, so lists are cut
 CROWDED, CROWDED_EACH = 1 << 24, 16
-EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
-NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
+EPS2D = 0.3  # low-pass of the rasterizer, which widens Gaussians; square pixels of the full-size image
+WORLD_NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
 # Directions are clamped at this share of the image outside its borders, as in gsplat, since the first-order projection
 # is too inexact farther out
 SPARE_SHARE = 0.15
@@ -107,7 +107,7 @@ def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats
     return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}, origin=zero)
 
 
-def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
+def num_pieces(count: int, threads: int, least: int = THREAD_PIECE) -> int:
     """Choose the number of pieces of work: up to four per thread, each with about ``least`` items or more."""
     return 1 if threads == 1 else max(1, min(4 * threads, count // least))
 
@@ -118,7 +118,7 @@ def pieces(count: int, threads: int) -> list[tuple[int, int]]:
     return [(count * i // num, count * (i + 1) // num) for i in range(num)]
 
 
-def tile_ranges(tiled: TiledView, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
+def tile_ranges(tiled: TiledView, threads: int, least: int = THREAD_PIECE) -> list[tuple[int, int]]:
     """Split tiles into ranges for the threads with about equal numbers of intersections, at least about ``least``."""
     count = len(tiled.flatten_ids)
     num = num_pieces(count, threads, least)
@@ -129,7 +129,7 @@ def tile_ranges(tiled: TiledView, threads: int, least: int = PIECE) -> list[tupl
 
 def camera_numbers(
     viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool,
-    near: float = NEAR_PLANE, far: float = FAR_PLANE,
+    near: float = WORLD_NEAR_PLANE, far: float = FAR_PLANE,
 ) -> Array:  # fmt: skip
     """Return the numbers of a camera in the order of the kernels."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -272,7 +272,7 @@ def tile_view(
     *,
     eps2d: float = EPS2D,
     antialiased: bool = False,
-    near: float = NEAR_PLANE,
+    near: float = WORLD_NEAR_PLANE,
     far: float = FAR_PLANE,
     opacities: Array | None = None,
     keep: Array | None = None,

@@ -27,7 +27,7 @@ BEFORE_FIT = 0.8  # share of the stages' seconds that pass before the fits
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 
-class Part(NamedTuple):
+class RunPart(NamedTuple):
     """A part of a run: the seconds of its fits and of all other stages, of which only the ratios count here."""
 
     stages: float
@@ -44,7 +44,7 @@ class Part(NamedTuple):
 class Forecast:
     """Share of a run that is done, by the seconds of its parts; within a part, by the steps of its fits."""
 
-    parts: list[Part] = field(default_factory=list)  # The present one and those after it
+    parts: list[RunPart] = field(default_factory=list)  # The present one and those after it
     spent: float = 0.0  # Seconds of the parts that have ended
     has_begun: bool = False
     fit: int = 0  # Fit of the present part, from 0, with its last step
@@ -56,10 +56,10 @@ class Forecast:
         if self.has_begun:
             self.spent += self.parts.pop(0).seconds
         if not self.parts:  # more parts than were expected
-            self.parts.append(Part(0.0))
+            self.parts.append(RunPart(0.0))
         self.has_begun, self.fit, self.step, self.part_spent = True, 0, 0, 0.0
 
-    def expect(self, parts: Iterable[Part]) -> None:
+    def expect(self, parts: Iterable[RunPart]) -> None:
         """Set the parts that follow the present one."""
         self.parts[self.has_begun :] = parts
 
@@ -187,7 +187,7 @@ def adopt(part: Record) -> None:
     record.notes += [text for text in part.notes if text not in record.notes]
 
 
-def expect_parts(parts: Iterable[Part]) -> None:
+def expect_parts(parts: Iterable[RunPart]) -> None:
     """Set the parts that the current run expects after its present part, replacing earlier expectations."""
     current_record().forecast.expect(parts)
 

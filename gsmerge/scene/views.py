@@ -13,7 +13,7 @@ from gsmerge.io.photo_files import (
     PhotoArrays,
     PhotoTransform,
     Size,
-    decode_views,
+    decode_photos,
     keep_photos,
     limit_size,
     photo_size,
@@ -92,7 +92,7 @@ def find_larger_and_masks(
     def read(view: int) -> np.ndarray:
         if not paths:
             return cut(view, photos.pictures[view])
-        return cut(view, decode_views([paths[view]], [photos.turns[view]], stored, photos.part)[0])
+        return cut(view, decode_photos([paths[view]], [photos.turns[view]], stored, photos.part)[0])
 
     large = None
     if window.is_larger:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.facts.holes import NEW_SIZE_PIXELS, make_gaussians
+from gsmerge.facts.holes import NEW_SIZE_PIXELS, make_round_gaussians
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.fit.outside import Outside
 from gsmerge.geometry.transforms import is_inside, project
@@ -184,7 +184,7 @@ def _continue_surfaces(
     possible = ~wrong.reshape(depths.shape)
     rows = np.flatnonzero(possible.any(0))
     first_possible = depths[possible.argmax(0)[rows], rows]
-    return make_gaussians(
+    return make_round_gaussians(
         eye, rays[rows], first_possible, NEW_SIZE_PIXELS / camera.Ks[0][0, 0], colors[rows], num_higher
     )
 

@@ -67,7 +67,7 @@ def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) 
     round_share = 0.25  # least share of the Gaussians that remains after a round
     while len(cloud) > count:
         cloud = _merge_round(cloud, max(count, int(round_share * len(cloud))))
-    return gaussians_of(cloud, gaussians, MOST_WIDENING)
+    return gaussians_of_cloud(cloud, gaussians, MOST_WIDENING)
 
 
 def cloud_of(g: Gaussians) -> Cloud:
@@ -131,7 +131,7 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.concatenate([below, equal[: count - len(below)]]))
 
 
-def gaussians_of(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
+def gaussians_of_cloud(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
     """Convert moments to Gaussians; Gaussians that were not merged are copied from ``source``.
 
     If a mass would need an opacity above one, scales grow instead, at most by the share ``wider`` for each doubling of

@@ -22,7 +22,7 @@ TARGET_CHANGE = 0.9 * ROUNDING  # change at which the next limit aims
 ENOUGH_CHANGE = 0.75 * ROUNDING  # change at which the search for a larger limit ends
 # Sizes of the pixels relative to the photos' pixels: first for the blending weights, then for the compared pictures.
 # These pixels are samples of the photo, with the same low-pass, so the root mean square is the same
-LEVELS = 2, 4
+COMPARED_LEVELS = 2, 4
 
 
 @stage("prune")
@@ -33,11 +33,11 @@ def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gau
     camera's picture changes by more than ``ROUNDING`` (root mean square) without the unseen Gaussians. Gaussians
     outside of all pictures count as seen.
     """
-    peaks, inside = peak_weights(gaussians, blank_photos(cameras, LEVELS[0]))
+    peaks, inside = peak_weights(gaussians, blank_photos(cameras, COMPARED_LEVELS[0]))
     peaks[~inside] = np.inf
     max_compared_views = 8  # most views in which pictures with and without the Gaussians are compared
     views = pick_views(len(cameras), max_compared_views)
-    limit = _find_limit(gaussians, peaks, blank_photos(cameras[views], LEVELS[1])) if views else 0.0
+    limit = _find_limit(gaussians, peaks, blank_photos(cameras[views], COMPARED_LEVELS[1])) if views else 0.0
     unseen = np.flatnonzero(peaks < limit)
     return gaussians[np.flatnonzero(peaks >= limit)], gaussians[unseen[np.argsort(-peaks[unseen], kind="stable")]]
 

@@ -15,7 +15,14 @@ import numpy as np
 from gsmerge.facts.counts import CountLimits
 from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels.elementary import log, log10
-from gsmerge.kernels.superpixels.merge_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
+from gsmerge.kernels.superpixels.merge_tree import (
+    OVERSIZE,
+    PLANE_ERROR,
+    TREE_COLUMNS,
+    cut_labels,
+    merge_order,
+    region_sums,
+)
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.runtime.record import stage
@@ -28,7 +35,8 @@ DEPTH_WEIGHT = 1.0  # weight of squared relative depth errors, relative to squar
 # Largest side of a region, as a share of the image's longer side, because the rasterizer's affine approximation bends
 # larger Gaussians. It is exceeded only if the budget is too small for more regions.
 MAX_EXTENT = 1 / 8
-KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count; below it, more Gaussians gain too little
+# dB of predicted quality per relative increase of the count; below it, more Gaussians gain too little
+REGION_KNEE_SLOPE = 1.0
 KNEE_FLOOR = 3e-4  # squared error per pixel and channel that remains at every count (noise, views that disagree)
 
 
@@ -144,7 +152,7 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
         usable = _usable_depths(depths[view], valid[view])
         labels, count = pad_labels(groups.labels[view]), groups.counts[view]
         pixels = np.ascontiguousarray(images[view], np.float32)
-        rows = np.empty((2 * count, ROW))
+        rows = np.empty((2 * count, TREE_COLUMNS))
         start = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
         pairs = adjacent_pairs(labels)
         # Weight of squared pixels, relative to squared colours; without it regions become snakes that no Gaussian fits
@@ -210,8 +218,8 @@ def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
     Predicted quality is q(N) = -10 log10(floor + D(N)) dB. Its slope at N is measured between N / 1.25 and N, in dB per
-    relative increase of N. The knee is the largest N with a slope of at least ``KNEE_SLOPE``, or the least N if there
-    is none. ``counts [m]`` are all different; ``distortions [m]`` are mean squared errors per pixel and channel.
+    relative increase of N. The knee is the largest N with a slope of at least ``REGION_KNEE_SLOPE``, or the least N if
+    there is none. ``counts [m]`` are all different; ``distortions [m]`` are mean squared errors per pixel and channel.
     """
     counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
     if len(counts) == 0 or counts.shape != distortions.shape:
@@ -221,5 +229,5 @@ def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     quality = -10 * log10(KNEE_FLOOR + np.maximum(error, 0))
     knee_step = 1.25  # the slope of the curve is measured over this factor of the count
     before = np.interp(log_counts - log(knee_step), log_counts, quality)
-    steep = (quality - before) / log(knee_step) >= KNEE_SLOPE
+    steep = (quality - before) / log(knee_step) >= REGION_KNEE_SLOPE
     return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])

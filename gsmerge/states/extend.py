@@ -21,7 +21,7 @@ from gsmerge.photos.views import camera_kinds, concat_cameras, in_float64, resiz
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.compact import PIECE, CompactOptions
+from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
@@ -74,7 +74,7 @@ def extend(
     scene has the kept views at the size of the first batch's views; each has its mended photo, or what stands in for
     it. ValueError if a setting is impossible for the scene; SceneError if the scene seems to be in another world.
     """
-    options = options.with_settings(PIECE)
+    options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)

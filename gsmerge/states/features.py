@@ -28,7 +28,7 @@ from gsmerge.photos.views import concat_cameras, resize_cameras
 from gsmerge.pipeline import encode_views
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.compact import PIECE, CompactOptions
+from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
 from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat
@@ -135,7 +135,7 @@ def extend_features(
     harmonics have another degree.
     """
     _check_options(options)
-    options = options.with_settings(PIECE)
+    options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress) as record:
         prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame, outside=False)
         prepared_scene, world = prepared.scene, _check_world(state, prepared.scene, extend_options)

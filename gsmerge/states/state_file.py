@@ -31,7 +31,7 @@ from gsmerge.states.features import FeatureState, ViewSamples
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
 from gsmerge.values.words import count_words
 
-COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
+FEATURE_COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
 _MAX_MEMBERS = (1 << 40) - 1  # of a group; larger numbers are damaged
 
 
@@ -60,7 +60,7 @@ def save_state(path: StrPath, state: State, *, overwrite: bool = False, mode: in
         return
     features = state.features
     assert features is not None
-    arrays: dict[str, np.ndarray] = {f"merged.{name}": getattr(features.merged, name) for name in COLUMNS}
+    arrays: dict[str, np.ndarray] = {f"merged.{name}": getattr(features.merged, name) for name in FEATURE_COLUMNS}
     arrays |= {f"refined.{name}": getattr(features.refined, name) for name in CORRECTED}
     arrays |= {name: getattr(features, name) for name in ("views", "num_members", "saliency", "group")}
     arrays |= {f"samples.{name}": column for name, column in vars(features.samples).items()}
@@ -113,7 +113,7 @@ def _read_features(file: GsmFile) -> FeatureState:
     shapes: dict[str, tuple[int, ...]] = {
         "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (num_higher, 3), "latents": (weights.options.latent,),
     }  # fmt: skip
-    columns = {name: _numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in COLUMNS}
+    columns = {name: _numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in FEATURE_COLUMNS}
     merged = FeatureGaussians(
         **columns,
         views=_whole_numbers(file, "merged.views", g, -1, num_views),

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import Similarity, pose_changes
-from gsmerge.io.bounds import MAX_VIEWS, check_pixels
+from gsmerge.io.bounds import MAX_VIEWS, check_image_size
 from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, change_photos, photo_size, same_shape
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.settings.reading import Order
@@ -145,7 +145,7 @@ def make_camera_file(
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
-    check_count(path, len(views))
+    check_camera_count(path, len(views))
     lacks_intrinsics = all(view.K is None for view in views)
     if lacks_intrinsics:  # placeholders, which the checks accept
         sides = [float(max(view.size)) or 1.0 for view in views]
@@ -199,7 +199,7 @@ def _check_lens(path: StrPath, view: StoredView) -> None:
             raise SceneError(path, text, "correct it, or undistort the images first")
 
 
-def check_count(path: StrPath, count: int) -> None:
+def check_camera_count(path: StrPath, count: int) -> None:
     """Raise SceneError if a file has more cameras than the limit, before anything is allocated for each."""
     if count > MAX_VIEWS:
         raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found more")
@@ -347,7 +347,7 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
         if 0 in size or size == (1, 1):
             remedy = "add it, or give one photo for each camera, with its name or in the same order"
             raise SceneError(path, "expected the image size (w, h) of the cameras, found none", remedy)
-    check_pixels(path, *size)
+    check_image_size(path, *size)
     sides = np.stack([camera_file.widths, camera_file.heights], 1)
     has_size = (sides > 0).all(1, keepdims=True)
     Ks = camera_file.Ks.copy()

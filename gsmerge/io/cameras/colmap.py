@@ -15,7 +15,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rotation_entries
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, read_lines
-from gsmerge.io.cameras.camera_file import StoredView, check_count, make_lens, make_pinhole
+from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.first_bytes import read_start
 
@@ -130,7 +130,7 @@ def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
 
 def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
     (count,) = _numbers(file, "<Q")
-    check_count(path, count)
+    check_camera_count(path, count)
     cameras = {}
     for _ in range(count):
         camera_id, model_id, width, height = _numbers(file, "<iiQQ")
@@ -142,7 +142,7 @@ def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
 
 def _binary_images(path: Path, file: BinaryIO) -> list[_Image]:
     (count,) = _numbers(file, "<Q")
-    check_count(path, count)
+    check_camera_count(path, count)
     images = []
     for _ in range(count):
         _, *numbers, camera = _numbers(file, "<i7di")
@@ -162,7 +162,7 @@ def _has_content(line: str) -> bool:
 def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
     cameras: dict[int, StoredView] = {}
     for line in filter(_has_content, lines):
-        check_count(path, len(cameras) + 1)
+        check_camera_count(path, len(cameras) + 1)
         camera_id, model, width, height, *params = line.split(maxsplit=_MAX_WORDS)
         if len(params) != _NUM_PARAMS.get(model, len(params)) or max(len(width), len(height)) > _MAX_DIGITS:
             raise ValueError("wrong number of parameters, or digits")
@@ -182,7 +182,7 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredV
         if after_image and _lists_points(line, cameras):
             after_image = False
             continue
-        check_count(path, len(images) + 1)
+        check_camera_count(path, len(images) + 1)
         _, *numbers, camera, name = line.split(maxsplit=9)
         if len(numbers) != 7:
             raise ValueError("expected a rotation and a position")

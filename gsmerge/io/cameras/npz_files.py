@@ -21,8 +21,8 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.archives import open_archive
-from gsmerge.io.bounds import check_file, check_pixels, read_budget
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, MAX_NORMALISED_FOCAL, ORDERS, StoredView, check_count
+from gsmerge.io.bounds import check_file, check_image_size, read_budget
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, MAX_NORMALISED_FOCAL, ORDERS, StoredView, check_camera_count
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.photo_files import PhotoArrays
 from gsmerge.runtime.threads import quiet_warnings
@@ -121,7 +121,7 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tu
     is_list = poses.ndim == 3 and len(poses) > 0 and poses.shape[1:] in ((3, 4), (4, 4))
     if not is_list or Ks.shape != (len(poses), 3, 3):
         raise SceneError(path, f"expected {names[0]} and {names[1]}, found {poses.shape} and {Ks.shape}")
-    check_count(path, len(poses))
+    check_camera_count(path, len(poses))
     max_intrinsic = 1e12  # pixels; this refuses NaN and infinity, too
     if not (np.isfinite(poses).all() and np.all(np.abs(Ks.astype(np.float64)) < max_intrinsic)):
         raise SceneError(path, f"expected finite numbers in {names[0]} and {names[1]}, found NaN or inf")
@@ -135,7 +135,7 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
         raise SceneError(path, f"expected images [{count},h,w,3], found {list(images.shape)}")
     if images.dtype.kind not in "fiu":
         raise SceneError(path, f"expected images of numbers, found {images.dtype}")
-    check_pixels(path, images.shape[2], images.shape[1])
+    check_image_size(path, images.shape[2], images.shape[1])
     if images.dtype == np.uint8:
         return np.ascontiguousarray(images)
     read_budget(path).check_memory(images.nbytes + images.size, "images")

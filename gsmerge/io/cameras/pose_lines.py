@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_lines
-from gsmerge.io.cameras.camera_file import StoredView, check_count, make_pinhole
+from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.foreign import INTRINSICS
 
@@ -57,7 +57,7 @@ def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[n
             rows += [np.array(words, np.float64)] if words else []
         except ValueError as error:
             raise SceneError(path, f"line {number}: expected numbers ({error})") from error
-        check_count(path, len(rows))
+        check_camera_count(path, len(rows))
     return rows
 
 

@@ -39,7 +39,7 @@ def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUni
     ``plain [n,3]`` are the bytes of the file's columns red, green and blue. Harmonics of a scene go far below zero,
     where colours are darker than grey. RGB ends at black and at white.
     """
-    # Of the range from black to white, least part that RGB covers; faint scenes as harmonics cover less
+    # Least part of the range from black to white that RGB covers. Faint scenes as harmonics cover less
     min_spread = 0.5
     for units in _UNITS if len(stored) >= MIN_JUDGED else ():
         rgb = units.rgb(stored)

@@ -94,7 +94,7 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
     _check_types(path, row)
     by_kind: dict[ColumnKind | None, list[str]] = {}
     for name in row.names or ():
-        if name in arrays.REQUIRED or name.startswith("f_rest_"):
+        if name in arrays.REQUIRED_COLUMNS or name.startswith("f_rest_"):
             continue
         kind = _find_kind(name)
         if kind is not None or row[name].kind == "f":
@@ -114,7 +114,7 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
     """Raise SceneError if columns of Gaussians are whole numbers; plain colours may be bytes."""
     colors = arrays.color_columns(row.names)
     for name in row.names or ():
-        dtype, is_used = row[name], name in (*arrays.REQUIRED, *colors) or name.startswith("f_rest_")
+        dtype, is_used = row[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
         is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
         if is_used and dtype.kind != "f" and not is_color_byte:
             type_name = _NUMBERS[dtype.kind][dtype.itemsize // 2]

@@ -140,16 +140,16 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
     rows, prefix = _without_prefix(vertex.data)
     columns = set(rows.dtype.names or ())
     optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
-    missing = [name for name in arrays.REQUIRED if name not in columns | optional]
+    missing = [name for name in arrays.REQUIRED_COLUMNS if name not in columns | optional]
     if missing:
         check_columns(path, rows.dtype, ())  # other columns may give the reason
         remedy = "name a .ply of Gaussians, since this one has none"
         if any(name.startswith("packed_") for name in columns):
             remedy = "export it again, since it is compressed but lacks its element 'chunk'"
-        elif len(missing) < len(arrays.REQUIRED) // 2:
+        elif len(missing) < len(arrays.REQUIRED_COLUMNS) // 2:
             remedy = "export it again with them"
         if arrays.SCALES[0] in missing:  # without any scale, a third one is expected, too
-            missing = [name for name in arrays.REQUIRED if name in {*missing, arrays.SCALES[2]} - columns]
+            missing = [name for name in arrays.REQUIRED_COLUMNS if name in {*missing, arrays.SCALES[2]} - columns]
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")

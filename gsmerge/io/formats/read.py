@@ -215,7 +215,7 @@ def convert_files(
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
-    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS}
+    used = {*arrays.REQUIRED_COLUMNS, *arrays.color_columns(names), *arrays.NORMALS}
     part_notes = dict.fromkeys(note for part in parts for note in part.notes)
     info = FileInfo(
         path=str(path),

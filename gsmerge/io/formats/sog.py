@@ -46,7 +46,7 @@ VERSION = 2  # of the format, in its metadata
 MODELS = {arrays.MIP: "antialiased", arrays.FLAT: "2dgs"}  # splat-transform's names of the modes of rendering
 GENERATOR = "gsmerge"
 # All files that writers make
-FILES = (
+SOG_FILES = (
     "means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_centroids.webp", "shN_labels.webp",
     META,
 )  # fmt: skip
@@ -169,7 +169,7 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
         raise SceneError(budget.path, problem, f"export it as version {VERSION}")
     count = check_whole(meta["count"], "count", 1)
     bands = check_whole(meta["shN"]["bands"], "bands", 1, MAX_DEGREE) if meta.get("shN") else 0
-    arrays.check_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)
+    arrays.check_gaussian_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)
     models = {model: mode for mode, model in MODELS.items()}
     mode = models.get(str(meta.get("model")), arrays.MIP if meta.get("antialias") is True else None)
     packed = _read_packed(files, meta, count, budget)

@@ -10,20 +10,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gsmerge.errors import GsmergeError, SceneError, UsageError
-from gsmerge.io.first_bytes import PACKAGE
+from gsmerge.io.first_bytes import CONVERTER_PACKAGE
 
-PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
+SPLAT_TRANSFORM_PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
 TIME_LIMIT = 1800  # seconds
 
 
 def find_program() -> str:
     """Find the path of the program; UsageError, which says how to install it, if there is none."""
     named = os.environ.get(VARIABLE)
-    program = shutil.which(named or PROGRAM)
+    program = shutil.which(named or SPLAT_TRANSFORM_PROGRAM)
     if program is None:
         place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
-        problem = f"expected the program {place}, found none; install it with npm install -g {PACKAGE}"
-        raise UsageError(f"{PROGRAM}: {problem}")
+        problem = f"expected the program {place}, found none; install it with npm install -g {CONVERTER_PACKAGE}"
+        raise UsageError(f"{SPLAT_TRANSFORM_PROGRAM}: {problem}")
     return program
 
 
@@ -52,4 +52,6 @@ def name_file(path: Path) -> Iterator[None]:
     try:
         yield
     except SceneError as error:
-        raise SceneError(path, f"{PROGRAM} wrote a file that cannot be used: {error.problem}") from error
+        raise SceneError(
+            path, f"{SPLAT_TRANSFORM_PROGRAM} wrote a file that cannot be used: {error.problem}"
+        ) from error

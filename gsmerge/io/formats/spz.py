@@ -39,8 +39,8 @@ HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
 MIP_FLAG = 1  # render the Gaussians antialiased
-RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
-AXES = (
+EXTENSION_RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
+AXIS_SYSTEMS = (
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
 )  # fmt: skip
@@ -117,18 +117,19 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
 def _stored_axes(path: StrPath, extensions: bytes) -> str:
     """Return the axes that the extensions name, by default those of a ``.ply``; SceneError if they are unknown."""
     at = 0
-    axes_kind = 0xADBE0003  # of SPZ_ADOBE_coordinate_system; its content is 1 for the first of AXES, or 0 for unknown
-    while at + RECORD.size <= len(extensions):
-        kind, size = RECORD.unpack_from(extensions, at)
-        at += RECORD.size + size
+    # Kind of SPZ_ADOBE_coordinate_system. Its content is 1 for the first of AXIS_SYSTEMS, or 0 for unknown
+    axes_kind = 0xADBE0003
+    while at + EXTENSION_RECORD.size <= len(extensions):
+        kind, size = EXTENSION_RECORD.unpack_from(extensions, at)
+        at += EXTENSION_RECORD.size + size
         if kind == axes_kind:
             content = extensions[at - size : at]
             number = int.from_bytes(content, "little") if len(content) == size == 4 else -1
-            if not 0 <= number <= len(AXES):
+            if not 0 <= number <= len(AXIS_SYSTEMS):
                 found = f"number {number}" if number > 0 else "a damaged record"
-                problem = f"expected axes 0 to {len(AXES)} in SPZ_ADOBE_coordinate_system, found {found}"
+                problem = f"expected axes 0 to {len(AXIS_SYSTEMS)} in SPZ_ADOBE_coordinate_system, found {found}"
                 raise SceneError(path, problem, "export it again without this extension")
-            return AXES[number - 1] if number else PLY_AXES
+            return AXIS_SYSTEMS[number - 1] if number else PLY_AXES
     return PLY_AXES
 
 
@@ -146,7 +147,7 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
         raise SceneError(path, problem, "export it again")
     if header.count == 0:
         raise SceneError(path, f"expected at least one Gaussian in {len(packed)} bytes, found a count of 0", AGAIN)
-    arrays.check_count(budget, header.count, header.num_higher, sum(header.widths))
+    arrays.check_gaussian_count(budget, header.count, header.num_higher, sum(header.widths))
     return header
 
 

@@ -261,7 +261,7 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
             raise SceneError(chunk, problem, "export it again")
         num_bytes, total = num_bytes + contents[-1].num_bytes, total + packed.count
         num_higher = max(num_higher, packed.num_higher)
-        arrays.check_count(ReadBudget(path, num_bytes), total, num_higher, sog.PACKED_BYTES)
+        arrays.check_gaussian_count(ReadBudget(path, num_bytes), total, num_higher, sog.PACKED_BYTES)
     return contents
 
 
@@ -274,6 +274,6 @@ def remove_unused_chunks(path: Path) -> None:
     for folder in path.parent.iterdir():
         if _CHUNK.fullmatch(folder.name) and folder.name not in used and folder.is_dir() and not folder.is_symlink():
             with suppress(OSError):
-                for name in sog.FILES:
+                for name in sog.SOG_FILES:
                     (folder / name).unlink(missing_ok=True)
                 folder.rmdir()

@@ -14,7 +14,7 @@ from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1,
 # Where most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces "deal". The list of
 # a tile then ends where no light passes the Gaussians in front
 PHASES = ("cull", "project", "count", "count_open", "deal", "deal_open", "blend", "loss", "backward", "update")
-PIECE = 1 << 13  # Gaussians that are culled or projected by one thread at a time
+THREAD_GAUSSIANS = 1 << 13  # Gaussians that are culled or projected by one thread at a time
 
 # State of the fit, buffers over its n Gaussians, over tiles, over intersections and over pixels, then what a step sets
 STEP = Table(

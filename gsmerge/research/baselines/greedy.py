@@ -20,7 +20,7 @@ from gsmerge.kernels.elementary import log, power
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map, use_threads
-from gsmerge.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of, merge_rows
+from gsmerge.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of_cloud, merge_rows
 from gsmerge.types import Gaussians
 
 Floats = NDArray[np.float64]
@@ -119,12 +119,12 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
     return cloud
 
 
-def merge(gaussians: Gaussians, count: int) -> Gaussians:
+def merge_greedily(gaussians: Gaussians, count: int) -> Gaussians:
     """Merge pairs in rounds until at most ``count`` Gaussians are left."""
     cloud = cloud_of(gaussians)
     cloud.masses[:] = gaussians.opacities.clip(MIN_OPACITY, 1) * areas(gaussians.scales)
     cloud = reduce_to(cloud, count)
-    merged = gaussians_of(cloud, gaussians)
+    merged = gaussians_of_cloud(cloud, gaussians)
     opacities = np.minimum(cloud.masses / areas(merged.scales), MAX_OPACITY).astype(np.float32)
     return replace(merged, opacities=opacities)
 
@@ -135,4 +135,4 @@ def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     if len(gaussians) <= count:
         return gaussians
     with stage("reduce"):
-        return merge(gaussians, count)
+        return merge_greedily(gaussians, count)

@@ -38,7 +38,7 @@ class Metric:
     digits: int  # number of decimals
 
 
-METRICS = {
+CHART_METRICS = {
     "psnr": Metric("PSNR (dB)", True, 2),
     "ssim": Metric("SSIM", True, 3),
     "lpips_vgg": Metric("LPIPS (VGG)", False, 3),
@@ -152,7 +152,7 @@ class Results:
         self.names = line_names(list(keys))
         counts = {part: sum(r.value(f"psnr_{part}") is not None for r in self.runs) for part in PARTS}
         self.part = next((p for p in counts if self.runs and counts[p] >= 0.9 * len(self.runs)), "context")
-        names = [m for m in METRICS if any(r.value(f"{m}_{self.part}") is not None for r in self.runs)]
+        names = [m for m in CHART_METRICS if any(r.value(f"{m}_{self.part}") is not None for r in self.runs)]
         self.metrics = [m for m in names if m != "lpips_alex" or "lpips_vgg" not in names]
 
     @property

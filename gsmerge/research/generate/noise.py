@@ -13,7 +13,7 @@ from gsmerge.kernels.pictures import blur, convolve
 from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.research.generate.photograph import Float, Pinhole
 from gsmerge.research.generate.shapes import Array, rotate
-from gsmerge.research.generate.textures import enlarge
+from gsmerge.research.generate.textures import enlarge_texture
 from gsmerge.types import SH_C0, Gaussians
 
 Range = tuple[float, float]
@@ -67,17 +67,17 @@ class NoiseOptions:
     unit: Range = (0.2, 5.0)  # world units per metre
 
 
-RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]
+NOISE_RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]
 if TYPE_CHECKING:
     Noise: TypeAlias = Any
 else:  # the values that were drawn for one scene, under the names of their ranges
-    Noise = make_dataclass("Noise", [*RANGES, "sh_degree"], frozen=True)
+    Noise = make_dataclass("Noise", [*NOISE_RANGES, "sh_degree"], frozen=True)
 
 
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
     """Draw the values of one scene; ``factor`` multiplies errors, not habits. Shares and ``bleed`` are at most 1."""
     drawn: dict[str, float] = {}
-    for name in RANGES:
+    for name in NOISE_RANGES:
         low, high = getattr(options, name)
         is_log = name in LOG_UNIFORM
         drawn[name] = float(exp(rng.uniform(log(low), log(high)))) if is_log else rng.uniform(low, high)
@@ -104,7 +104,7 @@ class TrueView:
 def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) -> Float:
     """Draw smooth noise ``[height,width]`` of standard deviation 1, with ``cells`` cells along the longer side."""
     side = max(height, width)
-    field = enlarge(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
+    field = enlarge_texture(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
     return field / max(float(field.std(dtype=np.float64)), 1e-3)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.kernels.elementary import arctan2, cos, power, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack, rotate
+from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack_shapes, rotate
 from gsmerge.research.generate.textures import Picture, pyramid
 
 NO_SURFACE_DEPTH = 1e6  # depth of pixels without a surface
@@ -154,7 +154,7 @@ def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, 
 
 def light_stage(stage: Stage) -> LitStage:
     """Prepare a stage for rendering: arrays, smaller textures, shadow maps."""
-    opaque = pack([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
+    opaque = pack_shapes([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
     extent = bounds(opaque)
     reach = np.linalg.norm(extent, axis=1)
     low, high = (opaque.centres - reach[:, None]).min(0), (opaque.centres + reach[:, None]).max(0)
@@ -166,7 +166,7 @@ def light_stage(stage: Stage) -> LitStage:
     from_below = 0.5  # brightness of light from below, relative to light from above
     return LitStage(
         stage,
-        pack(stage.shapes),
+        pack_shapes(stage.shapes),
         tuple(pyramid(texture) for texture in stage.textures),
         axes,
         middle,

@@ -30,7 +30,7 @@ from gsmerge.research.generate.photograph import (
     radiance,
     trace,
 )
-from gsmerge.research.generate.shapes import Array, invert, norm
+from gsmerge.research.generate.shapes import Array, invert_motion, norm
 from gsmerge.research.generate.textures import Palette
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.setting import Settings, setting
@@ -161,7 +161,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     num_places = len(shoot.poses)
     photo_seeds = rng.integers(0, 2**63, num_places)
     # many exporters use the frame of the first camera
-    shoot = replace(shoot, to_export=invert(shoot.poses[0]) if rng.random() < 0.5 else np.eye(4))
+    shoot = replace(shoot, to_export=invert_motion(shoot.poses[0]) if rng.random() < 0.5 else np.eye(4))
     views, targets = range(0, num_places, 2), range(1, num_places, 2)
     errors = {place: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for place in views}
 
@@ -247,5 +247,5 @@ def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> 
 
 
 def _cameras(poses: Sequence[Array], lens: Pinhole) -> Cameras:
-    viewmats = np.stack([invert(pose) for pose in poses])
+    viewmats = np.stack([invert_motion(pose) for pose in poses])
     return Cameras(viewmats, np.repeat(lens.intrinsics[None], len(poses), 0), lens.width, lens.height)

@@ -22,7 +22,7 @@ Color: TypeAlias = NDArray[Any]
 Grey: TypeAlias = NDArray[Any]  # float32: square, repeating without a seam, 0 to 1
 
 
-def enlarge(cells: NDArray[np.float64], size: int) -> Grey:
+def enlarge_texture(cells: NDArray[np.float64], size: int) -> Grey:
     """Enlarge a small periodic picture smoothly to ``[size,size]``."""
     return pictures.enlarge(cells, size, size, periodic=True)
 
@@ -37,7 +37,7 @@ def noise(
     """
     out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
     while cells <= size // 2:
-        layer = enlarge(rng.uniform(-1, 1, (cells, max(1, cells // stretch))), size)
+        layer = enlarge_texture(rng.uniform(-1, 1, (cells, max(1, cells // stretch))), size)
         out += strength * (1 - 2 * np.abs(layer) if ridged else layer)
         strength, cells = strength * fade, cells * 2
     low, high = np.percentile(out, (1, 99))
@@ -236,7 +236,7 @@ def carpet(rng: np.random.Generator, size: int) -> Picture:
     base = color(rng, strength=(0.1, 0.7), light=(0.2, 0.6))
     out = mix(*shades(rng, base, 0.4), noise(rng, size, first=32, fade=0.95))
     if rng.random() < 0.5:
-        motif = enlarge(np.pad(rng.uniform(0, 1, (4, 4)), ((0, 4), (0, 4)), mode="symmetric"), size)
+        motif = enlarge_texture(np.pad(rng.uniform(0, 1, (4, 4)), ((0, 4), (0, 4)), mode="symmetric"), size)
         mask = np.mod(3 * motif, 1)[..., None] > 0.5
         out = np.where(mask, out, 0.3 * out + 0.7 * color(rng, strength=(0.2, 0.8)))
     return out.astype(np.float32)

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsmerge.geometry.pooling import Members, pool_members, to_gaussians
-from gsmerge.measure.lpips import EPSILON, SCALE, SHIFT, Layer, min_size, read_layers
+from gsmerge.measure.lpips import EPSILON, INPUT_SCALE, INPUT_SHIFT, Convolution, min_size, read_layers
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR_PLANE
@@ -56,9 +56,9 @@ def _kernels(net: str) -> list[Tensor]:
     return [torch.from_numpy(layer.kernel).permute(0, 3, 1, 2) for layer in read_layers(net)]
 
 
-def _unit_features(image: Tensor, layers: tuple[Layer, ...], kernels: list[Tensor]) -> Iterator[Tensor]:
+def _unit_features(image: Tensor, layers: tuple[Convolution, ...], kernels: list[Tensor]) -> Iterator[Tensor]:
     """Yield the features ``[c,h,w]`` of each compared layer, with unit length at every pixel."""
-    values = (2 * image[None] - 1 - torch.from_numpy(SHIFT)) / torch.from_numpy(SCALE)
+    values = (2 * image[None] - 1 - torch.from_numpy(INPUT_SHIFT)) / torch.from_numpy(INPUT_SCALE)
     features = values.permute(0, 3, 1, 2)
     for layer, kernel in zip(layers, kernels, strict=True):
         conv = layer.conv

@@ -18,7 +18,7 @@ FROM_0_LIMITS: dict[str, Any] = {"least": 0, "most": 10**9}
 SHARE_LIMITS: dict[str, Any] = {"least": 0, "most": 1}
 RATE_LIMITS: dict[str, Any] = {"least": 1e-12, "most": 1e6}
 WEIGHT_LIMITS: dict[str, Any] = {"least": 0, "most": 1e6}
-LISTS = ("levels", "densities", "views", "random_views")
+LIST_OPTIONS = ("levels", "densities", "views", "random_views")
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class TrainOptions(Settings):
     seed: int = setting(0, "Seed of all random numbers.", **FROM_0_LIMITS)
 
     def __post_init__(self) -> None:
-        for name in LISTS:  # JSON and TOML have lists
+        for name in LIST_OPTIONS:  # JSON and TOML have lists
             object.__setattr__(self, name, tuple(getattr(self, name)))
         super().__post_init__()
         if self.random_views and (len(self.random_views) != 2 or self.random_views[0] > self.random_views[1]):
@@ -132,7 +132,7 @@ class TrainOptions(Settings):
 
     def to_dict(self) -> dict[str, Any]:
         """Convert all settings to plain values."""
-        return asdict(self) | {name: list(getattr(self, name)) for name in LISTS}
+        return asdict(self) | {name: list(getattr(self, name)) for name in LIST_OPTIONS}
 
 
 # Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper. Settings that the paper does not state have their
@@ -169,7 +169,7 @@ PAPER: Mapping[str, Any] = {
 }
 # Settings of the shipped networks. Encoder and merger gained nothing in validation, and colour corrections learnt the
 # exposure of the training photos; docs/internals/networks.md has the figures.
-SHIPPED: Mapping[str, Any] = {
+SHIPPED_TRAINING: Mapping[str, Any] = {
     "encoder": False,
     "merger": False,
     "color": 0.0,  # the bound of corrections
@@ -204,7 +204,7 @@ PAPER_SHIPPED: Mapping[str, Any] = {
     "validation_windows": 4,
 }
 PRESETS: Mapping[str, Mapping[str, Any]] = {
-    "default": {}, "shipped": SHIPPED, "paper": PAPER, "paper-shipped": PAPER_SHIPPED,
+    "default": {}, "shipped": SHIPPED_TRAINING, "paper": PAPER, "paper-shipped": PAPER_SHIPPED,
 }  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale, tr
 from gsmerge.fit.schedule import DrawMode, prepare_fit
 from gsmerge.geometry.transforms import project
 from gsmerge.photos.views import subset
-from gsmerge.raster.photos import EPS2D, MASKED_WEIGHT, scene_photos, score_photos
+from gsmerge.raster.photos import MASKED_WEIGHT, scene_photos, score_photos
+from gsmerge.raster.tiled_view import EPS2D
 from gsmerge.types import LargePhotos, PicturedScene
 
 LONG = FitOptions(fit_steps=160, holdout=0.2)
