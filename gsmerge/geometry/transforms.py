@@ -20,7 +20,7 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 from gsmerge.values.arrays import Array
 
-State = TypeVar("State")  # state that a descent changes
+DescentState = TypeVar("DescentState")  # state that a descent changes
 SH_DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
 # More values than the first number are narrowed down before the median is taken: to those between two shares of a
 # sample of about the second number, which are so far from a half that the median is practically always between them
@@ -414,8 +414,11 @@ class Damping:
 
 
 def descend(
-    start: State, error: Callable[[State], float], step: Callable[[State, float], State | None], damping: Damping
-) -> State:
+    start: DescentState,
+    error: Callable[[DescentState], float],
+    step: Callable[[DescentState, float], DescentState | None],
+    damping: Damping,
+) -> DescentState:
     """Take damped steps that each lower the error, by Levenberg and Marquardt's rule, and return the last state.
 
     ``step`` takes a state and its damping, and returns the next state, or None if there is none.

@@ -18,7 +18,7 @@ from gsmerge.io.xml_files import read_xml
 _ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component_id", "label"}
 
 
-def list_cameras(source: CameraSource) -> list[Entry]:
+def list_metashape_cameras(source: CameraSource) -> list[Entry]:
     """List the cameras of the largest component, each with its sensor."""
     path = source.path
     root, cameras = _largest_component(path)

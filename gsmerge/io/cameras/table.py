@@ -127,7 +127,7 @@ _POLYCAM = ViewLayout(
     views=list_keyframes, pose=Matrix("transform"), K=PinholeKeys("fx", "fy", "cx", "cy"), size=("width", "height")
 )
 _METASHAPE = ViewLayout(
-    views=_lazy("metashape.list_cameras"),
+    views=_lazy("metashape.list_metashape_cameras"),
     pose=Matrix("transform"),
     K=PinholeKeys("fx", "fy", "cx", "cy"),
     size=("width", "height"),
