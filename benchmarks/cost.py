@@ -40,7 +40,7 @@ from matplotlib.figure import Figure
 
 from gsmerge.io import read_ply
 from gsmerge.io.formats.splat_transform import find_program
-from gsmerge.research.charts.figures import COLORS, RC
+from gsmerge.research.charts.figures import LINE_COLORS, RC
 
 DEFAULTS, INPUT = "defaults", "the input"
 OURS: dict[str, tuple[str, ...]] = {
@@ -99,7 +99,7 @@ def draw_chart(records: list[Record], names: list[str], path: Path) -> None:
         figure = Figure(figsize=(7.2, 2.6), layout="constrained")
         panels = figure.subplots(1, 2)
         for axes, key, label in zip(panels, ("psnr", "lpips"), ("PSNR, dB", "LPIPS, less is better"), strict=True):
-            for name, color in zip(names, ("#888888", *COLORS[: len(OURS)], "#333333", "#999999"), strict=False):
+            for name, color in zip(names, ("#888888", *LINE_COLORS[: len(OURS)], "#333333", "#999999"), strict=False):
                 some = [record for record in records if record["name"] == name]
                 if name == INPUT:
                     axes.axhline(mean(some, key), color=color, linewidth=0.8, linestyle=":", label=INPUT)

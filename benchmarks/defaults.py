@@ -21,16 +21,16 @@ from captures import Record, Records, export, make_parser, make_table, read_held
 from matplotlib.figure import Figure
 
 import gsmerge
-from gsmerge.facts.confirm_depths import FEWEST, MOST, WRONG
+from gsmerge.facts.confirm_depths import FEWEST, MOST_PER_PIXEL, WRONG_SHARE
 from gsmerge.measure.fog import ALL
-from gsmerge.measure.scores import OUTSIDE
+from gsmerge.measure.scores import OUTSIDE_COLUMNS
 from gsmerge.research.charts.lines import mean_interval
 from gsmerge.types import Views
 
 SEEDS = 5
 MEASURED = gsmerge.EvaluateOptions(lpips=("vgg",), lpips_views=2, context=False)
 COLUMNS = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 3)}  # heading and digits
-COLUMNS |= {name: (heading, 3) for name, heading in OUTSIDE.items()}
+COLUMNS |= {name: (heading, 3) for name, heading in OUTSIDE_COLUMNS.items()}
 DEPTHS = "confirmed", "contradicted", "alone"  # shares of the depth by what other views say
 SHARES = "1%", "2%", "4.4%", "7%", "10%", "30%"
 PANELS = {"psnr": ("PSNR, dB", np.min), "lpips": ("LPIPS (less is better)", np.max)}  # label, and the worst of several
@@ -84,10 +84,12 @@ def draw_shares(runs: Mapping[str, Sequence[Record]], out: Path) -> None:
     figure = Figure(figsize=(8.4, 3.1), layout="constrained")
     x = [float(share[:-1]) for share in SHARES]
     for axis, (name, (label, worst)) in zip(figure.subplots(1, len(PANELS)), PANELS.items(), strict=True):
-        axis.axvspan(100 * FEWEST, 100 * MOST, color="#0072b2", alpha=0.15, lw=0)
+        axis.axvspan(100 * FEWEST, 100 * MOST_PER_PIXEL, color="#0072b2", alpha=0.15, lw=0)
         axis.axhline(0, color="#ccc", lw=0.8)
         for kind, color in (("confirmed", "#0072b2"), ("wrong", "#999")):
-            some = [rows for rows in runs.values() if (rows[usual]["confirmed"] >= WRONG) == (kind == "confirmed")]
+            some = [
+                rows for rows in runs.values() if (rows[usual]["confirmed"] >= WRONG_SHARE) == (kind == "confirmed")
+            ]
             if some:
                 change = np.array([[row[name] - rows[usual][name] for row in rows] for rows in some])
                 axis.plot(x, change.mean(0), "o-", color=color, ms=4, label=f"{len(some)} captures, depth {kind}")

@@ -17,9 +17,6 @@ from gsmerge.geometry.transforms import rotmat_to_quat
 from gsmerge.kernels.matrices import eigh, invert
 from gsmerge.values.arrays import Array, as_array, like
 
-_OTHER_SIZE = 0.1  # intrinsics are of another image size if all principal points differ by more than this share
-_BYTES = 255.0  # largest value of an 8-bit image
-
 
 def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     """Convert a ``Prediction`` of Depth Anything 3 with ``infer_gs=True``: all Gaussians, one per pixel, and the views.
@@ -205,7 +202,8 @@ def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, 
 
 def _as_floats(photos: np.ndarray) -> np.ndarray:
     """Convert 8-bit photos to [0, 1]; leave float photos unchanged."""
-    return photos / np.float32(_BYTES) if photos.dtype == np.uint8 else photos
+    max_byte = 255.0  # largest value of an 8-bit image
+    return photos / np.float32(max_byte) if photos.dtype == np.uint8 else photos
 
 
 def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
@@ -215,7 +213,8 @@ def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
     principal point is in the middle at both sizes.
     """
     factors = np.array([photos.shape[-2], photos.shape[-3]]) / (2 * Ks[:, (0, 1), 2])
-    is_other_size = np.abs(factors - 1).min() > _OTHER_SIZE
+    min_difference = 0.1  # intrinsics are of another image size if all principal points differ by more than this share
+    is_other_size = np.abs(factors - 1).min() > min_difference
     return Ks * np.concatenate([factors, np.ones((len(Ks), 1))], 1)[:, :, None] if is_other_size else Ks
 
 

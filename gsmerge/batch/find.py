@@ -25,7 +25,6 @@ from gsmerge.values.words import count_words
 
 NamedScene = tuple[Path, Path | None]  # a scene, and the folder that the user named; None if that was the scene itself
 MAX_FOLDERS = 100_000  # folders without a scene after the last scene; a link into a system's folders leads to more
-_JOB_BYTES = 700  # memory for each scene of a list
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
 # Names in a folder that looks like a scene, without .ply; a folder with such a name is part of one
@@ -215,6 +214,7 @@ def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
 def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:
     """Yield the scenes of a list, whose paths are relative to its folder; a missing scene fails when it is read."""
     budget, lines = read_budget(file), dict[str, None]()
+    job_bytes = 700  # memory for each scene of a list
     for line in read_lines(file):
         if "\0" in line:
             raise SceneError(file, "expected a text file with one path per line, found no text")
@@ -223,7 +223,7 @@ def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:
                 file, "expected a list of scenes, one path per line, found JSON", "name the folder of the scene"
             )
         lines[line.strip()] = None
-        budget.check_memory(_JOB_BYTES * len(lines), count_words(len(lines), "scene"))
+        budget.check_memory(job_bytes * len(lines), count_words(len(lines), "scene"))
     paths = [file.parent / os.path.expanduser(entry) for entry in lines if entry and not entry.startswith("#")]
     for path in sorted(paths, key=count_links):
         if not os.path.isdir(path):

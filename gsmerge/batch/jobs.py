@@ -30,7 +30,7 @@ from gsmerge.types import StrPath
 from gsmerge.version import __version__
 
 FIELDS = ("stem", "parent", "index", "k")
-PLACES = ("cameras", "images", "masks", "protect")  # options that name files and folders beside a scene
+PLACE_OPTIONS = ("cameras", "images", "masks", "protect")  # options that name files and folders beside a scene
 
 DISTINGUISH = "distinguish them with --name, such as '{parent}-{stem}.ply'"
 
@@ -139,7 +139,7 @@ class Job:
 
     def find_files(self) -> SceneFiles:
         """Find the files of the scene; SceneError if there are none."""
-        places = {name: getattr(self, name) for name in PLACES}
+        places = {name: getattr(self, name) for name in PLACE_OPTIONS}
         return find_scene_files(Path(self.scene), **places, within=self.within)
 
 
@@ -162,7 +162,7 @@ def find_jobs(
     if options.settings.checkpoint not in CHECKPOINTS:
         load_checkpoint(options.settings.checkpoint)  # fail once, not for each scene
     call = CompactCall(options.settings, options.opacity, options.hints)
-    for name in PLACES:
+    for name in PLACE_OPTIONS:
         _check_place(name, getattr(options, name))
     jobs: list[Job] = []
     owners: dict[str, list[str]] = {}  # scenes by the name of a result
@@ -176,7 +176,7 @@ def find_jobs(
         outputs = _output_names(options, scene, len(jobs))
         for name in outputs:
             owners.setdefault(os.path.normcase(name), []).append(str(scene))  # on Windows A.ply and a.ply are one file
-        patterns = {name: getattr(options, name) for name in PLACES}
+        patterns = {name: getattr(options, name) for name in PLACE_OPTIONS}
         paths: dict[str, Any] = {
             name: pattern if pattern == NONE else fill_template(pattern, scene) for name, pattern in patterns.items()
         }

@@ -89,7 +89,7 @@ def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **facts}
 
 
-def check_folder(folder: Path) -> None:
+def prepare_folder(folder: Path) -> None:
     """Make the output folder; SceneError if its records cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ from typing import Any
 
 from gsmerge.batch.find import main_file
 from gsmerge.batch.jobs import DISTINGUISH, BatchOptions, Job
-from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, check_folder, record
+from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, prepare_folder, record
 from gsmerge.errors import SceneError, error_line
 from gsmerge.io.atomic import atomic_output, describe_existing, remove_stale
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
@@ -88,7 +88,7 @@ def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> li
 
 def _record_failure(job: Job, folder: Path, reason: str) -> dict[str, Any]:
     """Make the record of a failure, which says if an earlier result of the scene stays."""
-    known = read_index(folder).read_on().results.get(job.output)
+    known = read_run_index(folder).read_on().results.get(job.output)
     is_kept = known is not None and known.scene == job.scene and os.path.lexists(folder / job.output)
     return record(
         FAILED, job.scene, job.output, error=reason + f"; its earlier result {folder / job.output} stays" * is_kept
@@ -134,7 +134,7 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
     is not installed.
     """
     concurrency = choose_concurrency(jobs, options)
-    check_folder(folder)
+    prepare_folder(folder)
     run, active = Run(folder, concurrency.threads, options.overwrite), dict[str, Job]()  # by scene
     with ExitStack() as stack:
         stack.callback(lambda: remove_unfinished(run, active.values()))
@@ -153,9 +153,9 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
         remaining, wait = sorted(jobs, key=lambda job: job.memory * concurrency.jobs > concurrency.memory), False
         while remaining:
             busy: list[Job] = []
-            for job, outcome in pool.run(make_result, make_calls(remaining, wait=wait)):
+            for job, outcome in pool.run(run_job, make_calls(remaining, wait=wait)):
                 del active[job.scene]
-                line = make_result(job, run, False, outcome.reason) if isinstance(outcome, LostProcess) else outcome
+                line = run_job(job, run, False, outcome.reason) if isinstance(outcome, LostProcess) else outcome
                 if line is None:
                     busy.append(job)
                 else:
@@ -163,7 +163,7 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
             remaining, wait = busy, True
 
 
-def make_result(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str, Any] | None:
+def run_job(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str, Any] | None:
     """Make a result unless it is done, record the outcome, and return the record.
 
     If another process works on the result, ``wait`` for it or return None. ``lost``: why the process that made the
@@ -187,7 +187,7 @@ def make_result(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict
 def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     """Make a locked result unless it is done or refused; return its record."""
     files = job.find_files()
-    key, known = job.call.key(files), read_index(run.folder).read_on().results.get(job.output)
+    key, known = job.call.key(files), read_run_index(run.folder).read_on().results.get(job.output)
     if known is not None and not run.overwrite and known.holds(run.folder, key):
         return record(
             SKIPPED, job.scene, job.output, key=key, files=known.files, doubts=known.doubts, unmet=known.unmet
@@ -218,7 +218,7 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1)
-def read_index(folder: Path) -> RecordIndex:
+def read_run_index(folder: Path) -> RecordIndex:
     """Return the index of a folder's records; each process keeps it between the calls of a run."""
     return RecordIndex(folder)
 

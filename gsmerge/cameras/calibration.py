@@ -30,12 +30,8 @@ from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
-_FOCALS = (1.2, 4.8)  # focal lengths, in longer sides of the picture, at which the search begins
 _FREE_INTRINSICS = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
-_ROUNDS = 2  # of solving; each round leaves out the points that the round before found far from their pixels
 _FAR, _FAR_PX = 3.0, 1.0  # a point is far beyond this multiple of the median distance and this number of pixels
-_SMALLEST_PX = 1e-3  # smaller distances count as this, since means have only 24 bits
-_MAX_UNCERTAINTY = 0.05  # of the focal length, relative; larger where points are nearly a plane in front of the camera
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,8 @@ class _Model:
     def criterion(self, far: float) -> float:
         """Compute the Bayesian information criterion, with distances clipped at ``far`` pixels."""
         with np.errstate(invalid="ignore"):
-            errors = np.nan_to_num(np.concatenate(self.errors), nan=far).clip(_SMALLEST_PX, far)
+            smallest_px = 1e-3  # smaller distances count as this, since means have only 24 bits
+            errors = np.nan_to_num(np.concatenate(self.errors), nan=far).clip(smallest_px, far)
         count = 2.0 * len(errors)
         return count * float(log((errors * errors).mean())) + self.free * float(log(count))
 
@@ -86,7 +83,9 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
     model = _choose_model(points, pixels, (width, height), bound) if bound <= limit else None
     if model is None or model.worst_px > limit:
         return None
-    if focal_uncertainty(points, pixels, model.Ks, model.poses) > _MAX_UNCERTAINTY:
+    # Relative uncertainty of the focal length. It is larger where points are nearly a plane in front of the camera
+    max_uncertainty = 0.05
+    if focal_uncertainty(points, pixels, model.Ks, model.poses) > max_uncertainty:
         return None
     viewmats = model.poses.copy()
     viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
@@ -115,7 +114,8 @@ def _solve_models(
     cameras.
     """
     one_focal_models = []
-    for share in _FOCALS:
+    first_focals = (1.2, 4.8)  # focal lengths, in longer sides of the picture, at which the search begins
+    for share in first_focals:
         focal = share * max(size)
         K = make_pinhole(focal, focal, size[0] / 2, size[1] / 2)
         starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
@@ -145,7 +145,8 @@ def _solve(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start: _M
     Raises numpy.linalg.LinAlgError if the points do not determine them.
     """
     K, poses, near_points, near_pixels = start.Ks[0], start.poses, points, pixels
-    for _ in range(_ROUNDS):
+    rounds = 2  # of solving; each round leaves out the points that the round before found far from their pixels
+    for _ in range(rounds):
         K, poses = refine_poses(near_points, near_pixels, K, poses, free=free)
         errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]
         is_near = [e <= max(_FAR_PX, _FAR * float(np.median(e))) for e in errors]  # one mask for each view

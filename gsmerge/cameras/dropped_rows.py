@@ -20,20 +20,14 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.reproject import follow_pixels
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
-_SAMPLES = 1500  # number of rows whose nearest neighbour is searched among the rows after them
 _MIN_SHARE, _MAX_LENGTHS = 0.02, 2  # share of samples with the same distance in rows; number of distances tried
-_SEEDS, _MAX_SERIES = 12, 200  # number of series of lines that are solved first, and in all
-_RARE = 0.05  # columns in a smaller share of the lines than the fullest column are left out
 # Least step back to the left, divided by the usual step; and largest step down, divided by the step back
 _WRAP, _BELOW = 8.0, 0.25
-_MAX_JUMPS = 100  # long steps per line; with more, rows are in no order
 _MIN_LINES = 6  # complete lines that follow each other
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # median distance of rows from their pixels
-_SAME = 2  # pixels of tolerance for the principal point
 # Number of lines beyond the solved lines that a camera predicts: as a share of the solved lines, and at least
 _AHEAD, _MIN_AHEAD = 0.3, 2
-_MAX_LOST = 16  # consecutive rows without a pixel, after which another view begins
 _MIN_PLACED = 0.9  # share of the rows that must have a pixel
 
 
@@ -61,7 +55,8 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
 def _find_lengths(points: np.ndarray) -> list[int]:
     """List the most common distances in rows from a row to its nearest neighbour after it: lengths of lines."""
     longest = min(_MAX_WIDTH, len(points) // 4)
-    starts = np.linspace(0, len(points) - longest - 1, _SAMPLES).astype(int)
+    num_samples = 1500  # number of rows whose nearest neighbour is searched among the rows after them
+    starts = np.linspace(0, len(points) - longest - 1, num_samples).astype(int)
     x, y, z = points.T.astype(np.float32)
 
     def find_nearest(start: int) -> int:
@@ -89,8 +84,9 @@ class _View:
 
 def _find_views(points: np.ndarray, length: int) -> list[_View]:
     """Find the views whose lines have ``length`` rows."""
-    series = _find_lines(points, length)[:_MAX_SERIES]
-    seeds = [_solve_lines(points, starts) for starts in series[:_SEEDS]]
+    num_first, max_series = 12, 200  # number of series of lines that are solved first, and in all
+    series = _find_lines(points, length)[:max_series]
+    seeds = [_solve_lines(points, starts) for starts in series[:num_first]]
     nearest = min((seed.px for seed in seeds if seed is not None), default=None)
     if nearest is None:
         return []
@@ -117,7 +113,8 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
     usual = np.median(steps[:count].reshape(-1, length), 1).repeat(length)
     usual = np.pad(usual, (0, len(steps) - count), mode="edge")
     rows = np.flatnonzero(steps > _WRAP * usual) + 1
-    if len(rows) * length > _MAX_JUMPS * len(points):
+    max_jumps = 100  # long steps per line; with more, rows are in no order
+    if len(rows) * length > max_jumps * len(points):
         return []
     return _collect_series(rows, _link_lines(rows, points[rows], _BELOW * steps[rows - 1], length))
 
@@ -174,7 +171,8 @@ def _drop_rare_columns(view: _View) -> _View:
     """Leave out outer columns that few lines have, and number the other columns from 0."""
     first = int(view.x.min())
     counts = np.bincount(view.x - first)
-    common = first + np.flatnonzero(counts >= _RARE * counts.max())
+    least_share = 0.05  # columns in a smaller share of the lines than the fullest column are left out
+    common = first + np.flatnonzero(counts >= least_share * counts.max())
     inside = (view.x >= common[0]) & (view.x <= common[-1])
     return _shift(replace(view, rows=view.rows[inside], x=view.x[inside], y=view.y[inside]), -int(common[0]))
 
@@ -191,6 +189,7 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
     first, last = view.rows[[0, -1]]
     before, after = np.flatnonzero(~free[:first]), np.flatnonzero(~free[last:])
     low, high = int(before[-1]) + 1 if len(before) else 0, int(last + after[0]) if len(after) else len(free)
+    max_lost = 16  # consecutive rows without a pixel, after which another view begins
     while True:
         top, lines = int(view.y.min()), int(np.ptp(view.y)) + 1
         reach = max(_MIN_AHEAD, int(_AHEAD * lines))
@@ -200,7 +199,7 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
         followed = np.ascontiguousarray(points[first:last], np.float32)
         pixels = follow_rows(followed, viewmat[None], shift[None], width, lines + 2 * reach)
         rows = np.flatnonzero(pixels >= 0)
-        stretches = np.split(rows, np.flatnonzero(np.diff(rows) > _MAX_LOST) + 1)
+        stretches = np.split(rows, np.flatnonzero(np.diff(rows) > max_lost) + 1)
         rows = max(stretches, key=len)
         y, x = np.divmod(pixels[rows], width)
         grown = _solve(points, _View(first + rows, x, y + top - reach, view.camera)) if len(rows) else view
@@ -254,7 +253,8 @@ def _choose_shifts(views: Sequence[tuple[np.ndarray, float]]) -> tuple[list[int]
     starts = firsts - middles
     corners = np.rint(starts - np.median(starts[sizes == sizes.max()])).astype(int)  # relative to the largest view
     inside = corners.clip(0, sizes.max() - sizes)
-    corners = np.where(np.abs(corners - inside) <= _SAME, inside, corners)
+    tolerance = 2  # of the principal point, pixels
+    corners = np.where(np.abs(corners - inside) <= tolerance, inside, corners)
     corners -= corners.min()
     return (corners - firsts).tolist(), int((corners + sizes).max())
 

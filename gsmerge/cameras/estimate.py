@@ -13,10 +13,6 @@ from gsmerge.cameras.layouts import ESTIMATED
 from gsmerge.geometry.transforms import median
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, make_camera_file
 
-_MOST_VIEWS = 64  # views that may follow each other at every pixel
-_STEPS = 2000  # steps that are measured for each number of views
-_FEW_PIXELS = 256  # of a view, at least
-
 
 def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> CameraFile | None:
     """Estimate the cameras of rows ``means [n,3]`` that are the pixels of a grid; None for other rows.
@@ -49,7 +45,10 @@ def _find_pixel_step(means: np.ndarray) -> int:
 
     It is the step after which points ``means [n,3]`` are nearest; 1 for a few rows.
     """
-    longest = min(_MOST_VIEWS, len(means) // _FEW_PIXELS)
-    starts = np.linspace(0, max(0, len(means) - longest - 1), _STEPS).astype(int)
+    most_views = 64  # views that may follow each other at every pixel
+    few_pixels = 256  # of a view, at least
+    longest = min(most_views, len(means) // few_pixels)
+    num_steps = 2000  # steps that are measured for each number of views
+    starts = np.linspace(0, max(0, len(means) - longest - 1), num_steps).astype(int)
     lengths = [np.abs(means[starts + step] - means[starts]).sum(1) for step in range(1, longest + 1)]
     return 1 + int(np.argmin([median(steps[np.isfinite(steps)]) for steps in lengths])) if lengths else 1

@@ -12,8 +12,6 @@ from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.types import Cameras, Gaussians
 
-_SOME_CAMERA = 4.0  # rows nearer than this multiple of the limit are the pixels of some projective camera
-
 
 def count_error(ply: FileInfo, cameras: Cameras) -> SceneError:
     """Make the SceneError for rows that are not the pixels of the cameras."""
@@ -36,7 +34,8 @@ def check_frame(inputs: AlignmentInput, camera_file: CameraFile) -> None:
     alignment, first_view = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)
     if float(np.nanmedian([*alignment.median_px, np.inf])) < alignment.limit_px:
         return
-    are_pixels = projective_error(first_view.points, first_view.pixels) < _SOME_CAMERA * alignment.limit_px
+    max_multiple = 4.0  # rows nearer than this multiple of the limit are the pixels of some projective camera
+    are_pixels = projective_error(first_view.points, first_view.pixels) < max_multiple * alignment.limit_px
     shown = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True)
     if are_pixels and not shown.color_ratio <= MAX_FRONT_RATIO:
         raise misalignment_error(camera_file.path, alignment, None)

@@ -29,7 +29,6 @@ from gsmerge.types import Cameras
 from gsmerge.values.arrays import distinct
 
 _ROUNDS = 4  # of reweighted least squares
-_MIN_POSE_POINTS, _MAX_POINTS = 6, 2000  # least and most points that a camera's pose is solved from
 _HALF = np.sqrt(0.5)
 # Rotation of the world by the pixelSplat family: axes swapped, then an eighth of a turn about the last axis
 UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
@@ -118,8 +117,9 @@ def own_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
 def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:
     """Solve for the world-to-camera matrix ``[4,4]`` of a view from its own pixels; None if that fails."""
     rows = np.flatnonzero(pairs.views == view)
-    rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
-    if len(rows) < _MIN_POSE_POINTS:
+    min_points, max_points = 6, 2000  # least and most points that a camera's pose is solved from
+    rows = rows[:: max(1, len(rows) // max_points)]
+    if len(rows) < min_points:
         return None
     points, pixels = pairs.points[rows], pairs.pixels[rows]
     middle = medians(points)

@@ -17,9 +17,6 @@ from gsmerge.io.cameras.table import FFGS
 from gsmerge.io.photo_files import PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras
 
-_STRETCHES = 0.1  # relative difference of the scales of width and height above which few models resize photos
-_MAX_ENLARGED = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
-
 
 @dataclass(frozen=True, eq=False)
 class Grid:
@@ -112,7 +109,8 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
     x, y = (file_side / side for file_side, side in zip(file_size, size, strict=True))
     transform = replace(transform, scale_x=x * transform.scale_x, scale_y=y * transform.scale_y)
     note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
-    if camera_file.source == ESTIMATED and abs(transform.scale_x / transform.scale_y - 1) > _STRETCHES:
+    max_difference = 0.1  # relative difference of the scales of width and height above which few models resize photos
+    if camera_file.source == ESTIMATED and abs(transform.scale_x / transform.scale_y - 1) > max_difference:
         note += "; if the model did not squeeze them, rows were left out of the file: name its cameras with --cameras"
     is_same = file_size == (transform.width, transform.height)
     return Grid(camera_file, to_cameras(camera_file), transform, () if is_same else (note,))
@@ -132,7 +130,8 @@ def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
         transform = resize_and_crop(camera_size, size)
         note = f"cameras of {camera_size[0]} x {camera_size[1]} are {transform.description}, the images' size"
         return [Grid(camera_file, transform.cameras(cameras), None, (note,))]
-    if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
+    max_enlarged = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
+    if max(transform.scale_x, transform.scale_y) > max_enlarged:
         return []  # the photos are previews, and a fit to them would blur the Gaussians
     note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
     return [Grid(camera_file, cameras, transform, (note,))]

@@ -28,13 +28,6 @@ from gsmerge.io.photo_files import NO_IMAGES
 from gsmerge.kernels.matrices import invert, matmul, transform
 from gsmerge.types import Cameras
 
-_SAME = 1e-6  # tolerance for equal poses, relative to the largest number in them
-
-NEAR_PX = 0.5  # cameras with smaller errors are not moved
-SAME_FOCAL = 0.01  # largest relative difference of focal lengths that count as equal
-CLEAR = 0.96  # the given poses are better if they reduce the disagreement between photos to this share
-_LINE_ROUNDS = 4  # of reweighted least squares
-
 
 @dataclass(frozen=True, eq=False)
 class Poses:
@@ -57,10 +50,11 @@ def describe_convention(convention: Convention) -> str:
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
     """List the poses ``viewmats [c,4,4]`` as they are in each other convention, without duplicates."""
     stored, all_poses = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
+    tolerance = 1e-6  # tolerance for equal poses, relative to the largest number in them
     for other in CONVENTIONS:
         converted = to_viewmats(stored, other)
         stacks = [poses.viewmats for poses in all_poses]
-        if not any(np.allclose(converted, stack, atol=_SAME * (1 + np.abs(stack).max())) for stack in stacks):
+        if not any(np.allclose(converted, stack, atol=tolerance * (1 + np.abs(stack).max())) for stack in stacks):
             all_poses.append(Poses(other, converted))
     return all_poses[1:]
 
@@ -106,8 +100,9 @@ def move_cameras(
     if not before.worst_px <= max_pixels(cameras.width, cameras.height):
         return None
     viewmats, errors = cameras.viewmats.astype(np.float64), pixel_errors(pairs, cameras)
+    near_px = 0.5  # cameras with smaller errors are not moved
     for view in np.unique(pairs.views):
-        if np.median(errors[pairs.views == view]) > NEAR_PX:
+        if np.median(errors[pairs.views == view]) > near_px:
             pose = solve_pose(pairs, int(view), cameras.Ks[view])
             if pose is None:
                 return None
@@ -132,7 +127,9 @@ def _photos_confirm(pairs: Correspondences, images: np.ndarray, given: Cameras, 
     """
     motions = matmul(invert(given.viewmats), moved.viewmats)[pairs.views]
     points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
-    return _disagreement(points, pairs, images, given) < CLEAR * _disagreement(pairs.points, pairs, images, moved)
+    better_share = 0.96  # the given poses are better if they reduce the disagreement between photos to this share
+    limit = better_share * _disagreement(pairs.points, pairs, images, moved)
+    return _disagreement(points, pairs, images, given) < limit
 
 
 def _disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
@@ -157,7 +154,8 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     x, y = (np.ascontiguousarray(values.T) for values in (x, y))
     weights = np.ones(x.shape[1])
     with np.errstate(all="ignore"):
-        for _ in range(_LINE_ROUNDS):
+        line_rounds = 4  # of reweighted least squares
+        for _ in range(line_rounds):
             mean_x, mean_y = ((weights * values).sum(1, keepdims=True) / weights.sum() for values in (x, y))
             dx, dy = x - mean_x, y - mean_y
             slopes = (weights * dx * dy).sum(1, keepdims=True) / (weights * dx**2).sum(1, keepdims=True)
@@ -196,7 +194,8 @@ def _check_assumed(cameras: Cameras, other: Cameras, before_px: float, source: s
     """
     factors = other.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
     middle = cameras.width / 2, cameras.height / 2
-    if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= SAME_FOCAL).all():
+    same_focal = 0.01  # largest relative difference of focal lengths that count as equal
+    if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= same_focal).all():
         return
     x, y = (other.Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
     raise SceneError(

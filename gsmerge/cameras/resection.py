@@ -13,13 +13,8 @@ from gsmerge.kernels import reproject
 from gsmerge.kernels.matrices import eigh, matmul, solve
 
 DAMPING = Damping(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
-MAX_STRETCH = 0.5  # largest relative change of a focal length in one step
 ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4  # numbers of free intrinsics: fx = fy; fx, fy; fx, fy, cx, cy
 _Fit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]  # intrinsics, poses, normal equations
-MIN_POINTS = 24  # with fewer points almost any projective camera fits
-_FLAT = 1e-10  # second moment of an axis, divided by the largest one; below this, points lie in a plane across the axis
-_PROJECTIVE_ROUNDS = 8  # of reweighted least squares
-_SMALLEST_ERROR = 1e-6  # divided by the standard deviation of the pixels
 
 
 def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
@@ -96,7 +91,8 @@ def _step(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.
     whole = np.concatenate([slope[:, 6:, None], damped[:, 6:, 6:]], 2)
     reduced = (whole - matmul(mixed.swapaxes(1, 2), solved)).sum(0)
     change = -solve(reduced[:, 1:], reduced[:, 0])
-    change[:TWO_FOCALS] = change[:TWO_FOCALS].clip(-MAX_STRETCH, MAX_STRETCH)
+    max_stretch = 0.5  # largest relative change of a focal length in one step
+    change[:TWO_FOCALS] = change[:TWO_FOCALS].clip(-max_stretch, max_stretch)
     return change, -solved[..., 0] - matmul(solved[..., 1:], change)
 
 
@@ -132,7 +128,8 @@ def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
 
     Returns 0 if there are too few points to decide.
     """
-    return 0.0 if len(points) < MIN_POINTS else projective_camera(points, pixels)[1]
+    min_points = 24  # with fewer points almost any projective camera fits
+    return 0.0 if len(points) < min_points else projective_camera(points, pixels)[1]
 
 
 def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, float]:
@@ -151,15 +148,17 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     down = np.concatenate([zero, local, -targets[:, 1:] * local], 1)
     weights = np.ones(len(points))
     camera, error = np.zeros((3, local.shape[1])), np.full(len(points), np.inf)
-    for _ in range(_PROJECTIVE_ROUNDS):
+    projective_rounds = 8  # of reweighted least squares
+    smallest_error = 1e-6  # divided by the standard deviation of the pixels
+    for _ in range(projective_rounds):
         equations = np.concatenate([across * weights[:, None], down * weights[:, None]])
         camera = eigh(matmul(equations.T, equations))[1][:, 0].reshape(3, -1)
         projected = matmul(local, camera.T)
         with np.errstate(all="ignore"):
             error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - targets, axis=1)
             error = np.where(np.isfinite(error), error, np.inf)
-            depth = np.abs(projected[:, 2]) + _SMALLEST_ERROR
-            weights = np.sqrt(robust_weights(error, 2, _SMALLEST_ERROR, depth))
+            depth = np.abs(projected[:, 2]) + smallest_error
+            weights = np.sqrt(robust_weights(error, 2, smallest_error, depth))
     camera = matmul(camera, basis.T)
     camera[:2] = size * camera[:2] + centre[:, None] * camera[2]
     camera[:, :3] /= unit
@@ -175,6 +174,8 @@ def _whiten(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
     homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
     values, axes = eigh(matmul(homogeneous.T, homogeneous))
-    used = values > _FLAT * values[-1]  # points in a plane or on a line do not determine the other axes
+    # Second moment of an axis, divided by the largest one; below this, points lie in a plane across the axis
+    flatness = 1e-10
+    used = values > flatness * values[-1]  # points in a plane or on a line do not determine the other axes
     basis = axes[:, used] / np.sqrt(values[used])
     return matmul(homogeneous, basis), basis

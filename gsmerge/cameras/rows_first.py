@@ -43,12 +43,6 @@ from gsmerge.types import Cameras
 
 _EVIDENCE = "Gaussians' places in their pixels"  # for a frame, in words
 _PLAIN_PX = 0.5  # rows in order that are nearer to their pixels, pixels, need no other cameras
-_MIN_ROWS, _MIN_SHARE = 24, 0.05  # finite rows needed to find pixels: this number, or this share of all rows
-_MOST_ROWS = 0.75  # share of rows near their pixels in layers: of two layers, one may belong to other views
-_MOVED_GAUSSIANS = 2000  # Gaussians of a view that its moved pose is solved from
-_ROUNDING_PX = 0.1  # by which cameras in one frame may fit worse than own poses, since files round numbers
-_FIRST_ROWS = 20_000  # rows that must follow the order of the pixels before all rows are tried
-_MIN_PLACED = 0.99  # share of the rows that must have a pixel
 _MOST_PLACES = 1 << 27  # largest product of rows and views that are followed; each takes four bytes
 
 
@@ -184,7 +178,8 @@ def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     else:  # several Gaussians of a pixel follow each other, or there are several layers of all pixels
         rows = np.arange(count)
         layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
-    if int(source.ply.valid.sum()) < min(_MIN_ROWS, _MIN_SHARE * count):
+    min_rows, min_share = 24, 0.05  # finite rows needed to find pixels: this number, or this share of all rows
+    if int(source.ply.valid.sum()) < min(min_rows, min_share * count):
         return None
     return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
 
@@ -204,7 +199,8 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
         far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
         is_right = alignment.ok and alignment.worst_px <= limit and median(pixel_errors(shuffled, cameras)) >= far_px
         is_near = pixel_errors(pairs, cameras) <= max_pixels(*grid.size)
-        is_right = is_right and (layout.ids is None or float(is_near.mean()) >= _MOST_ROWS)
+        max_share = 0.75  # share of rows near their pixels in layers: of two layers, one may belong to other views
+        is_right = is_right and (layout.ids is None or float(is_near.mean()) >= max_share)
         return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if is_right else None
 
     usual = exporter_frames(grid.cameras, source.scale)[0]
@@ -214,7 +210,8 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
     if len(own) == len(grid.cameras):
         poses = np.stack([own[view] for view in range(len(own))])
         own_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
-        limit = max(AS_NEAR * own_px, own_px + _ROUNDING_PX)
+        rounding_px = 0.1  # by which cameras in one frame may fit worse than own poses, since files round numbers
+        limit = max(AS_NEAR * own_px, own_px + rounding_px)
         for other in _conventions(source, grid):
             frame = fit_frame(other.cameras, poses, source.scale)
             if recovery := accept(other, IDENTITY, limit) or accept(other, frame, limit):
@@ -232,7 +229,8 @@ def _conventions(source: RowSource, grid: Grid) -> Iterator[Grid]:
 def _move_cameras(source: RowSource, grid: Grid, layout: Layout) -> Grid:
     """Move inexact cameras so that they show rows in their pixels; the same grid if they are too far off."""
     inputs = source.inputs(grid, photos=False)
-    pairs = inputs.pairs(layout, _MOVED_GAUSSIANS)
+    moved_gaussians = 2000  # Gaussians of a view that its moved pose is solved from
+    pairs = inputs.pairs(layout, moved_gaussians)
     if not check_pairs(pairs, grid.cameras).worst_px <= max_pixels(*grid.size):
         return grid
     path, names = str(source.camera_file.path), source.camera_file.names
@@ -277,9 +275,11 @@ def _follow(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray 
     """Find the pixels ``[n]`` of rows in the order of pixels, -1 for a few rows; None for rows in another order."""
     matrices = np.ascontiguousarray(cameras.viewmats, np.float64), np.ascontiguousarray(cameras.Ks, np.float64)
     ids = None
-    for tried in (points[:_FIRST_ROWS], points):  # the first rows rule out most other orders
+    first_rows = 20_000  # rows that must follow the order of the pixels before all rows are tried
+    min_placed = 0.99  # share of the rows that must have a pixel
+    for tried in (points[:first_rows], points):  # the first rows rule out most other orders
         ids = follow_rows(tried, *matrices, cameras.width, cameras.height, mixed=mixed)
-        if (ids >= 0).sum() < _MIN_PLACED * len(tried):
+        if (ids >= 0).sum() < min_placed * len(tried):
             return None
     return ids
 

@@ -19,7 +19,7 @@ SHUFFLED_MARGIN = 5.0  # factor by which Gaussians must be nearer to their pixel
 # 0.72 / sqrt(n) of the median, so a ratio of 1.15 is three standard errors. Files round the numbers of cameras, which
 # displaces projections by up to 0.02 pixels
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
-SAMPLE_GAUSSIANS, MIN_SAMPLE_GAUSSIANS = 6000, 60  # Gaussians of a score: of all views, and least of each view
+SCORED_GAUSSIANS, MIN_SCORED_GAUSSIANS = 6000, 60  # Gaussians of a score: of all views, and least of each view
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_PX, MAX_SHARE = 12.0, 0.05  # error up to which cameras are moved: pixels, and share of the side of small images
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some of them a little beyond
@@ -60,7 +60,7 @@ class AlignmentInput:
 
     def pairs(self, layout: Layout, per_view: int = 0) -> Correspondences:
         """Return a sample of the valid rows of a layout, with their pixels and views; 0: as many as for a score."""
-        per_view = per_view or max(MIN_SAMPLE_GAUSSIANS, SAMPLE_GAUSSIANS // layout.views)
+        per_view = per_view or max(MIN_SCORED_GAUSSIANS, SCORED_GAUSSIANS // layout.views)
         return find_correspondences(self.gaussians.means, self.valid, layout, per_view)
 
 

@@ -21,27 +21,21 @@ from gsmerge.types import Cameras, Gaussians
 
 # Colour error, divided by the colour error of shuffled pixels. Above this share colours agree no better than at random
 RANDOM_SHARE = 0.85
-SAME_COLORS = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
 # Least score of another convention, divided by the score of the usual one: if photos decide, and if none do
 _COLOR_MARGIN, _MARGIN = 1.3, 2.0
 _FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the given frame
-_PEAK_GAIN = 1.05  # least score of a scale chosen by colours, divided by the score of a scale two steps away
 _SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to count those that cameras see
 # Gaussians compared in other conventions and frames. They have 0.4 % of noise; scores that matter differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
-_MIN_GAUSSIANS, _MAX_PROJECTED = 200, 4_000_000  # least number of Gaussians, and most Gaussians times cameras
-_MIN_SEEN = 0.5  # share of the Gaussians that must be in some camera
 MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
 # Largest depth of a foremost Gaussian, divided by the least depth in its cell; and mean number of Gaussians per cell
 _FRONT, _PER_CELL = 1.05, 3
 _SCALES = np.geomspace(1 / 1300, 1300, 115)  # of the cameras' positions, tried in turn: engines' units differ by 1000
-_SCALE_GAUSSIANS = 2000  # Gaussians that the scales are tried on
 # Finer searches around the best scale: range (natural logarithm), steps, Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
 # Where the Gaussians' middle is tried in a picture to find a shift: x and y in widths and heights, and logarithm of
 # the depth in radii of the scene. Colours agree over about a tenth of a picture
 _PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
-_SHIFT_VIEWS = 4  # views that shifts are tried on
 # Searches around the best places: number of Gaussians, places that are kept, and steps
 _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
 
@@ -87,7 +81,8 @@ def check_cameras(
     ``images`` may be empty. With ``foremost``, the colours of hidden Gaussians do not count. ``hiding`` are further
     points ``[n,3]`` that hide Gaussians, but have no colours themselves.
     """
-    samples = min(samples, max(_MIN_GAUSSIANS, _MAX_PROJECTED // len(cameras)))
+    min_gaussians, max_projected = 200, 4_000_000  # least number of Gaussians, and most Gaussians times cameras
+    samples = min(samples, max(min_gaussians, max_projected // len(cameras)))
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
     points = gaussians.means[rows].astype(np.float64)
@@ -119,7 +114,8 @@ def check_cameras(
             shuffled_errors.append(_mean_difference(colors[seen], rng.permutation(photo)))
     share, num_compared = float(visible[: len(rows)].sum()) / max(1, len(rows)), int(compared.sum())
     ratio, error = _color_ratio(errors, shuffled_errors, num_compared)
-    return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > RANDOM_SHARE, num_compared, error)
+    min_seen = 0.5  # share of the Gaussians that must be in some camera
+    return CameraCheck(share, ratio, share >= min_seen and not ratio > RANDOM_SHARE, num_compared, error)
 
 
 def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: int) -> tuple[float, float]:
@@ -127,7 +123,8 @@ def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: in
 
     ``count`` is the number of Gaussians. Both results are NaN if the colours hardly vary.
     """
-    if not errors or not (mean_shuffled := float(np.concatenate(shuffled).mean())) > SAME_COLORS:
+    min_error = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
+    if not errors or not (mean_shuffled := float(np.concatenate(shuffled).mean())) > min_error:
         return np.nan, np.nan
     ratio = float(np.concatenate(errors).mean()) / mean_shuffled
     residuals = np.concatenate(errors) - ratio * np.concatenate(shuffled)  # with a mean of 0
@@ -274,7 +271,8 @@ def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool
     """Return True if the ``score`` of a frame is clearly higher than at scales two steps away."""
     two_steps = float(_SCALES[2] / _SCALES[0])
     neighbour_scores = (_score_frame(inputs, _scale_frame(frame, factor)) for factor in (1 / two_steps, two_steps))
-    return all(score > _PEAK_GAIN * neighbour_score for neighbour_score in neighbour_scores)
+    peak_gain = 1.05  # least score of a scale chosen by colours, divided by the score of a scale two steps away
+    return all(score > peak_gain * neighbour_score for neighbour_score in neighbour_scores)
 
 
 def _scale_frame(frame: Similarity, factor: float) -> Similarity:
@@ -293,7 +291,8 @@ def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
     in one place, so that scores are high, but equal.
     """
     scaled = [_scale_frame(frame, float(scale)) for scale in _SCALES]
-    scores = np.array([_score_frame(inputs, candidate, _SCALE_GAUSSIANS) for candidate in scaled])
+    scale_gaussians = 2000  # Gaussians that the scales are tried on
+    scores = np.array([_score_frame(inputs, candidate, scale_gaussians) for candidate in scaled])
     best = scaled[2 + int(np.argmax(scores[2:-2] - np.maximum(scores[:-4], scores[4:])))]
     for reach, steps, samples in _FINER:
         factors = exp(np.linspace(-reach, reach, steps))
@@ -306,7 +305,8 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
 
     The middle of the Gaussians is looked for in the picture of the middle camera, at many depths.
     """
-    some = slice(None, None, -(-len(inputs.cameras) // _SHIFT_VIEWS))
+    shift_views = 4  # views that shifts are tried on
+    some = slice(None, None, -(-len(inputs.cameras) // shift_views))
     rows, cameras, images = (inputs.gaussians, inputs.valid), inputs.cameras[some], inputs.images[some]
     to_world = invert(cameras.viewmats)
     centres, points = to_world[:, :3, 3], inputs.gaussians.means[inputs.valid].astype(np.float64)

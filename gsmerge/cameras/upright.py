@@ -24,22 +24,9 @@ from gsmerge.geometry.transforms import Similarity, sh0_to_rgb
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
-_QUANTILE = 0.95  # this quantile of the distances along the widest axis is 1 in these files
-_TOLERANCE = 1e-3  # of the median and the quantile
-_ROUGH_ROWS, _ROUGH = 2000, 1.0  # rows of a first check, and its tolerance before the rotation is undone
-_PER_PIXEL = (1, 2, 3)  # Gaussians of a pixel
-_UNIQUE = 1.2  # least distance of a stretch at its second-best place, divided by the distance at its best place
 _LENGTH, _STRETCHES = 48, 96  # rows of a stretch, and number of stretches that are searched
-_PER_STRETCH = 12  # rows of each stretch that the frame is solved from
-_SHARE = 3  # stretches of fused views are taken from the first and the last third of the rows
 _SLACK = 8  # pixels beyond the bounds on both sides that are searched too
-_MAX_COST = 9.0  # largest distance of a stretch, divided by the lower quartile of all distances
-_LEAST = 1e-3  # distances below this count as equal
-_NO_PLACE = 1e9  # distance of a stretch that cannot be in its photo
-_PAIRS = 200  # pairs of stretches from which a frame is tried
-_NEAR = 3.0  # a stretch agrees with the frame of a pair if its error is below this multiple of the limit
 _ROUNDS = 3  # of solving for the frame from the stretches that agree with it
-_MIN_VIEWS, _MIN_STRETCHES, _MIN_AGREEING = 2, 3, 0.25  # views that agree, stretches of each, share of all stretches
 
 
 @dataclass(frozen=True)
@@ -56,12 +43,14 @@ class _Stretch:
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Find the camera from which rows were centred, rescaled and turned upright; return the rotation, or None."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
-    sample = means[:: max(1, len(means) // _ROUGH_ROWS)]
-    if not len(sample) or _deviation(sample) > _ROUGH:
+    rough_rows, rough = 2000, 1.0  # rows of a first check, and its tolerance before the rotation is undone
+    sample = means[:: max(1, len(means) // rough_rows)]
+    if not len(sample) or _deviation(sample) > rough:
         return None
+    tolerance = 1e-3  # of the median and the quantile
     for view, viewmat in enumerate(inputs.cameras.viewmats):
         rotation = matmul(UPRIGHT, viewmat[:3, :3])
-        if _deviation(matmul(sample, rotation)) < _ROUGH / 2 and _deviation(matmul(means, rotation)) < _TOLERANCE:
+        if _deviation(matmul(sample, rotation)) < rough / 2 and _deviation(matmul(means, rotation)) < tolerance:
             source = "the first camera" if view == 0 else f"camera {view + 1}"
             return Similarity(rotation, 1.0, np.zeros(3), f"rotated upright from {source}")
     return None
@@ -69,7 +58,8 @@ def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
 
 def _deviation(points: np.ndarray) -> float:
     """Measure how far points ``[n,3]`` are from a median of 0 and a quantile of 1."""
-    quantile = float(np.quantile(np.abs(points), _QUANTILE, axis=0).max())
+    widest_quantile = 0.95  # this quantile of the distances along the widest axis is 1 in these files
+    quantile = float(np.quantile(np.abs(points), widest_quantile, axis=0).max())
     return max(float(np.abs(np.median(points, 0)).max()), abs(quantile - 1))
 
 
@@ -91,7 +81,8 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
     """Yield the orders that ``count`` rows may have, as pixels ``[p]`` of a photo and the stretches to search."""
     grid, trim = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), TRIMS[0]
     trimmed, whole = grid[trim:-trim, trim:-trim].reshape(-1), grid.reshape(-1)
-    for per_pixel in _PER_PIXEL:
+    per_pixel_counts = (1, 2, 3)  # Gaussians of a pixel
+    for per_pixel in per_pixel_counts:
         stretches = _interleaved_stretches(count, len(cameras), per_pixel, len(trimmed))
         if stretches:
             yield trimmed, stretches
@@ -119,9 +110,10 @@ def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
 
     The rows of the first view come first, and the rows of the last view last. Empty for too few or too many rows.
     """
-    if not _SHARE * _LENGTH <= count < views * num_pixels:
+    num_parts = 3  # stretches of fused views are taken from the first and the last third of the rows
+    if not num_parts * _LENGTH <= count < views * num_pixels:
         return []
-    starts = np.unique(np.linspace(0, count // _SHARE, _STRETCHES).astype(int)).tolist()
+    starts = np.unique(np.linspace(0, count // num_parts, _STRETCHES).astype(int)).tolist()
     first_view = [_Stretch(0, start, 1, start - _SLACK, num_pixels) for start in starts]
     last_view = [
         _Stretch(views - 1, count - _LENGTH - start, 1, 0, num_pixels - start - _LENGTH + _SLACK) for start in starts
@@ -140,14 +132,18 @@ def _match(
     rows = np.array([stretch.start + stretch.step * np.arange(_LENGTH) for stretch in stretches])
     places, sums, next_sums = _place_stretches(inputs, stretches, rows, pixels).T
     places = places.astype(int)
-    is_near = sums <= _MAX_COST * max(_LEAST, float(np.quantile(sums, 0.25)))
-    matched = np.flatnonzero(is_near & (next_sums > _UNIQUE * np.maximum(sums, _LEAST)))
-    sample = np.linspace(0, _LENGTH - 1, _PER_STRETCH).astype(int)
+    max_cost = 9.0  # largest distance of a stretch, divided by the lower quartile of all distances
+    min_cost = 1e-3  # distances below this count as equal
+    is_near = sums <= max_cost * max(min_cost, float(np.quantile(sums, 0.25)))
+    min_ratio = 1.2  # least distance of a stretch at its second-best place, divided by the distance at its best place
+    matched = np.flatnonzero(is_near & (next_sums > min_ratio * np.maximum(sums, min_cost)))
+    per_stretch = 12  # rows of each stretch that the frame is solved from
+    sample = np.linspace(0, _LENGTH - 1, per_stretch).astype(int)
     ids = rows[matched][:, sample].reshape(-1)
     matched_pixels = pixels[(places[matched, None] + sample).clip(max=len(pixels) - 1).reshape(-1)]
     y, x = np.divmod(matched_pixels, inputs.cameras.width)
-    views = np.array([stretch.view for stretch in stretches])[matched].repeat(_PER_STRETCH)
-    parts = np.arange(len(matched)).repeat(_PER_STRETCH)
+    views = np.array([stretch.view for stretch in stretches])[matched].repeat(per_stretch)
+    parts = np.arange(len(matched)).repeat(per_stretch)
     points = inputs.gaussians.means[ids].astype(np.float64)
     valid = inputs.valid[ids]
     return Correspondences(points, np.stack([x, y], 1) + 0.5, views).select(valid), parts[valid]
@@ -165,16 +161,17 @@ def _place_stretches(
     with np.errstate(invalid="ignore"):
         colors = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1).astype(np.float32)
     places = []
+    no_place = 1e9  # distance of a stretch that cannot be in its photo
     for stretch, stretch_rows in zip(stretches, rows, strict=True):
         low, high = max(0, stretch.low), min(len(pixels), stretch.high + _LENGTH)
         if high - low < _LENGTH:
-            places.append((0, _NO_PLACE, 0.0))
+            places.append((0, no_place, 0.0))
             continue
         shown = inputs.images[stretch.view].reshape(1, -1, 3)[:, pixels[low:high]]
         sums = cv2.matchTemplate(shown, colors[stretch_rows][None], cv2.TM_SQDIFF)[0]
         best = int(sums.argmin())
         others = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
-        places.append((low + best, float(sums[best]), float(others.min(initial=_NO_PLACE))))
+        places.append((low + best, float(sums[best]), float(others.min(initial=no_place))))
     return np.array(places)
 
 
@@ -187,7 +184,8 @@ def _solve_agreed_frame(
     """
     stretches = np.unique(parts)
     views = np.array([pairs.views[parts == stretch][0] for stretch in stretches])
-    if len(np.unique(views)) < _MIN_VIEWS:
+    min_views, min_stretches, min_agreeing = 2, 3, 0.25  # views that agree, stretches of each, share of all stretches
+    if len(np.unique(views)) < min_views:
         return None
     limit, rng = pixel_limit(inputs.cameras.width, inputs.cameras.height), np.random.default_rng(0)
 
@@ -203,16 +201,18 @@ def _solve_agreed_frame(
         return stretches[[float(np.median(errors[parts == stretch])) < limit for stretch in stretches]]
 
     best = stretches[:0]
-    for _ in range(_PAIRS):
+    num_pairs = 200  # pairs of stretches from which a frame is tried
+    max_multiple = 3.0  # a stretch agrees with the frame of a pair if its error is below this multiple of the limit
+    for _ in range(num_pairs):
         first = rng.choice(len(stretches))
         second = rng.choice(np.flatnonzero(views != views[first]))
-        best = max(best, find_agreeing(solve(stretches[[first, second]]), _NEAR * limit), key=len)
+        best = max(best, find_agreeing(solve(stretches[[first, second]]), max_multiple * limit), key=len)
     frame = None
     for _ in range(_ROUNDS):
         frame = solve(best) if len(best) else None
         best = find_agreeing(frame, limit)
     counts = np.bincount(views[np.isin(stretches, best)], minlength=1)
-    if frame is None or (counts >= _MIN_STRETCHES).sum() < _MIN_VIEWS or len(best) < _MIN_AGREEING * len(stretches):
+    if frame is None or (counts >= min_stretches).sum() < min_views or len(best) < min_agreeing * len(stretches):
         return None
     text = f"{rotation.description}, positions scaled by {frame.scale:.4g} and shifted"
     return replace(frame, description=text)

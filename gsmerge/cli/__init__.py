@@ -14,7 +14,6 @@ from contextlib import suppress
 from typing import NoReturn
 
 INTERRUPTED = 130  # exit code
-GC_THRESHOLDS = 200_000, 10, 10  # above the 115,000 objects of imports, where each search for cycles takes 30 ms
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -29,7 +28,8 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # gsmerge reports damaged images itself
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads would spin beside those of gsmerge
-    gc.set_threshold(*GC_THRESHOLDS)
+    gc_thresholds = 200_000, 10, 10  # above the 115,000 objects of imports, where each search for cycles takes 30 ms
+    gc.set_threshold(*gc_thresholds)
     _open_streams()
     try:
         from gsmerge.cli.app import run

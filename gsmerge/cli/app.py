@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 DEBUG = "--debug"
 
 # Panel of the help -> commands. A command NAME is the function NAME of the module NAME_command; others are plugins
-COMMANDS = {
+COMMAND_GROUPS = {
     "Compact": ("compact", "convert"),
     "Many scenes, and views in batches": ("batch", "extend"),
     "Look and measure": ("inspect", "view", "render", "evaluate"),
 }
-OWN_COMMANDS = {name for names in COMMANDS.values() for name in names}
+OWN_COMMANDS = {name for names in COMMAND_GROUPS.values() for name in names}
 PLUGIN_PANEL = "Added by other packages"
 
 
@@ -57,7 +57,7 @@ def make_app(only: str | None = None) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )  # fmt: skip
     app.callback(invoke_without_command=True)(root)
-    for panel, names in COMMANDS.items():
+    for panel, names in COMMAND_GROUPS.items():
         for name in names:
             if only in (None, name):
                 function = getattr(import_module(f"gsmerge.cli.{name}_command"), name)
@@ -155,9 +155,6 @@ def root(
     print_help(context)
 
 
-_RETRY_SECONDS = 0.02  # delay before a signal is raised again, if no caller could handle it
-
-
 @contextmanager
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, without unfinished files.
@@ -167,7 +164,8 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     """
 
     def raise_later(number: int) -> None:
-        timer = threading.Timer(_RETRY_SECONDS, signal.raise_signal, (number,))
+        retry_seconds = 0.02  # delay before a signal is raised again, if no caller could handle it
+        timer = threading.Timer(retry_seconds, signal.raise_signal, (number,))
         timer.daemon = True
         timer.start()
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 JOBS = Setting("", kind=int | Literal["auto"], least=1)
 MAX_LISTED = 20  # rows of the table, failures, and doubtful results
-HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
+TABLE_HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
 # Key of a reason -> word before it, and noun
 REASONS = {
@@ -38,7 +38,7 @@ REASONS = {
     opt.argument("scenes", list[str], "FOLDER|PATTERN|LIST...", "Folders to search for scenes, patterns such as *.ply, "
                  ".ply files, or text files with one of these per line."),
     *opt.panel(
-        opt.INPUT,
+        opt.INPUT_GROUP,
         opt.option("cameras", str, "Cameras: one path for all scenes, or a pattern in which {scene}, {parent} and "
                    "{stem} are replaced by those of each scene; none: without.", wording="beside each"),
         opt.option("images", str, "Folder of the photos: a path or such a pattern; none: without.",
@@ -60,7 +60,7 @@ REASONS = {
     "engine",
     opt.output("Folder for the results. Scenes whose results are already in it are skipped.", default=opt.REQUIRED),
     *opt.panel(
-        opt.OUTPUT,
+        opt.OUTPUT_GROUP,
         opt.option("name", str, "Name of each result; {stem}, {parent}, {index} and {k} are replaced.",
                    default="{stem}.ply", metavar="NAME"),
     ),
@@ -195,8 +195,10 @@ class Totals:
         from gsmerge.measure.documents import text_table
         from gsmerge.runtime.memory import human_share
 
-        rows = [HEADER, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
-        lines = text_table(rows, columns=columns, least=list(map(HEADER.index, OMITTED_FIRST))) if self.rows else []
+        rows = [TABLE_HEADER, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
+        lines = (
+            text_table(rows, columns=columns, least=list(map(TABLE_HEADER.index, OMITTED_FIRST))) if self.rows else []
+        )
         lines += [f"... and {self.counts[DONE] - len(self.rows):,} more"] * (self.counts[DONE] > len(self.rows))
         for name, (word, noun) in REASONS.items():
             grouped = _list_reasons(self.reasons[name])

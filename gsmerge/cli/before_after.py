@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from gsmerge.scene.read import Loaded
     from gsmerge.types import Cameras, Gaussians, Scene, Views
 
-TOLERANCE = 1e-5  # largest difference, absolute and relative, of equal poses after writing and reading
-
 
 def lpips_networks(
     choice: str | None, usual: Sequence[str] = EvaluateOptions().lpips
@@ -99,6 +97,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
 
     cameras: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
+    tolerance = 1e-5  # largest difference, absolute and relative, of equal poses after writing and reading
     for name, path in zip(file_names(paths), paths, strict=True):
         camera_path, camera_file = result_cameras(path), None
         if camera_path is not None and scene.is_shown:
@@ -107,7 +106,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
         if camera_file is None or camera_path is None or camera_file.names != scene.names:
             continue
         viewmats = camera_file.viewmats
-        if np.allclose(viewmats, start, rtol=TOLERANCE, atol=TOLERANCE):
+        if np.allclose(viewmats, start, rtol=tolerance, atol=tolerance):
             continue
         cameras[name] = replace(scene.cameras, viewmats=viewmats)
         moves = describe_moves(list_moves(scene.names, start, viewmats, scene_depth(scene)))

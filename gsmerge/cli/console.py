@@ -23,8 +23,6 @@ Kind = Literal["info", "note", "warning", "error"]  # of a line on stderr
 PREFIXES: Mapping[Kind, str] = {
     "info": "", "note": "note: ", "warning": "gsmerge: warning: ", "error": "gsmerge: error: ",
 }  # fmt: skip
-MAX_LINE = 5000  # characters
-NARROW = 60  # columns; narrower terminals get shorter bars with less text
 
 
 @dataclass
@@ -70,7 +68,8 @@ _stream: ContextVar[JsonLines | None] = ContextVar("stream", default=None)  # No
 def one_line(text: str) -> str:
     """Escape text from files or names for a terminal, and shorten it to one line."""
     clean = text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-    return clean if len(clean) <= MAX_LINE else f"{clean[: MAX_LINE // 2]} ... {clean[-MAX_LINE // 2 :]}"
+    max_line = 5000  # characters
+    return clean if len(clean) <= max_line else f"{clean[: max_line // 2]} ... {clean[-max_line // 2 :]}"
 
 
 def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
@@ -192,7 +191,8 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     from rich.table import Column
 
     text_column = Column(no_wrap=True, overflow="ellipsis")
-    is_wide = console.width >= NARROW
+    narrow_columns = 60  # columns; narrower terminals get shorter bars with less text
+    is_wide = console.width >= narrow_columns
     columns = [rich.BarColumn(16 if is_wide else 8), rich.TimeRemainingColumn(compact=True)]
     columns += [rich.TimeElapsedColumn()] if is_wide else []
     columns += [rich.TextColumn("{task.description}", markup=False, table_column=text_column)]

@@ -36,7 +36,7 @@ class MeasuringOptions(Settings):
     "lpips",
     opt.settings_option(EvaluateOptions, MeasuringOptions, example="context=false or photo_side=476"),
     *opt.panel(
-        opt.OUTPUT,
+        opt.OUTPUT_GROUP,
         opt.option("output", list[Path], "File to write: .json, or .csv (a row for each result and view); may be "
                    "repeated.", "--output", "-o"),
     ),

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from gsmerge.io.scene_files import SceneFiles
     from gsmerge.scene.read import Loaded
 
-INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
+INPUT_GROUP, COUNT_GROUP, METHOD_GROUP, MEASURING_GROUP, OUTPUT_GROUP, GENERAL_GROUP = (
     "Input", "How many Gaussians", "Method", "Measuring", "Output", "General"
 )  # fmt: skip
 # Forms of plain values in the help
@@ -45,7 +45,7 @@ METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH",
 STYLES = ("bar", "json")  # of progress
 REQUIRED = Parameter.empty
 LIST_SETTINGS = "help"  # value for which --set prints all settings
-SEED = "GSMERGE_SEED"  # environment variable: the seed of commands that are given none
+SEED_VARIABLE = "GSMERGE_SEED"  # environment variable: the seed of commands that are given none
 
 SETTINGS = {
     setting.name: setting for kind in (EvaluateOptions, Engine, PlacementOptions, CompactOptions)
@@ -93,8 +93,9 @@ class Args(SimpleNamespace):
         for name in options.keys() & pairs.keys():
             raise UsageError(f"--set {name}: expected this setting once, got --{name.replace('_', '-')} too")
         values = options | pairs
-        if "seed" in settings and "seed" not in values and os.environ.get(SEED):  # an empty one counts as not set
-            values["seed"] = parse_value(SEED, os.environ[SEED], settings["seed"])
+        # An empty variable counts as not set
+        if "seed" in settings and "seed" not in values and os.environ.get(SEED_VARIABLE):
+            values["seed"] = parse_value(SEED_VARIABLE, os.environ[SEED_VARIABLE], settings["seed"])
         return values
 
     def settings(self, **changes: Any) -> CompactOptions:
@@ -393,7 +394,7 @@ TARGETS = "targets target_images"
 
 _TABLE = (
     panel(
-        INPUT,
+        INPUT_GROUP,
         option("cameras", Path, "Camera file or COLMAP folder: transforms.json, cameras.json, results.npz, ... "
                "Default: beside the .ply; none: without.", parser=named_or_none),
         option("images", Path, "Folder of the input photos. Default: beside the .ply; none: without.",
@@ -410,7 +411,7 @@ _TABLE = (
         option("target_images", Path, "Folder of the held-out photos. Default: beside their cameras."),
     ),
     panel(
-        COUNT,
+        COUNT_GROUP,
         setting_option("k", metavar="1-8|mixed|auto"),
         # A text, as reports and finished batches have it
         setting_option("budget", metavar="40000|2%|5MB|DEVICE|auto", parser=str),
@@ -418,16 +419,16 @@ _TABLE = (
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),
     ),
     panel(
-        METHOD,
+        METHOD_GROUP,
         *map(setting_option, ("effort", "fit")),
         option("set", list[str], "Any other setting; may be repeated.", metavar="NAME=VALUE"),
     ),
     panel(
-        MEASURING,
+        MEASURING_GROUP,
         option("lpips", ("both", *NETS, "none"), SETTINGS["lpips"].help, wording="alex, where installed"),
     ),
     panel(
-        OUTPUT,
+        OUTPUT_GROUP,
         setting_option("crop", metavar="SHAPE"),
         setting_option("drop", metavar="floaters,sky,..."),
         *map(setting_option, ("up", "scale", "sh_degree")),
@@ -446,7 +447,7 @@ _TABLE = (
         setting_option("engine", default="local"),
     ),
     panel(
-        GENERAL,
+        GENERAL_GROUP,
         setting_option("seed"),
         setting_option("threads", wording="all processors"),
         option("progress", STYLES, "json: print a line for each step on stderr, with the seconds left.",

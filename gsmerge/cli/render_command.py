@@ -12,16 +12,15 @@ from gsmerge.errors import UsageError
 from gsmerge.settings.pictures import CLIPS, PICTURES
 
 MAX_SIDE = 1 << 20  # pixels; larger than any camera, so that pictures keep the size of the cameras
-MAX_DIGITS = 9  # only so many digits of a number of views are read
-SIDES = (16, 16384)  # least and largest width and height of a picture, pixels
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """Parse ``--size``: width and height, separated by an x."""
     match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not all(SIDES[0] <= side <= SIDES[1] for side in size):
-        expected = f"WIDTHxHEIGHT, such as 1920x1080, {SIDES[0]} to {SIDES[1]} pixels each"
+    sides = (16, 16384)  # least and largest width and height of a picture, pixels
+    if not all(sides[0] <= side <= sides[1] for side in size):
+        expected = f"WIDTHxHEIGHT, such as 1920x1080, {sides[0]} to {sides[1]} pixels each"
         raise ValueError(f"expected {expected}, got {text!r}")
     return size
 
@@ -30,7 +29,8 @@ def parse_views(text: str) -> int | str:
     """Parse ``--views``: a number or the name of a view. Digits that begin with 0 are a name."""
     if not re.fullmatch(r"[+-]?[\d.]+", text) or re.fullmatch(r"0\d+", text):
         return text
-    count = int(text[:MAX_DIGITS]) if text.isdecimal() else 0
+    max_digits = 9  # only so many digits of a number of views are read
+    count = int(text[:max_digits]) if text.isdecimal() else 0
     if count < 1:
         raise ValueError(f"expected a number from 1 or the name of a view, got {text}")
     return count
@@ -44,7 +44,7 @@ def parse_views(text: str) -> int | str:
                "clip, .mp4, .webm or .gif; a moving line separates two scenes. A folder gets a picture of each camera.",
                default=opt.REQUIRED),
     *opt.panel(
-        opt.OUTPUT,
+        opt.OUTPUT_GROUP,
         opt.option("path", str, "Path of the camera. orbit: about the middle view, orbit:45 by 45 degrees to each "
                    "side; spline: through all views. With ,back:0.5 it moves back by half of the depth. Or a file "
                    "with a camera for each frame.",
@@ -66,13 +66,13 @@ def render(args: opt.Args) -> None:
     """Draw scenes: a clip of before and after, a panel with the photos, or a picture for each camera."""
     kind = _choose_kind(args)
     from gsmerge.measure import drawings
-    from gsmerge.measure.camera_path import parse_path
+    from gsmerge.measure.camera_path import parse_camera_path
     from gsmerge.measure.documents import document_head, note_entries
 
     files = args.files(args.scenes[0])
     framing = drawings.frame_files(files, args.cameras, args.images)
     inputs = (*args.scenes, *input_files(files), *input_files(framing))
-    if args.path is not None and parse_path(args.path) is None:  # the path is a file
+    if args.path is not None and parse_camera_path(args.path) is None:  # the path is a file
         inputs = (*inputs, Path(args.path))
     if args.output.suffix.lower() in (*PICTURES, *CLIPS):
         # A picture in a scene's folder may be replaced, unless it is a photo
@@ -118,10 +118,10 @@ def _choose_kind(args: opt.Args) -> str:
 
 def _check_path(args: opt.Args) -> None:
     """Raise UsageError for an unknown path, or for ``--frames`` with a path that is a file."""
-    from gsmerge.measure.camera_path import parse_path
+    from gsmerge.measure.camera_path import parse_camera_path
 
     with opt.usage_errors():
-        if parse_path(args.path) is not None:
+        if parse_camera_path(args.path) is not None:
             return
     if not Path(args.path).exists():
         expected = "orbit, spline or a file of cameras"

@@ -19,7 +19,7 @@ from gsmerge.cli.paths import check_outputs, input_files, write_texts
     opt.output("The page, .html. A page that gsmerge made is replaced.",
                wording="AFTER.compare.html, or BEFORE.view.html, beside it"),
     *opt.panel(
-        opt.OUTPUT,
+        opt.OUTPUT_GROUP,
         opt.switch("light", "Show BEFORE only in pictures, and AFTER in 3D; the page has a third of the size."),
     ),
     "open",
@@ -28,7 +28,7 @@ def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D and scores in one file."""
     from gsmerge.io.atomic import common_mode
     from gsmerge.measure.documents import document_head, note_entries
-    from gsmerge.pages.data import collect
+    from gsmerge.pages.data import collect_page_data
     from gsmerge.pages.page import headline, speed, speed_words, view_page
     from gsmerge.pages.view import check_page_name, file_gains
 
@@ -45,7 +45,7 @@ def view(args: opt.Args) -> None:
         pair = read_before_after(args, files)
         say_notes(pair.notes, quiet=args.silent)
         sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
-        data = collect(
+        data = collect_page_data(
             pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
             new_gains=file_gains(pair.plys), light=args.light, progress=progress,
         )  # fmt: skip

@@ -11,7 +11,7 @@ from gsmerge.compaction.report import CompactReport
 from gsmerge.errors import Doubt
 from gsmerge.measure.evaluate import evaluate
 from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS
-from gsmerge.raster.metrics import SPARE, describe_loss, is_worse
+from gsmerge.raster.metrics import SAMPLE_LOSS, describe_loss, is_worse
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
 from gsmerge.settings.compact import CompactOptions
@@ -40,7 +40,7 @@ def join_reports(
     before, after = mean([start.psnr_before for start in starts]), mean(psnrs)
     reference = None if before is None else starts[0].prepared.reference.name
     pictures = OWN_PHOTOS if reference == PHOTOS else reference
-    is_near = reference == PHOTOS and is_worse(before, after, SPARE)
+    is_near = reference == PHOTOS and is_worse(before, after, SAMPLE_LOSS)
     if is_near:  # all photos decide
         exact = evaluate(scene, {"result": gaussians}, options=EvaluateOptions(lpips=(), fog=False))
         before, after = (scores.mean("context")[scene.masks is not None].psnr for scores in exact.results)

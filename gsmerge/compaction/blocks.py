@@ -32,8 +32,8 @@ from gsmerge.plan import WHOLE_GAUSSIANS, SceneChoices
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.memory import free_pages, memory_bytes
 from gsmerge.runtime.record import (
-    Part,
     Record,
+    RunPart,
     add_seconds,
     begin_part,
     choose,
@@ -44,7 +44,7 @@ from gsmerge.runtime.record import (
 )
 from gsmerge.runtime.work import start_work
 from gsmerge.settings.budget import AUTO, parse_share, share_text
-from gsmerge.settings.compact import PIECE, CompactOptions
+from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene
@@ -53,8 +53,7 @@ T = TypeVar("T")
 # Most superpixels of a block, relative to compaction in one piece. A block takes more if views of other blocks see the
 # same surfaces
 MOST_DENSITY = 2.0
-SEAM_COST = 0.5  # of the fit of seams, as a share of the fits of all blocks
-SURPLUS = 1.03  # Gaussians of all blocks, relative to an exact number; the faintest surplus is dropped
+BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to an exact number; the faintest surplus is dropped
 
 
 def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
@@ -106,7 +105,7 @@ def compact_in_blocks(
             growth = sum(start.count for start in starts) / max(1, len(joined))
             if limit is not None and options.budget.is_filled:
                 # blocks drop new Gaussians that belong to other blocks, so each needs a surplus to reach the number
-                growth = max(growth, SURPLUS * limit / max(1, len(joined)))
+                growth = max(growth, BLOCK_SURPLUS * limit / max(1, len(joined)))
         shared_start = work.share((joined, owners))
         fitted = list(adopt_records(work.run("fit", fit_block, count, each_start(starts, shared_start, growth))))
         joined, owners = join_parts([gaussians for gaussians, _ in fitted])
@@ -130,15 +129,16 @@ def join_parts(parts: Sequence[Gaussians]) -> tuple[Gaussians, np.ndarray]:
     return Gaussians.concat(parts), np.repeat(np.arange(len(parts)), [len(gaussians) for gaussians in parts])
 
 
-def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, count: int) -> list[Part]:
+def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, count: int) -> list[RunPart]:
     """Return the parts of a run in ``count`` blocks of equal costs: they are merged, then fitted, and then scored."""
     steps, num_gaussians = 0 if choices.fit.fit == "none" else choices.fit.steps, choices.limits.default
     settings, view_pixels = choices.settings(options), scene.pixels_per_view
     costs = RunCosts(settings, view_pixels * len(scene), view_pixels, 1 / count, steps)
     build, [scores] = costs.build(num_gaussians), costs.end([], None)
-    merged, fitted = Part(build.stages / count), Part(0.0, build.fits / count)
-    seams = [Part(0.0, SEAM_COST * build.fits)] * (steps > 0)
-    return [merged] * count + [fitted] * count + seams + [Part(scores.stages / count)] * count
+    merged, fitted = RunPart(build.stages / count), RunPart(0.0, build.fits / count)
+    seam_cost = 0.5  # of the fit of seams, as a share of the fits of all blocks
+    seams = [RunPart(0.0, seam_cost * build.fits)] * (steps > 0)
+    return [merged] * count + [fitted] * count + seams + [RunPart(scores.stages / count)] * count
 
 
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
@@ -236,13 +236,13 @@ def block_options(
     quarter of the pixels, so each view is fitted as often as in one piece. ``limit`` is the number of Gaussians of all
     blocks together; None: ``superpixels`` and K decide.
     """
-    settings: dict[str, Any] = {**PIECE, "budget": None}
+    settings: dict[str, Any] = {**ONE_PIECE, "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels
     if limit is not None:
-        settings["budget"] = max(1, round(SURPLUS * factor * limit * len(block.views) / len(scene)))
+        settings["budget"] = max(1, round(BLOCK_SURPLUS * factor * limit * len(block.views) / len(scene)))
     elif isinstance(superpixels, str) and superpixels.endswith("%"):
         share = min(1.0, min(factor, MOST_DENSITY) * parse_share(superpixels))
         settings["superpixels"] = share_text(round(share, 6))

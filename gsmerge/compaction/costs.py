@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.compaction.curve import DROP_SHARES, DROP_STEPS, KNEE_SHARES, KNEE_STEPS, curve_counts
 from gsmerge.facts.counts import LEVEL_FACTOR, CountLimits
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.runtime.record import Part
+from gsmerge.runtime.record import RunPart
 from gsmerge.settings.compact import OURS
 from gsmerge.types import Scene
 
@@ -22,7 +22,7 @@ IMPORT_SECONDS = 1.0  # imports, and the constant part of every run
 # For each million pixels of all views together, or each million Gaussians if there are more of these:
 COST_BUILD = 1.0  # superpixels, merging and scores of a result
 COST_INPUT = 0.3  # reading and scoring the input
-COST_NETWORKS = 1.4
+COST_NETWORKS = 1.4  # the shipped networks
 COST_PAPER = 4.5  # the paper's networks, which have more inputs and refine
 COST_PAIRS = 3.0  # merging neighbours pair by pair
 COST_PLACED = 6.0  # drawing a scene without views from placed ones
@@ -32,8 +32,9 @@ COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.25  # per million Gaussians that it draws
 THREAD_GAIN = 0.35  # speed of each thread after the first, relative to the first
 TRIAL_SHARE = 0.25  # of the trial that estimates new views, as a share of building the result
-TRIES, TRIES_OF_RENDERS = 3, 1  # counts that a search usually builds, by photos and by renders of the input
-SAMPLE_GAUSSIANS = 10_000  # from which the mean share inside a view is estimated
+# Counts that a search usually builds, by photos and by renders of the input
+USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
+INSIDE_GAUSSIANS = 10_000  # from which the mean share inside a view is estimated
 PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
 
 
@@ -49,7 +50,7 @@ class RunCosts:
     merges_pairs: bool = False
     is_placed: bool = False  # The views are placed, since the scene has none
 
-    def build(self, count: float, steps: int | None = None) -> Part:
+    def build(self, count: float, steps: int | None = None) -> RunPart:
         """Return the part that builds ``count`` Gaussians, with a fit of ``steps`` (None: as the run)."""
         settings, steps = self.settings, self.steps if steps is None else steps
         method = settings["method"]
@@ -59,19 +60,19 @@ class RunCosts:
             work += COST_PAPER if "paper" in (settings["recipe"], settings["checkpoint"]) else COST_NETWORKS
         view_pixels = min(self.num_pixels, PLACED_PIXELS) if self.is_placed else self.view_pixels
         step = COST_STEP * view_pixels + COST_DRAWN * self.inside * count
-        return Part(self.num_pixels * work / 1e6, steps * step / 1e6)
+        return RunPart(self.num_pixels * work / 1e6, steps * step / 1e6)
 
-    def end(self, counts: Sequence[float], trial: Part | None) -> list[Part]:
+    def end(self, counts: Sequence[float], trial: RunPart | None) -> list[RunPart]:
         """Return the parts that follow a result: levels of ``counts`` Gaussians, a trial, the scores of the input."""
         work = COST_PLACED if self.is_placed else COST_INPUT
-        return [*map(self.build, counts), *([] if trial is None else [trial]), Part(self.num_pixels * work / 1e6)]
+        return [*map(self.build, counts), *([] if trial is None else [trial]), RunPart(self.num_pixels * work / 1e6)]
 
-    def trial(self, count: float) -> Part:
+    def trial(self, count: float) -> RunPart:
         """Return the part of the trial that estimates new views of ``count`` Gaussians, in two rounds."""
         build = self.build(count)
-        return Part(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)
+        return RunPart(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)
 
-    def seconds(self, parts: Sequence[Part], num_views: int, threads: int) -> float:
+    def seconds(self, parts: Sequence[RunPart], num_views: int, threads: int) -> float:
         """Return the wall time of a run with these parts, imports included."""
         work = sum(part.seconds for part in parts)
         return IMPORT_SECONDS + work / (1 + THREAD_GAIN * max(0, min(threads, num_views) - 1))
@@ -79,19 +80,19 @@ class RunCosts:
 
 def mean_inside(scene: Scene) -> float:
     """Measure the mean share of a scene's Gaussians that lie in a view, on a sample; 1 without views."""
-    return float(np.mean(shares_inside(scene, SAMPLE_GAUSSIANS) or [1.0]))
+    return float(np.mean(shares_inside(scene, INSIDE_GAUSSIANS) or [1.0]))
 
 
 def expected_parts(
     costs: RunCosts, limits: CountLimits, count: float, *, has_target: bool, has_curve: bool, max_drop: float | None,
     rendered: bool, levels: int, has_trial: bool,
-) -> list[Part]:  # fmt: skip
+) -> list[RunPart]:  # fmt: skip
     """Return the parts of a run for a result of ``count`` Gaussians.
 
     ``has_target``: counts are tried until a PSNR is met. ``has_curve``: the scene's curve is measured first, down to
     a loss of ``max_drop`` dB. ``rendered``: renders of the input stand for photos.
     """
-    tries = (TRIES_OF_RENDERS if rendered else TRIES) if has_target else 1
+    tries = (USUAL_BUILDS_OF_RENDERS if rendered else USUAL_BUILDS) if has_target else 1
     parts = [costs.build(count)] * tries
     if has_curve and not (has_target or rendered):
         shares, steps = (KNEE_SHARES, KNEE_STEPS) if max_drop is None else (DROP_SHARES, DROP_STEPS)

@@ -27,7 +27,6 @@ from gsmerge.types import Gaussians
 
 KNEE_STEPS = 60  # steps of each short fit: enough to find the knee
 DROP_STEPS = 300  # steps of each short fit for a largest loss of quality, where tenths of a dB count on clean scenes
-HOLDOUT = 0.1  # share of the photos' patches that the fits leave out
 PROGRESS = "curve: what each count brings"
 DROP_SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # counts at which the curve is measured, of the usual count
 KNEE_SHARES = DROP_SHARES[1:5]  # the counts for finding only the knee
@@ -62,13 +61,14 @@ def measure_curve(
     Every fit takes ``steps``, whatever the plan says. It is scored on the photos of ``left_out``; without them, on
     patches that the fit leaves out.
     """
+    holdout = 0.1  # share of the photos' patches that the fits leave out
     short = replace(
-        plan.fit, fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, photo_scale=1.0,
+        plan.fit, fit="full", fit_steps=steps, half_res_share=1.0, holdout=holdout, photo_scale=1.0,
         scored=True, move_cameras=False, share=None,
     )  # fmt: skip
     if left_out is None:
         photos = scene_photos(prepared.scene)[prepared.reference.score_views]
-        weights, min_gain = training_weights(photos, HOLDOUT, plan.seed), short.tuning.min_gain
+        weights, min_gain = training_weights(photos, holdout, plan.seed), short.tuning.min_gain
     else:
         seen = np.flatnonzero(left_out.shares > LEAST_SEEN).tolist()
         photos, weights = left_out.photos[seen], [1 - mask.astype(np.float32) for mask in left_out.seen[seen]]

@@ -15,13 +15,9 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Cameras, Gaussians
 
-NEAR_SHARE = 0.97  # share of the size that a build has to reach
-MOST_DROPPED = 0.08  # largest share of the Gaussians that is dropped after the last build
-ENOUGH = 0.985  # no further Gaussian is put back from this share of the size on
-SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
-TRIES, MAX_REBUILDS = 8, 2  # files that are measured to choose what is dropped; builds after the first one
+BUILD_SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
+MOST_MEASURED, MAX_REBUILDS = 8, 2  # files that are measured to choose what is dropped; builds after the first one
 
-PLACED_BYTES = 700  # most bytes of the node of a camera that is placed since a scene has none
 
 Rebuild = Callable[[int | None], Candidate]  # a count -> a candidate of all views, built, cleaned up and scored
 
@@ -33,7 +29,8 @@ def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: S
         return file.measure(gaussians, cameras, comments)
     if file.encode_contents is not None:
         contents = Contents([gaussians], comments, cameras if names else cameras[:0], names)
-        return len(file.encode_contents(gaussians, contents)) + PLACED_BYTES * (file.first_view and not names)
+        placed_bytes = 700  # most bytes of the node of a camera that is placed since a scene has none
+        return len(file.encode_contents(gaussians, contents)) + placed_bytes * (file.first_view and not names)
     assert file.encode is not None  # all other formats have a fixed number of bytes for each Gaussian
     return len(file.encode(gaussians, comments))
 
@@ -54,9 +51,11 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
         # unseen Gaussians were dropped from the requested number; the bytes that they free are not filled up
         requested = max(count, built[-1].count or 0)
         full_size = rest + (size - rest) * requested / max(count, 1)  # bytes with the dropped Gaussians
-        room = min(int(SURPLUS * count * (max_bytes - rest) / max(size - rest, 1)), plan.limits.most)
-        is_near = full_size >= NEAR_SHARE * max_bytes or room <= SURPLUS * requested
-        fits = room >= (1 - MOST_DROPPED) * count and is_near
+        room = min(int(BUILD_SURPLUS * count * (max_bytes - rest) / max(size - rest, 1)), plan.limits.most)
+        near_share = 0.97  # share of the size that a build has to reach
+        is_near = full_size >= near_share * max_bytes or room <= BUILD_SURPLUS * requested
+        most_dropped = 0.08  # largest share of the Gaussians that is dropped after the last build
+        fits = room >= (1 - most_dropped) * count and is_near
         return None if fits or len(built) > MAX_REBUILDS else room
 
     candidate = meet(rebuild, candidate, choose_next)[-1]
@@ -84,14 +83,15 @@ def drop_to_bytes(
     """
     low, high = 0, len(gaussians)  # counts: the largest that is known to fit, and the largest that may fit
     best, count = gaussians[:0], len(gaussians)
-    for _ in range(TRIES):
+    full_share = 0.985  # no further Gaussian is put back from this share of the size on
+    for _ in range(MOST_MEASURED):
         trial = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
         size = measure_bytes(trial, file, cameras, names)
         if size <= max_bytes:
             low, best = count, trial
         else:
             high = count - 1
-        if low == len(gaussians) or (low and ENOUGH * max_bytes <= size <= max_bytes) or low >= high:
+        if low == len(gaussians) or (low and full_share * max_bytes <= size <= max_bytes) or low >= high:
             break
-        count = min(max(low + 1, int(count * ((1 + ENOUGH) / 2 * max_bytes - rest) / max(size - rest, 1))), high)
+        count = min(max(low + 1, int(count * ((1 + full_share) / 2 * max_bytes - rest) / max(size - rest, 1))), high)
     return best

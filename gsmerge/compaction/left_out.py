@@ -19,7 +19,8 @@ from gsmerge.settings.compact import OURS, TRIAL, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene
 
 LEAST_VIEWS = 4  # fewest views with photos; of fewer views, too little would remain
-PART, MOST = 6, 3  # one of every PART views is left out at a time, and at most MOST views
+# One of every LEFT_OUT_PART views is left out at a time, and at most MOST_LEFT_OUT views
+LEFT_OUT_PART, MOST_LEFT_OUT = 6, 3
 LEAST_SEEN = 0.02  # share of a left-out photo that the other views must cover
 
 
@@ -85,9 +86,9 @@ def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
     return float(np.average(scores[seen], weights=shares[seen]))
 
 
-def choose_views(views: Sequence[int]) -> tuple[list[int], list[int]]:
+def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
     """Choose views to leave out in each of two rounds: evenly spread among ``views``, without neighbours in a round."""
-    count = min(MOST, max(1, len(views) // PART))
+    count = min(MOST_LEFT_OUT, max(1, len(views) // LEFT_OUT_PART))
     spread = [views[i] for i in pick_views(len(views), 2 * count)]
     return spread[::2], spread[1::2]
 

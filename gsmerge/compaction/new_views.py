@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from gsmerge.compaction.left_out import LEAST_SEEN, can_leave_out, choose_views, leave_out, mean_seen
+from gsmerge.compaction.left_out import LEAST_SEEN, can_leave_out, choose_left_out, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.transforms import camera_distances
 from gsmerge.io.formats.arrays import ExpectedScores
@@ -26,12 +26,12 @@ from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
 from gsmerge.types import Cameras, PicturedScene, Pixels
 
-SIDE = 120  # the longer side of the small pictures has at least this many pixels
+TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this many pixels
 # Most steps of the fit. Fits of few views differ below 150 steps (gsmerge.fit.schedule.MANY_STEPS), and predict less
-STEPS = 200
-# Most views of a round, the nearest to those that are left out. With more, STEPS would draw each too seldom to tell how
-# a run with more steps ends; and farther views show little of what the left-out views show
-MOST_VIEWS = 64
+TRIAL_STEPS = 200
+# Most views of a round, the nearest to those that are left out. With more, TRIAL_STEPS would draw each too seldom to
+# tell how a run with more steps ends; and farther views show little of what the left-out views show
+TRIAL_VIEWS = 64
 # Small pictures have more detail in each pixel, so they lose more with few Gaussians. The shares of the trial and of
 # the result are relative to the usual share. The trial's share is the result's share to the power of LESS. On five
 # captures at 1 % this lowers the error of the estimated gain from 2.3 to 1.0 dB
@@ -100,7 +100,7 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     begin_part()
     with record_part(silent=True) as record:
         share = min(1.0, USUAL * float(power(count / (USUAL * pixels), LESS)))
-        chosen = choose_views(prepared.reference.score_views)
+        chosen = choose_left_out(prepared.reference.score_views)
         rounds = [_score_round(prepared, views, plan, build, share) for views in chosen]
         scores = [round_scores for round_scores in rounds if round_scores is not None]
     add_seconds({"new views": sum(record.seconds.values())})
@@ -117,14 +117,14 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
     Returns ``[4,v]`` for the photos: the share that the remaining views see, and the PSNR (dB) of renders from all
     rows, from the rows of the remaining views, and from the result. None if no remaining view sees what they show.
     """
-    around = views_around(prepared.scene.cameras, views, MOST_VIEWS)
+    around = views_around(prepared.scene.cameras, views, TRIAL_VIEWS)
     scene = prepared.scene if len(around) == len(prepared.scene) else subset(prepared.scene, around)
-    small = shrink_scene(scene, max(1, max(scene.cameras.width, scene.cameras.height) // SIDE))
+    small = shrink_scene(scene, max(1, max(scene.cameras.width, scene.cameras.height) // TRIAL_PIXELS))
     left_out = leave_out(small, [around.index(view) for view in views], prepared)
     if left_out is None:
         return None
     superpixels = max(1, round(share * small.pixels_per_view))
-    short = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(STEPS, plan.fit.steps))
+    short = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(TRIAL_STEPS, plan.fit.steps))
     # views from outside hardly change the score, nor does pruning (docs/internals/notebook.md)
     inside = replace(short.fit, tuning=replace(short.fit.tuning, outside_from=1.0))
     compacted = build(left_out.rest, replace(short, fit=inside, is_trial=True), None).gaussians

@@ -17,11 +17,7 @@ from gsmerge.runtime.memory import free_pages
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene
 
-GRID = 24  # cells along the longer side of a view's depth map
-SAMPLE_CELLS = 120  # most cells of a view that are looked up in all other views
-SAME_DEPTH = 0.15  # share by which a point may lie behind the depth of a cell that shows it
 SHARED = 0.25  # most views of neighbours that a block takes in addition, as a share of its own views
-OWNED_TOGETHER = 1024  # points whose owners are searched together
 MOST_CUT = 1 / 3  # largest share of the weights that blocks may cut; beyond it, one piece is better
 
 
@@ -63,7 +59,8 @@ class Covisibility:
 
 def measure_covisibility(scene: Scene) -> Covisibility:
     """Measure which share of every view each other view sees, with occlusion; the scene has to have pixels."""
-    cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // GRID))
+    grid_cells = 24  # cells along the longer side of a view's depth map
+    cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // grid_cells))
     rows, columns = (np.arange(step // 2, side, step) for side in (cameras.height, cameras.width))
     picked = (rows[:, None] * cameras.width + columns).reshape(-1)
     fronts = scene.get_pixels().fronts.reshape(len(scene), -1)[:, picked]
@@ -76,7 +73,8 @@ def measure_covisibility(scene: Scene) -> Covisibility:
         return np.where(valid[view] & (z > 0), z, np.inf)
 
     depths = np.stack(parallel_map(measure_depths, range(len(scene)))).reshape(-1, len(rows), len(columns))
-    stride = slice(None, None, max(1, len(picked) // SAMPLE_CELLS))
+    sample_cells = 120  # most cells of a view that are looked up in all other views
+    stride = slice(None, None, max(1, len(picked) // sample_cells))
     samples = [means[view, stride][valid[view, stride]] for view in range(len(scene))]
 
     def measure_shares(points: np.ndarray) -> np.ndarray:
@@ -93,7 +91,8 @@ def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.nd
     Points behind the surfaces of the coarse depth maps ``depths [c,h,w]`` are not seen.
     """
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    return see_points(points, viewmats, Ks, depths, cameras.width, cameras.height, 0.0, 1 + SAME_DEPTH)
+    same_depth = 0.15  # share by which a point may lie behind the depth of a cell that shows it
+    return see_points(points, viewmats, Ks, depths, cameras.width, cameras.height, 0.0, 1 + same_depth)
 
 
 def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
@@ -184,5 +183,6 @@ def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence
         squares[~shown & shown.any(0)] = np.inf
         return squares.argmin(0)
 
-    parts = np.array_split(points.astype(np.float64), max(1, len(points) // OWNED_TOGETHER))
+    owned_together = 1024  # points whose owners are searched together
+    parts = np.array_split(points.astype(np.float64), max(1, len(points) // owned_together))
     return np.asarray(views)[np.concatenate(parallel_map(find_owners, parts))]

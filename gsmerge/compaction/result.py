@@ -11,7 +11,7 @@ from weakref import ReferenceType
 
 from gsmerge.compaction.candidate import Candidate, shrink, with_moved_views
 from gsmerge.compaction.distance import describe_far, is_far
-from gsmerge.compaction.new_views import SIDE, SPREAD, NewViews, Trial
+from gsmerge.compaction.new_views import SPREAD, TRIAL_PIXELS, NewViews, Trial
 from gsmerge.compaction.outputs import write_result
 from gsmerge.compaction.report import CompactReport, compared_psnr
 from gsmerge.compaction.scores import PartScores, measure_parts, score_input
@@ -20,7 +20,7 @@ from gsmerge.errors import Doubt
 from gsmerge.facts.prepare import Prepared
 from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.plan import Plan, own_views
-from gsmerge.raster.metrics import SPARE, describe_distance, describe_loss, is_worse
+from gsmerge.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene, number_views
@@ -145,7 +145,7 @@ def make_result(
         for candidate in candidates
     ]
     if plan.samples and any(
-        is_worse(*compared_psnr(parts.covered, before, candidate.psnr), SPARE)
+        is_worse(*compared_psnr(parts.covered, before, candidate.psnr), SAMPLE_LOSS)
         for parts, candidate in zip(part_scores, candidates, strict=True)
     ):
         plan = replace(plan, scored_views=own_views(prepared), samples=False)
@@ -223,7 +223,8 @@ def _expect_new_views(
     if trial is None or prepared.agreement is None or before is None or after is None:
         return None, None
     expected = trial.predict(before, after, prepared.agreement.confirmed)
-    is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= SIDE  # smaller pictures say little
+    # Smaller pictures say little
+    is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= TRIAL_PIXELS
     if not is_large or main.worse is not None or expected.gain >= -SPREAD:
         return expected, None
     return expected, f"new views of the result are expected to be {-expected.gain:.1f} dB worse than those of the input"

@@ -13,7 +13,7 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.rounding import round_as_written
 from gsmerge.photos.views import scored_views
 from gsmerge.plan import Plan
-from gsmerge.raster.photos import NEAR_PLANE, WHOLE, PhotoScore, scene_photos, score_photos
+from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.record import stage
 from gsmerge.stages.prune import ROUNDING
 from gsmerge.types import Gaussians, Scene
@@ -28,7 +28,7 @@ def covers_all(before: PhotoScore | None) -> bool:
 
     That is the case if the input covers nearly all pixels, or none; and without a score.
     """
-    return before is None or before.share >= WHOLE or not math.isfinite(before.covered_psnr)
+    return before is None or before.share >= WHOLE_SHARE or not math.isfinite(before.covered_psnr)
 
 
 def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PhotoScore:
@@ -39,7 +39,7 @@ def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Pho
 def may_leave_gaps(prepared: Prepared, plan: Plan) -> bool:
     """Return whether more than a few pixels are black in renders of the input, as where the input covers nothing."""
     pictures = (prepared.scene.images[view] for view in plan.scored_views)
-    return bool(np.mean([(picture.max(-1) > ROUNDING).mean() for picture in pictures]) < WHOLE)
+    return bool(np.mean([(picture.max(-1) > ROUNDING).mean() for picture in pictures]) < WHOLE_SHARE)
 
 
 def written(gaussians: Gaussians, plan: Plan) -> Gaussians:

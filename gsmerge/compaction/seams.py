@@ -20,9 +20,7 @@ from gsmerge.runtime.record import add_seconds, begin_part, choose, record_part,
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-FOREIGN = 0.1  # a Gaussian is at a seam if more than this share of its weights is in views of other blocks
-SEAM_SHARE = 0.1  # seams are fitted to a view if more than this share of its weights is on Gaussians at seams
-SEAM_STEPS = 100  # fewest steps of the fit
+FOREIGN_SHARE = 0.1  # a Gaussian is at a seam if more than this share of its weights is in views of other blocks
 SEAM_VIEW_STEPS = 2  # steps for each view
 # Blocks are parts of one room if at least the share ROOM_SHARE of the Gaussians is at seams. Then each view gets
 # ROOM_VIEW_STEPS steps
@@ -30,7 +28,6 @@ ROOM_SHARE, ROOM_VIEW_STEPS = 0.5, 4
 # Step sizes relative to the usual start: they are smaller, because the Gaussians are fitted already, but beside older
 # neighbours
 SEAM_RATE = 0.6
-SEAM_DECAY = 0.1  # factor on the step sizes at the end
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart], seed: int) -> Gaussians:
@@ -49,10 +46,12 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
             return joined
         scene = join_views([(start.prepared.scene, ids) for start, ids in zip(starts, views, strict=True) if ids])
     rows = np.flatnonzero(peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution)
-    tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=SEAM_DECAY)
+    seam_decay = 0.1  # factor on the step sizes at the end
+    tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=seam_decay)
     view_steps = SEAM_VIEW_STEPS if at_seam.mean() < ROOM_SHARE else ROOM_VIEW_STEPS
+    seam_steps = 100  # fewest steps of the fit
     options = replace(
-        plan.fit, fit_steps=max(SEAM_STEPS, view_steps * len(scene)), photo_scale=1.0, scored=False, dropout=0.0,
+        plan.fit, fit_steps=max(seam_steps, view_steps * len(scene)), photo_scale=1.0, scored=False, dropout=0.0,
         half_res_share=0.0, min_contribution=0.0, beyond=True, tuning=tuning,
     )  # fmt: skip
     decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])
@@ -76,11 +75,12 @@ def find_seams(
     for number, _, ids, weights in _view_weights(splats, starts):
         total[ids] += weights
         foreign[ids] += np.where(owners[ids] == number, 0, weights)
-    at_seam = foreign > FOREIGN * total
+    at_seam = foreign > FOREIGN_SHARE * total
+    seam_share = 0.1  # seams are fitted to a view if more than this share of its weights is on Gaussians at seams
     # measured a second time, because the weights of all views would not fit into memory
     for number, view, ids, weights in _view_weights(splats, starts):
         seam_weight, view_weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam[ids]], weights))
-        if seam_weight > SEAM_SHARE * view_weight:
+        if seam_weight > seam_share * view_weight:
             views[number].append(view)
     return at_seam, views
 

@@ -18,7 +18,7 @@ from gsmerge.compaction.curve import (
     curve_knee,
     measure_curve,
 )
-from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, choose_views, leave_out, mean_seen
+from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, choose_left_out, leave_out, mean_seen
 from gsmerge.compaction.scores import covers_all, may_leave_gaps, measure_input, measure_renders
 from gsmerge.facts.counts import LEVEL_FACTOR
 from gsmerge.facts.prepare import Prepared
@@ -30,22 +30,17 @@ from gsmerge.runtime.record import begin_part, choose, current_record, note, rec
 from gsmerge.stages.segment import knee_count
 
 # dB of PSNR per doubling of the count, assumed until two counts were tried: against photos, and against renders
-SLOPE, RENDERS_SLOPE = 1.0, 3.0
-CLOSE = 1.15  # two counts are the same up to this ratio
-NEAR_DB = 0.6  # a count is near enough at this many dB above a target for renders, which is CLOSE at their slope
+PHOTOS_SLOPE, RENDERS_SLOPE = 1.0, 3.0
+SAME_COUNT_RATIO = 1.15  # two counts are the same up to this ratio
+# A count is near enough at this many dB above a target for renders, which is SAME_COUNT_RATIO at their slope
+NEAR_DB = 0.6
 # The same bound for photos that decide the default count. It is less than FIDELITY_LOSS, because the whole input has no
 # loss at all
 PHOTOS_NEAR_DB = 0.2
 MAX_RUNS = 6  # most builds of a search
-# Bounds of a search by left-out photos. Its slope is the mean of eleven captures below the usual count; a count is near
-# enough at half of a doubling
-MAX_TRIED = 3  # most builds, in addition to the build of the result
-LEFT_OUT_SLOPE, LEFT_OUT_NEAR_DB = 0.3, 0.15  # dB per doubling of the count; dB above a target
-MAX_FACTOR = 4  # a quality target against photos may take at most this many times the usual count
-FAR_DB = (
-    6.0  # PSNR is cut at this many dB above a target: larger values, as of the whole input, say little of the slope
-)
-COMPACT_SHARE = 0.5  # a scene is compact already if the result needs more than this share of its Gaussians
+MAX_TRIED = 3  # most builds of a search by left-out photos, in addition to the build of the result
+# PSNR is cut at this many dB above a target, because larger values, as of the whole input, say little of the slope
+FAR_DB = 6.0
 
 T = TypeVar("T")
 
@@ -102,7 +97,8 @@ class CountSearch:
         if plan.keeps_fidelity and not plan.auto_count:
             least = min(limits.default, limits.max_count)
         if not (plan.keeps_fidelity or self.rendered):
-            most = min(most, MAX_FACTOR * limits.default)
+            max_factor = 4  # a quality target against photos may take at most this many times the usual count
+            most = min(most, max_factor * limits.default)
         if self.left_out is not None and self.most:
             most = min(most, self.most)
         return least, most
@@ -110,10 +106,13 @@ class CountSearch:
     def _expected_slope(self) -> tuple[float, float]:
         """Return the dB per doubling of the count to assume at first, and the dB above the target that are enough."""
         if self.left_out is not None:
-            return LEFT_OUT_SLOPE, LEFT_OUT_NEAR_DB
+            # dB per doubling of the count, the mean of eleven captures below the usual count; and dB above a target, at
+            # which a count is near enough, since that is half of a doubling
+            left_out_slope, left_out_near_db = 0.3, 0.15
+            return left_out_slope, left_out_near_db
         if self.rendered:
             return RENDERS_SLOPE, NEAR_DB
-        return SLOPE, PHOTOS_NEAR_DB if self.plan.keeps_fidelity else 0.0
+        return PHOTOS_SLOPE, PHOTOS_NEAR_DB if self.plan.keeps_fidelity else 0.0
 
     @property
     def tried(self) -> dict[int, float]:
@@ -178,7 +177,8 @@ class CountSearch:
             good = f"show the photos at most {FIDELITY_LOSS:g} dB worse than the input"
         if not self.met:
             return [f"{kept}: each of the {len(self.tried)} counts tried would {short}"]
-        if count > COMPACT_SHARE * limits.num_input:
+        compact_share = 0.5  # a scene is compact already if the result needs more than this share of its Gaussians
+        if count > compact_share * limits.num_input:
             return [f"the scene is compact already: {kept}, since fewer would {short}"]
         return [f"{kept}, about the fewest that {good}"]
 
@@ -231,7 +231,7 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
     if plan.fit.fit == "none" or not (has_target or plan.max_drop is not None or plan.auto_count):
         return None
     if can_leave_out(prepared):
-        for views in choose_views(prepared.reference.score_views):
+        for views in choose_left_out(prepared.reference.score_views):
             if left_out := leave_out(prepared.scene, views, prepared):
                 return left_out
     if prepared.reference.name == PHOTOS and not plan.auto_count:
@@ -284,7 +284,7 @@ def level_counts(finest: int, plan: Plan) -> list[int]:
 
 
 def next_count(
-    tried: Mapping[int, float], target: float, least: int, most: int, slope: float = SLOPE, near: float = 0.0
+    tried: Mapping[int, float], target: float, least: int, most: int, slope: float = PHOTOS_SLOPE, near: float = 0.0
 ) -> int:
     """Choose the next count to try in the search for the fewest Gaussians that reach a PSNR, within 15 %.
 
@@ -297,7 +297,7 @@ def next_count(
     if above is not None and tried[above] <= target + near:
         return above
     if above is not None and below is not None:
-        if above <= below * CLOSE:
+        if above <= below * SAME_COUNT_RATIO:
             return above
         width = float(log(above / below))  # of the interval between the two counts; PSNR is linear in it
         rise = (min(tried[above], target + FAR_DB) - tried[below]) / width

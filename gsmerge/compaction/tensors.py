@@ -21,7 +21,7 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import normalize, rgb_to_sh0
-from gsmerge.io.bounds import check_pixels
+from gsmerge.io.bounds import check_image_size
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,
     C2W_OPENGL,
@@ -34,15 +34,12 @@ from gsmerge.io.cameras.camera_file import (
 from gsmerge.io.formats.read import clear_invalid, clear_rows, find_empty
 from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.input import TOLERANCE, check_cameras, check_numbers, check_values
+from gsmerge.scene.input import TOLERANCE, check_numbers, check_poses, check_values
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
 from gsmerge.values.arrays import Array, as_array, to_float32
 from gsmerge.values.words import count_words
 
-ORDERS = ("view-major", "none")
-_NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may exceed it
-_EXACT = 1e-5  # the same difference from which on quaternions are normalised
-_MAX_COLOR = 2.0  # largest colour; harmonics may take colours a little beyond 1
+TENSOR_ORDERS = ("view-major", "none")
 _REMEDIES = {
     C2W_OPENCV: "pass their inverse, torch.linalg.inv(viewmats)",
     W2C_OPENGL: "negate the second and the third row of each",
@@ -108,8 +105,8 @@ def compact_tensors(
         >>> len(gsmerge.compact_tensors(**columns, **views, effort="draft", budget=300).gaussians)
         300
     """
-    if order not in ORDERS:
-        raise ValueError(f"order: expected one of {', '.join(ORDERS)}, got {order!r}")
+    if order not in TENSOR_ORDERS:
+        raise ValueError(f"order: expected one of {', '.join(TENSOR_ORDERS)}, got {order!r}")
     columns = {
         "means": _rows("means", means, 3),
         "quats": _rows("quats", quats, 4),
@@ -194,7 +191,8 @@ def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, l
     check_values(out)
     _check_lengths(out["quats"][valid])
     np.clip(out["opacities"], 0, 1, out=out["opacities"])
-    off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > _EXACT)
+    min_difference = 1e-5  # of a quaternion's length from 1, from which on it is normalised
+    off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > min_difference)
     out["quats"][off] = normalize(out["quats"][off])
     out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
     notes = [count_words(num_bad, "row", "with NaN or inf, set aside")] if num_bad else []
@@ -212,7 +210,8 @@ def _read_base(sh0: Array | None, colors: Array | None) -> np.ndarray:
     if sh0 is not None:
         return _rows("sh0", sh0, 3).reshape(-1, 1, 3)
     rgb = _rows("colors", colors, 3)
-    _expect_unit_range("colors", rgb[np.isfinite(rgb)], _MAX_COLOR - 1)
+    max_color = 2.0  # largest colour; harmonics may take colours a little beyond 1
+    _expect_unit_range("colors", rgb[np.isfinite(rgb)], max_color - 1)
     return rgb_to_sh0(rgb)[:, None]
 
 
@@ -232,8 +231,10 @@ def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
 def _check_lengths(quats: np.ndarray) -> None:
     """Raise SceneError for quaternions of other lengths than 1; a scene may have them, as no stage uses lengths."""
     lengths = np.linalg.norm(quats, axis=1)
-    share = float((np.abs(lengths - 1) > _NOT_UNIT).mean())
-    if share > _FEW:
+    # Difference of a quaternion's length from 1; share of rows that may exceed it
+    max_difference, max_share = 0.01, 0.01
+    share = float((np.abs(lengths - 1) > max_difference).mean())
+    if share > max_share:
         sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
         remedy = "pass torch.nn.functional.normalize(quats, dim=-1)"
         raise SceneError("quats", f"expected unit quaternions wxyz, found {sizes}", remedy)
@@ -264,7 +265,7 @@ def _read_views(
     intrinsics = _matrices("Ks", Ks, ((3, 3),), views)
     poses = np.tile(np.eye(4), (views, 1, 1))
     poses[:, : matrices.shape[1]] = matrices
-    check_cameras(poses, intrinsics)
+    check_poses(poses, intrinsics)
     for view, K in enumerate(intrinsics):
         if max(K[0, 0], K[1, 1]) < MAX_NORMALISED_FOCAL <= min(width, height):
             problem = f"view {view}: expected intrinsics in pixels, found a focal length of {K[0, 0]:.3g}"
@@ -303,7 +304,7 @@ def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple
         if photos.ndim < 4 or photos.shape[-1] != 3:
             raise _image_error(photos, "[V, H, W, 3]")
         views, height, width = photos.shape[-4:-1]
-    check_pixels("shape", width, height)
+    check_image_size("shape", width, height)
     return views, height, width
 
 

@@ -21,28 +21,31 @@ from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
 from gsmerge.types import Cameras, Scene
 
-SAMPLE_PIXELS = 1200  # sampled pixels of a view
-NEIGHBORS = 16  # nearest other views in which the sampled pixels are looked up
-# Largest distance from a pixel at which its point, projected back, agrees with it: REACH as a share of the longer side,
-# but at least PIXELS
-REACH, PIXELS = 1 / 120, 1.5
-SAME = 0.05  # difference of the logarithms of two depths of one surface
-TINY = 1e-9  # least depth, canonical units
-# A result is poor if the share of confirmed pixels is below POOR: this separates the poor results of 15 captures from
-# the sound ones. If the share of alone pixels is above LONELY, the reason is that too few views see the pixels
-POOR, LONELY = 0.5, 0.2
-CERTAIN, ENOUGH = 2.0, 30  # standard errors that chance may cause; samples from which on the error is about normal
-# Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if more than the share MOSTLY of its
-# pixels is poor
+CONFIRM_PIXELS = 1200  # sampled pixels of a view
+CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are looked up
+# Largest distance from a pixel at which its point, projected back, agrees with it: AGREEMENT_SHARE as a share of the
+# longer side, but at least AGREEMENT_PIXELS
+AGREEMENT_SHARE, AGREEMENT_PIXELS = 1 / 120, 1.5
+SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
+LEAST_DEPTH = 1e-9  # least depth, canonical units
+# A result is poor if the share of confirmed pixels is below POOR_SHARE: this separates the poor results of 15 captures
+# from the sound ones. If the share of alone pixels is above LONELY_SHARE, the reason is that too few views see the
+# pixels
+POOR_SHARE, LONELY_SHARE = 0.5, 0.2
+# Standard errors that chance may cause; samples from which on the error is about normal
+CHANCE_ERRORS, NORMAL_SAMPLES = 2.0, 30
+# Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if more than the share POOR_PART_SHARE
+# of its pixels is poor
 THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
 }  # fmt: skip
-MOSTLY = 0.5
-# Useful number of Gaussians per pixel. It is MOST if the share of confirmed pixels is at least SOUND, and falls to the
-# usual share, FEWEST, at a share of WRONG. With more Gaussians a fit memorises the photos (docs/guide/how-many.md).
-# MOST is the largest number at which no capture with as much confirmed depth lost .1 dB in photos that were not used.
-MOST, FEWEST, SOUND, WRONG = 0.07, parse_share(SHARE), 0.75, 0.6
+POOR_PART_SHARE = 0.5  # share of the pixels of a part
+# Useful number of Gaussians per pixel. It is MOST_PER_PIXEL if the share of confirmed pixels is at least SOUND_SHARE,
+# and falls to the usual share, FEWEST, at a share of WRONG_SHARE. With more Gaussians a fit memorises the photos
+# (docs/guide/how-many.md). MOST_PER_PIXEL is the largest number at which no capture with as much confirmed depth lost
+# .1 dB in photos that were not used.
+MOST_PER_PIXEL, FEWEST, SOUND_SHARE, WRONG_SHARE = 0.07, parse_share(SHARE), 0.75, 0.6
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,12 @@ class Agreement:
     confirmed: float  # At least one view confirms the depth, and no more views see through it
     contradicted: float  # More views see through it than confirm it
     alone: float  # No other view sees the position
-    num_pixels: int = field(default=SAMPLE_PIXELS, compare=False)  # Number of sampled pixels that count
+    num_pixels: int = field(default=CONFIRM_PIXELS, compare=False)  # Number of sampled pixels that count
     # Part of the pictures in which most pixels are contradicted, or alone, as "left third of 4 of 7 views"; empty: none
     contradicted_part: str = field(default="", compare=False)
     alone_part: str = field(default="", compare=False)
-    from_one_point: bool = field(default=False, compare=False)  # No two views show things displaced by ``PIXELS``
+    # No two views show things displaced by ``AGREEMENT_PIXELS``
+    from_one_point: bool = field(default=False, compare=False)
 
     def to_dict(self) -> dict[str, float]:
         """Return the shares of the scene, for reports."""
@@ -65,8 +69,8 @@ class Agreement:
     @property
     def share(self) -> float:
         """Useful number of Gaussians per pixel; more would not show new views better."""
-        soundness = (self.confirmed - WRONG) / (SOUND - WRONG)
-        return FEWEST + (MOST - FEWEST) * min(1.0, max(0.0, soundness))
+        soundness = (self.confirmed - WRONG_SHARE) / (SOUND_SHARE - WRONG_SHARE)
+        return FEWEST + (MOST_PER_PIXEL - FEWEST) * min(1.0, max(0.0, soundness))
 
     @property
     def advice(self) -> str | None:
@@ -77,10 +81,10 @@ class Agreement:
                 " another, and new views from elsewhere show guesses; photos from other places would help most"
             )
         error = math.sqrt(self.confirmed * (1 - self.confirmed) / self.num_pixels)
-        if self.confirmed + CERTAIN * error >= POOR or self.num_pixels < ENOUGH:
+        if self.confirmed + CHANCE_ERRORS * error >= POOR_SHARE or self.num_pixels < NORMAL_SAMPLES:
             return None
         problem = f"only {100 * self.confirmed:.0f} % of the pixels have a depth that another view confirms"
-        if self.alone > LONELY:
+        if self.alone > LONELY_SHARE:
             cause = f"no other view sees {100 * self.alone:.0f} %, because the photos are too few or too far apart"
             where = f" ({self.alone_part})" if self.alone_part else ""
             return f"{problem}, and {cause}{where}; more photos between these would help most"
@@ -116,7 +120,7 @@ def _count_view(scene: Scene, view: int) -> np.ndarray:
     """
     width, height = scene.cameras.width, scene.cameras.height
     rows = np.flatnonzero(scene.get_pixels().fronts[view].reshape(-1) >= 0)
-    rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), SAMPLE_PIXELS))]
+    rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), CONFIRM_PIXELS))]
     num_same, num_through, is_alone, is_counted = _look_up(scene, view, rows)
     kinds = (num_same > 0) & (num_same >= num_through), num_through > num_same, is_alone
     column, row = 3 * (rows % width) // width, 3 * (rows // width) // height  # in thirds of the picture
@@ -135,10 +139,10 @@ def _look_up(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarray, np.
     means, cameras = scene.gaussians.means, scene.cameras
     fronts = scene.get_pixels().fronts.reshape(len(scene), -1)
     points = means[fronts[view, rows]].astype(np.float64)
-    neighbors = nearest_views(cameras.centres, view)[:NEIGHBORS]
+    neighbors = nearest_views(cameras.centres, view)[:CONFIRM_NEIGHBORS]
     pixels, depths = project(points, cameras[neighbors])
     x, y = pixels[..., 0], pixels[..., 1]
-    inside = (depths > TINY) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
+    inside = (depths > LEAST_DEPTH) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
     # pairs of a neighbour and a point inside its picture, first all pairs, then those with a Gaussian in the pixel
     neighbor_ids, ids = np.nonzero(inside)
     column, row = x[neighbor_ids, ids].astype(np.int64), y[neighbor_ids, ids].astype(np.int64)
@@ -151,9 +155,9 @@ def _look_up(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarray, np.
     surface = means.take(front[has_front], 0).astype(np.float64)  # the points that the neighbours show there
     distance = _distance_back(surface, rows[ids], cameras[[view]])
     surface_depths = camera_depths(surface, cameras.viewmats[neighbors[neighbor_ids]])
-    behind = log(depths[neighbor_ids, ids] / np.maximum(surface_depths, TINY))  # above 0: the point is hidden
-    agrees = (distance < 1) & (np.abs(behind) < SAME)
-    sees_through = ~agrees & ((behind < -2 * SAME) | ((behind < 0) & (distance > 2)))
+    behind = log(depths[neighbor_ids, ids] / np.maximum(surface_depths, LEAST_DEPTH))  # above 0: the point is hidden
+    agrees = (distance < 1) & (np.abs(behind) < SAME_LOG_DEPTH)
+    sees_through = ~agrees & ((behind < -2 * SAME_LOG_DEPTH) | ((behind < 0) & (distance > 2)))
     num_same, num_through = (np.bincount(ids[mask], minlength=len(rows)) for mask in (agrees, sees_through))
     return num_same, num_through, is_alone, is_counted
 
@@ -166,15 +170,15 @@ def _distance_back(points: np.ndarray, rows: np.ndarray, camera: Cameras) -> np.
     pixels = np.stack([rows % camera.width, rows // camera.width], 1) + 0.5
     (projected,), (depths,) = project(points, camera)
     right, down = (projected - pixels).T
-    reach = max(PIXELS, REACH * max(camera.width, camera.height))
-    return np.where(depths > TINY, np.sqrt(right * right + down * down), np.inf) / reach
+    reach = max(AGREEMENT_PIXELS, AGREEMENT_SHARE * max(camera.width, camera.height))
+    return np.where(depths > LEAST_DEPTH, np.sqrt(right * right + down * down), np.inf) / reach
 
 
 def _is_from_one_point(scene: Scene) -> bool:
-    """Return whether the cameras' largest distance shifts points at the scene's depth by less than ``PIXELS``."""
+    """Return whether the cameras' largest distance shifts points at the scene's depth by under ``AGREEMENT_PIXELS``."""
     cameras = scene.cameras
     baseline = np.linalg.norm(np.ptp(cameras.centres, axis=0))
-    return bool(baseline * cameras.Ks[:, 0, 0].max() < PIXELS * scene_depth(scene))
+    return bool(baseline * cameras.Ks[:, 0, 0].max() < AGREEMENT_PIXELS * scene_depth(scene))
 
 
 def _worst_part(poor: np.ndarray, pixels: np.ndarray) -> str:
@@ -182,7 +186,7 @@ def _worst_part(poor: np.ndarray, pixels: np.ndarray) -> str:
 
     ``poor [v,part]`` and ``pixels [v,part]`` are numbers of pixels. Empty if all parts are poor in equally many views.
     """
-    views = (poor > MOSTLY * np.maximum(pixels, 1)).sum(0)
+    views = (poor > POOR_PART_SHARE * np.maximum(pixels, 1)).sum(0)
     worst = int(views.argmax())
     if views[worst] == 0 or views.min() == views[worst]:
         return ""

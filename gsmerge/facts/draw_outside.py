@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.facts.pixels import find_pixels
-from gsmerge.facts.place_cameras import SAMPLE_GAUSSIANS, choose_cameras
+from gsmerge.facts.place_cameras import CANDIDATE_GAUSSIANS, choose_showing
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.kernels.elementary import arctan2
@@ -27,10 +27,9 @@ from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels
 # show mainly such Gaussians. Views of fifteen captures in voxels miss at most .001 of them, at their edges; two
 # of four views of a narrow capture miss .02, and two of five of another .006
 LEAST_OUTSIDE = 0.005
-LEAST_ADDED = 0.2  # a further camera is placed if it adds more than this share of what those before it show
 SOURCES, STEPS_BACK = 4, 8  # most views beside which cameras are placed, and cameras for each that step back
 # Bounds of these: step back as a share of the depth, rotation to the sides, and rotation up or down, degrees
-NEAREST, FARTHEST = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
+BESIDE_LOW, BESIDE_HIGH = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
 
 
 def draw_outside(scene: PicturedScene) -> PicturedScene:
@@ -66,11 +65,12 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
 
     Candidates step back from some of the views, or turn about their centres by halves of their field, all around.
     """
-    sample, step = thin_out(gaussians, SAMPLE_GAUSSIANS), max(1, -(-len(gaussians) // SAMPLE_GAUSSIANS))
+    sample, step = thin_out(gaussians, CANDIDATE_GAUSSIANS), max(1, -(-len(gaussians) // CANDIDATE_GAUSSIANS))
     sources = cameras[even_views(len(cameras), min(len(cameras), SOURCES))]
-    back = outside_cameras(sample.means, sources, STEPS_BACK * len(sources), NEAREST, FARTHEST)
+    back = outside_cameras(sample.means, sources, STEPS_BACK * len(sources), BESIDE_LOW, BESIDE_HIGH)
     candidates = concat_cameras(back, _turn(sources))
-    return candidates[choose_cameras(sample, candidates, outside[::step], LEAST_ADDED)]
+    least_added = 0.2  # a further camera is placed if it adds more than this share of what those before it show
+    return candidates[choose_showing(sample, candidates, outside[::step], least_added)]
 
 
 def _turn(cameras: Cameras) -> Cameras:

@@ -28,22 +28,20 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, fill_pixels
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
-EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
+HOLE_OPACITY = 0.75  # opacity of the drawing below which a pixel is empty
 # Shares of the usual opacity of a view, which is low if the export has few rows. A pixel shows nothing if its opacity
 # is below NOTHING. There is nothing around a pixel if the mean opacity around it is below SPARSE
 NOTHING, SPARSE = 0.5, 0.25
-# Parts that stay empty hold squares with sides of the share LARGE of the picture's longer side, cover at least the
-# share PART of the picture, and are reduced by a rim of RIM pixels
-LARGE, PART, RIM = 1 / 12, 0.12, 2
-GAP = 1 / 53  # beside large empty parts, only gaps narrower than this share of the longer side are filled
-MOST = 0.5  # share of empty pixels from which on the scene may be only a part of what the photos show
+# Parts that stay empty hold squares with sides of the share LARGE_SIDE of the picture's longer side, cover at least the
+# share LARGE_AREA of the picture, and are reduced by a rim of RIM_PIXELS pixels
+LARGE_SIDE, LARGE_AREA, RIM_PIXELS = 1 / 12, 0.12, 2
+GAP_WIDTH = 1 / 53  # beside large empty parts, only gaps narrower than this share of the longer side are filled
+MOST_EMPTY = 0.5  # share of empty pixels from which on the scene may be only a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # candidate depths, relative to the depth of a view's farthest surface
-FARTHEST = 0.99  # quantile of the depths that counts as the farthest
-FARTHER = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
-NEIGHBORS = 3  # nearest views that a picture is compared with
-BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
-LEAST = 1e-3  # least weight in this window of pixels that other views see
-SIZE, OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
+FARTHEST_QUANTILE = 0.99  # quantile of the depths that counts as the farthest
+HOLE_NEIGHBORS = 3  # nearest views that a picture is compared with
+DIFFERENCE_BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
+NEW_SIZE_PIXELS, NEW_OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
 BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
 
 
@@ -66,11 +64,11 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     if not views:
         return scene
     holes, empty, edges = np.zeros_like(free), np.zeros_like(free), dict[int, _Edges]()
-    gap = 2 * round(GAP * max(shown.shape[1:]) / 2) + 1
+    gap = 2 * round(GAP_WIDTH * max(shown.shape[1:]) / 2) + 1
 
     def find(view: int, tiled: TiledView) -> None:
         depths, transmittance = blend_depths(tiled)
-        covered = transmittance <= 1 - EMPTY
+        covered = transmittance <= 1 - HOLE_OPACITY
         if is_cropped or not everywhere:
             empty[view] = _find_empty(1 - transmittance, shown[view], gap, is_cropped=is_cropped)
         bare[view] = ~covered & ~empty[view]
@@ -80,11 +78,11 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
         if covered.any() and holes[view].any():
             beside = fill_gaps(depths[..., None], covered)[..., 0][holes[view]]
-            edges[view] = _Edges(beside, float(np.quantile(depths[covered], FARTHEST)))
+            edges[view] = _Edges(beside, float(np.quantile(depths[covered], FARTHEST_QUANTILE)))
 
     tile_views(scene, find, views)
     filled = scene
-    if edges and np.count_nonzero(bare[views]) < MOST * np.count_nonzero(~empty[views]):
+    if edges and np.count_nonzero(bare[views]) < MOST_EMPTY * np.count_nonzero(~empty[views]):
         filled = _fill_views(scene, holes, edges)
     return _leave_empty(filled, empty)
 
@@ -134,14 +132,15 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
     """Return the connected parts of a mask ``[h,w]`` that hold a large square, reduced by a rim of some pixels.
 
     There are none if the squares cover little of the picture. Gaps, and borders that exporters leave out, are narrower
-    than the squares. Depth Anything 3 leaves out the farthest tenth of the pixels, which is less than the share PART.
+    than the squares. Depth Anything 3 leaves out the farthest tenth of the pixels, which is less than the share
+    LARGE_AREA.
     """
-    if empty.mean() < PART:
+    if empty.mean() < LARGE_AREA:
         return np.zeros_like(empty)
-    side = 2 * round(LARGE * max(empty.shape) / 2) + 1
-    square, rim = np.ones((side, side), np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)
+    side = 2 * round(LARGE_SIDE * max(empty.shape) / 2) + 1
+    square, rim = np.ones((side, side), np.uint8), np.ones((2 * RIM_PIXELS + 1,) * 2, np.uint8)
     opened = cv2.morphologyEx(empty.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
-    if opened.mean() < PART:
+    if opened.mean() < LARGE_AREA:
         return np.zeros_like(empty)
     _, labels = cv2.connectedComponents(empty.astype(np.uint8), connectivity=4)
     is_large = np.isin(labels, labels[opened & empty])
@@ -180,11 +179,11 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
     beside, beyond = edges.beside.astype(np.float64), edges.farthest * FACTORS[:, None]
     candidates = np.concatenate([beside[None], np.maximum(beyond, beside)])
     depth = _choose_depths(scene, view, holes, rays, candidates)
-    eye, size = cameras.centres[view], SIZE / cameras.Ks[view, 0, 0]
-    return make_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
+    eye, size = cameras.centres[view], NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
+    return make_round_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
 
 
-def make_gaussians(
+def make_round_gaussians(
     eye: np.ndarray, rays: np.ndarray, depths: np.ndarray, size: float, colors: np.ndarray, num_higher: int
 ) -> Gaussians:
     """Make round Gaussians at ``depths [n]`` along ``rays [n,3]`` from ``eye``, with ``colors [n,3]`` (sRGB).
@@ -195,7 +194,7 @@ def make_gaussians(
         means=(eye + depths[:, None] * rays).astype(np.float32),
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(rays), 1)),
         scales=np.repeat((size * depths)[:, None], 3, 1).astype(np.float32),
-        opacities=np.full(len(rays), OPACITY, np.float32),
+        opacities=np.full(len(rays), NEW_OPACITY, np.float32),
         sh0=rgb_to_sh0(colors)[:, None].astype(np.float32),
         shN=np.zeros((len(rays), num_higher, 3), np.float32),
     )
@@ -209,16 +208,18 @@ def _choose_depths(
     Differences of colours are averaged over neighbouring ``holes [h,w]``. The first depth is chosen in doubt.
     """
     centres = scene.cameras.centres
-    neighbors = [i for i in nearest_views(centres, view) if (centres[i] != centres[view]).any()][:NEIGHBORS]
+    neighbors = [i for i in nearest_views(centres, view) if (centres[i] != centres[view]).any()][:HOLE_NEIGHBORS]
     neighbor_rays = [_rays_in(scene.cameras, neighbor, centres[view], rays) for neighbor in neighbors]
     colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
     best_depths, best_costs = depths[0], np.full(len(rays), np.inf, np.float32)
+    min_gain = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
+    min_weight = 1e-3  # least weight in this window of pixels that other views see
     for step, depth in enumerate(depths):
         sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and their number
         for neighbor, (start, along) in zip(neighbors, neighbor_rays, strict=True):
             add_differences(scene.images[neighbor], along, start, depth, colors, pixels, sums)
-        total, number = blur(sums, BLUR).reshape(-1, 2)[pixels].T
-        cost = np.where(number > LEAST, total / np.maximum(number, LEAST), np.inf) + FARTHER * step
+        total, number = blur(sums, DIFFERENCE_BLUR).reshape(-1, 2)[pixels].T
+        cost = np.where(number > min_weight, total / np.maximum(number, min_weight), np.inf) + min_gain * step
         best_depths, best_costs = np.where(cost < best_costs, depth, best_depths), np.minimum(cost, best_costs)
     return best_depths
 

@@ -25,7 +25,7 @@ from gsmerge.geometry.transforms import (
     move_views,
     without_common_motion,
 )
-from gsmerge.kernels.compare_views import COLUMNS, compare_views
+from gsmerge.kernels.compare_views import SCRATCH_COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur
 from gsmerge.kernels.raster.sh import view_colors
@@ -35,26 +35,19 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene
 
 SIDES = (60, 120, 240)  # longer side of the photos in pixels, one size after the other
-MIN_SIDE = 24  # least number of pixels of the shorter side at the first size; smaller photos say too little
-OVERLAP_PIXELS = 400  # the neighbours of a view are chosen by about this many of its pixels
 BORDER = 2  # width in pixels of the border that is not compared
-SAMPLE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
+POSE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
 # Compared pixels of a view, and most steps, at the first size. They are fewer, because right poses need them as well
 FIRST_PIXELS, FIRST_STEPS = 600, 2
-NEIGHBOURS = 4  # other views with which a view is compared
-MIN_OVERLAP = 0.2  # share of a view's pixels that a neighbour must see
-STEPS = 6  # most Gauss-Newton steps at each size
-DAMPING = 1e-3  # damping of the steps, relative to the curvature
-EARLY_PX = 1.0  # poses are considered right if the first step moves all views by less than this, in pixels
+POSE_NEIGHBOURS = 4  # other views with which a view is compared
+POSE_STEPS = 6  # most Gauss-Newton steps at each size
 TOGETHER = 16  # pairs per task
-ENOUGH = 1e-4  # a smaller step, in radians and canonical units, is the last
-BLUR = 0.7  # blur of the photos, standard deviation in pixels
+POSE_BLUR = 0.7  # blur of the photos, standard deviation in pixels
 # Detail of photos is finer than this blur, in pixels. Highlights are smooth, and move with the camera as if its pose
 # were wrong. If poses follow them, what is drawn on the surfaces agrees less, by more than CHANCE standard errors
 DETAIL, CHANCE = 2.0, 2.0
 # Prior error of a pose, radians and canonical units, and the weight of this prior
 PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
-LIMIT_PX = 1.5  # a pose counts as wrong if it moves by more than this, in pixels of the views
 # Poses are moved only if this removes a share of the disagreement: LEAST_GAIN of some view at every size, and at the
 # largest size VIEW_GAIN of some view or MEAN_GAIN of all views. Wrong depth moves right views, too. At the largest size
 # it removes up to 0.14 of one view and 0.06 of all; the track of a depth camera removes 0.28 and 0.18. If all views are
@@ -101,17 +94,18 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
     pairs = _choose_pairs(scene, views)
     sides = [side for side in SIDES if side < largest] or [largest]
-    if len(pairs) == 0 or shortest * sides[0] < MIN_SIDE * largest:
+    min_side = 24  # least number of pixels of the shorter side at the first size; smaller photos say too little
+    if len(pairs) == 0 or shortest * sides[0] < min_side * largest:
         return None
     viewmats = start
     for side in sides:
         check = side == sides[0] != sides[-1] and not always
-        level = _make_level(scene, pairs, largest / side, FIRST_PIXELS if check else SAMPLE_PIXELS)
+        level = _make_level(scene, pairs, largest / side, FIRST_PIXELS if check else POSE_PIXELS)
         viewmats, final = _descend(level, viewmats, check=check)
         before = _compare(level, start)
         if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, final, end=side == sides[-1])):
             return None
-    detail = _make_level(scene, pairs, largest / sides[-1], SAMPLE_PIXELS, detail=True)
+    detail = _make_level(scene, pairs, largest / sides[-1], POSE_PIXELS, detail=True)
     worse = _compare(detail, viewmats).costs - _compare(detail, start).costs
     if not always and worse.sum() > CHANCE * np.sqrt((worse * worse).sum()):
         return None
@@ -123,9 +117,11 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
 def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours of the largest overlap."""
     cameras, fronts = scene.cameras, scene.get_pixels().fronts.reshape(len(scene), -1)
-    step = max(1, scene.pixels_per_view // OVERLAP_PIXELS)
+    overlap_pixels = 400  # the neighbours of a view are chosen by about this many of its pixels
+    step = max(1, scene.pixels_per_view // overlap_pixels)
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     pairs, candidates, anywhere = set(), set(views), np.full((len(scene), 1, 1), np.inf)
+    min_overlap = 0.2  # share of a view's pixels that a neighbour must see
     for view in views:
         rows = fronts[view, ::step]
         points = scene.gaussians.means[rows[rows >= 0]].astype(np.float64)
@@ -134,8 +130,8 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
         cosines = matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3])  # of the viewing directions
         overlap = seen_shares * cosines.clip(0)
         ranked = [int(i) for i in np.argsort(-overlap, kind="stable") if i != view and i in candidates]
-        for neighbour in ranked[:NEIGHBOURS]:
-            if overlap[neighbour] > MIN_OVERLAP:
+        for neighbour in ranked[:POSE_NEIGHBOURS]:
+            if overlap[neighbour] > min_overlap:
                 pairs |= {(view, neighbour), (neighbour, view)}
     return np.array(sorted(pairs), np.int64)
 
@@ -155,7 +151,7 @@ def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: 
 
     def sample_view(view: int) -> tuple[np.ndarray, ...]:
         grey = photos.images[view].mean(-1, dtype=np.float32)
-        grey = blur(grey, BLUR) - (blur(grey, DETAIL) if detail else np.float32(0))
+        grey = blur(grey, POSE_BLUR) - (blur(grey, DETAIL) if detail else np.float32(0))
         down, right = np.gradient(grey)
         rows = fronts[view][nearest]
         depth = camera_depths(means[rows], scene.cameras.viewmats[view])
@@ -200,14 +196,16 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
 
     ``check``: take few steps, and only one step if it moves no view far.
     """
-    max_steps = FIRST_STEPS if check else STEPS
+    max_steps = FIRST_STEPS if check else POSE_STEPS
+    early_px = 1.0  # poses are considered right if the first step moves all views by less than this, in pixels
+    min_step = 1e-4  # a smaller step, in radians and canonical units, is the last
     for step in range(max_steps + 1):
         evidence = _compare(level, viewmats)
-        if step == max_steps or (check and step == 1 and _flows(level, evidence).max() < EARLY_PX):
+        if step == max_steps or (check and step == 1 and _flows(level, evidence).max() < early_px):
             break
         change = _solve_step(level, viewmats, evidence)
         viewmats = matmul(viewmats, motion_matrices(change))
-        if np.abs(change).max() < ENOUGH:
+        if np.abs(change).max() < min_step:
             break
     return viewmats, evidence
 
@@ -223,7 +221,8 @@ def _solve_step(level: _Level, viewmats: np.ndarray, evidence: _Evidence) -> np.
             curvature[row, column] += sign * pair_curvature
         slope[rows] -= pair_slope
         slope[columns] += pair_slope
-    curvature[np.diag_indices(len(curvature))] *= 1 + DAMPING
+    damping = 1e-3  # damping of the steps, relative to the curvature
+    curvature[np.diag_indices(len(curvature))] *= 1 + damping
     return -solve(curvature, slope).reshape(-1, 6)
 
 
@@ -237,7 +236,7 @@ def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
         compare_views(
             level.points, level.greys, level.starts, level.pairs, viewmats, level.start, level.Ks, level.pictures,
             level.depths, NEAR_PLANE, BORDER, level.scale, begin, min(begin + TOGETHER, count),
-            np.empty((COLUMNS, max_points)), np.empty(max_points, np.int64), *vars(evidence).values(),
+            np.empty((SCRATCH_COLUMNS, max_points)), np.empty(max_points, np.int64), *vars(evidence).values(),
         )  # fmt: skip
 
     parallel_map(compare_pairs, range(0, count, TOGETHER))
@@ -252,7 +251,8 @@ def _flows(level: _Level, evidence: _Evidence) -> np.ndarray:
 
 def _any_wrong(level: _Level, before: _Evidence, after: _Evidence, *, end: bool) -> bool:
     """Return whether a view moved far and now agrees better with the other views; at the ``end``, much better."""
-    is_far = _flows(level, after) > LIMIT_PX
+    limit_px = 1.5  # a pose counts as wrong if it moves by more than this, in pixels of the views
+    is_far = _flows(level, after) > limit_px
     costs_before, costs = (
         np.bincount(level.pairs.ravel(), evidence.costs.repeat(2), len(is_far)) for evidence in (before, after)
     )

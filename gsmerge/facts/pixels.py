@@ -20,7 +20,8 @@ from gsmerge.geometry.pooling import pixel_sizes
 from gsmerge.geometry.transforms import find_nearest
 from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
 from gsmerge.raster.images import ONE_AT_A_TIME
-from gsmerge.raster.photos import EPS2D, NEAR_PLANE
+from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.raster.tiled_view import EPS2D
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT
@@ -28,14 +29,15 @@ from gsmerge.types import Pixels, Scene, SceneT
 # Only cells whose neighbours all have a centre are examined. Cells are wide enough if this share of them has a centre.
 # Of captures in voxels, six with a share of .97 or more give the same result as drawing; two with .93 and .95 lose 1.5
 # and 5 dB
-COVERED = 0.96
-REACH = 4.0  # width of a Gaussian that shows nearly all of it, in standard deviations
-SAMPLE = 10_000  # medians and shares are estimated from at least this many Gaussians, if there are as many
+COVERED_CELLS = 0.96
+SHOWN_WIDTH = 4.0  # width of a Gaussian that shows nearly all of it, in standard deviations
+ESTIMATE_GAUSSIANS = 10_000  # medians and shares are estimated from at least this many Gaussians, if there are as many
 SAME_DEPTH = 1.05  # a centre is on the surface of its cell up to this multiple of the depth of the cell's front
 LOW_PASS = math.sqrt(EPS2D)  # standard deviation of the low-pass, pixels
-# The low-pass hides a Gaussian if all its scales are below the share HIDDEN of it. If less than the share FEWEST of the
-# Gaussians is hidden, nothing changes: a fit repairs so few, and scenes without cameras have up to .05 in placed views
-HIDDEN, FEWEST = 0.5, 0.1
+# The low-pass hides a Gaussian if all its scales are below the share HIDDEN_SIZE of it. If less than the share
+# FEWEST_HIDDEN of the Gaussians is hidden, nothing changes: a fit repairs so few, and scenes without cameras have up to
+# .05 in placed views
+HIDDEN_SIZE, FEWEST_HIDDEN = 0.5, 0.1
 
 
 def with_pixels(scene: SceneT) -> SceneT:
@@ -51,17 +53,18 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     """
     g, cameras, placed = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
-    step = max(1, len(g) // SAMPLE)
+    step = max(1, len(g) // ESTIMATE_GAUSSIANS)
     units = pixel_sizes(g.means[::step], homes[::step], cameras)
     if placed:  # a part of the Gaussians of a surface lies farther apart
         units = np.minimum(units, find_nearest(g.means[::step], 1)[1][:, 0] / math.sqrt(step))
-    if (g.scales[::step].max(1) < HIDDEN * LOW_PASS * units).mean() < FEWEST:
+    if (g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units).mean() < FEWEST_HIDDEN:
         return scene
     units = find_nearest(g.means, 1)[1][:, 0] if placed else pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | placed
     num_sharing = 1 if placed else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
-    hidden = (sizes * np.sqrt(num_sharing) < HIDDEN * LOW_PASS * units) & (units < 1)  # 1: the scene's median depth
-    if np.count_nonzero(hidden & seen) <= FEWEST * np.count_nonzero(seen):
+    # A unit of 1 is that of the scene's median depth
+    hidden = (sizes * np.sqrt(num_sharing) < HIDDEN_SIZE * LOW_PASS * units) & (units < 1)
+    if np.count_nonzero(hidden & seen) <= FEWEST_HIDDEN * np.count_nonzero(seen):
         return scene
     share, usual = 100 * hidden.mean(), np.median(sizes[hidden] / units[hidden])
     note(
@@ -112,7 +115,9 @@ def _weigh_view(
         return ids, pixels, areas
     inside, shown = areas > 0, np.zeros(fronts.shape, bool)
     shown.reshape(-1)[pixels[inside]] = True
-    level = choose_level(shown, REACH * float(np.sqrt(np.median(np.abs(areas[:: max(1, len(areas) // SAMPLE)])))))
+    level = choose_level(
+        shown, SHOWN_WIDTH * float(np.sqrt(np.median(np.abs(areas[:: max(1, len(areas) // ESTIMATE_GAUSSIANS)]))))
+    )
     order, (cells, shape) = order_by_depth(depths), _cells_of(pixels, fronts.shape, level)
     grid_fronts = np.empty(shape, np.int32)
     weights = weigh_centres(order, ids, cells, areas, opacities, grid_fronts)  # fills `grid_fronts`
@@ -137,7 +142,7 @@ def choose_level(shown: np.ndarray, widest: float) -> int:
         around = cv2.erode(_coarser(fine).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
         height, width = fine.shape
         between = around.repeat(2, 0)[:height].repeat(2, 1)[:, :width]
-        if between.any() and np.count_nonzero(fine & between) >= COVERED * np.count_nonzero(between):
+        if between.any() and np.count_nonzero(fine & between) >= COVERED_CELLS * np.count_nonzero(between):
             return level + 1
         fine, level = _coarser(fine), level + 1
     return 1

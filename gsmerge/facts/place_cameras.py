@@ -23,29 +23,25 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 NUM_VIEWS = 24  # most cameras that are placed
 HELD_OUT = 8  # of so many placed cameras, one is held out from the fit, for scores
 FITTED = 16  # cameras of each kind for a scene without cameras, and half as many on a walk
-SAMPLE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
-EXTENT = (0.05, 0.95)  # quantiles of the positions along each axis between which the scene is assumed to lie
-AROUND = 40  # candidate cameras around the scene
-ABOVE = -0.25  # height of the ring of viewpoints, in its radii; y points down
+CANDIDATE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
+AROUND_CAMERAS = 40  # candidate cameras around the scene
 FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
-WALKED = 0.6  # length of a walk to each side of the median, as a share of the longest half axis
-DIRECTIONS = 8  # directions of a camera inside
+INSIDE_DIRECTIONS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length
-WIDE, PIXEL = 5 / 3, 1.5  # field of cameras that look from inside (80 degrees), and their pixel in standard deviations
+# Field of cameras that look from inside (80 degrees), and their pixel in standard deviations
+INSIDE_FIELD, INSIDE_PIXEL = 5 / 3, 1.5
 PROBE = 96  # pixels per side of the pictures for choosing candidates
-SMALLEST, LARGEST = 96, 640  # pixels per side
-CLEAR = 0.02  # near plane, as a share of the scene's radius
-ENOUGH = 1.0  # blending weight, summed over pixels, at which a Gaussian counts as seen
-LEAST_GAIN = 1e-3  # a camera is added if it raises the opacity shown so far by more than this share
+SMALLEST_PIXELS, LARGEST_PIXELS = 96, 640  # pixels per side
+NEAR_PLANE_SHARE = 0.02  # near plane, as a share of the scene's radius
 PAIRS, MIDDLE = 2, 0.5  # nearest views to which each view has a camera between, and its share of the way
 WIDEST = np.pi / 4  # the space between two views is unknown if the angle between them is larger
 # With at most this many views, a fit to renders also gets views between them; more views it does not memorise
-FEW_VIEWS = 24
-OUTSIDE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share of all views, and its maximum
+FEW_RENDERED_VIEWS = 24
+OUTSIDE_SHARE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share of all views, and its maximum
 # Bounds of the views from outside: step back as a share of the depth, rotation to the sides, and rotation up or down,
 # degrees
-NEAREST, FARTHEST = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
+OUTSIDE_LOW, OUTSIDE_HIGH = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
 
 STANDING = (
@@ -80,14 +76,14 @@ def _with_cameras(gaussians: Gaussians, cameras: Cameras) -> Scene:
 
 def place_inside(gaussians: Gaussians) -> Cameras | None:
     """Place cameras to all sides where the viewer of a scene stands; None if it was not made around a viewer."""
-    viewer = find_viewer(gaussians[:: -(-len(gaussians) // SAMPLE_GAUSSIANS)])
+    viewer = find_viewer(gaussians[:: -(-len(gaussians) // CANDIDATE_GAUSSIANS)])
     if viewer is None:
         return None
-    size = int(np.clip(round(WIDE / (PIXEL * viewer.angle)), SMALLEST, LARGEST))
+    size = int(np.clip(round(INSIDE_FIELD / (INSIDE_PIXEL * viewer.angle)), SMALLEST_PIXELS, LARGEST_PIXELS))
     radii = viewer.free * power(np.arange(NUM_VIEWS) * GOLDEN / np.pi % 1, 1 / 3)  # even in the free ball
     eyes = viewer.place + radii[:, None] * sphere(NUM_VIEWS)[::-1]
     viewmats = np.stack([_look(eye, direction) for eye, direction in zip(eyes, sphere(NUM_VIEWS), strict=True)])
-    return Cameras(viewmats, np.repeat(_lens(size, WIDE)[None], NUM_VIEWS, 0), size, size)
+    return Cameras(viewmats, np.repeat(_lens(size, INSIDE_FIELD)[None], NUM_VIEWS, 0), size, size)
 
 
 def place_viewpoints(gaussians: Gaussians) -> Cameras:
@@ -98,10 +94,11 @@ def place_viewpoints(gaussians: Gaussians) -> Cameras:
 def _place_shown(gaussians: Gaussians) -> Cameras:
     """Place cameras for people to look from, first around a scene that was not made around a viewer, then inside."""
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
-    centre, half = _extent(thin_out(gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64))
+    centre, half = _extent(thin_out(gaussians, CANDIDATE_GAUSSIANS).means.astype(np.float64))
     angles = 2 * np.pi * np.arange(len(inside)) / len(inside)
+    ring_height = -0.25  # height of the ring of viewpoints, in its radii; y points down
     # the first camera sees the front of most models
-    ring = np.stack([sin(angles), np.full(len(angles), ABOVE), -cos(angles)], 1)
+    ring = np.stack([sin(angles), np.full(len(angles), ring_height), -cos(angles)], 1)
     around = replace(inside, viewmats=_around(centre, half, FAR_RADII, normalize(ring)))
     return concat_cameras(around, inside)
 
@@ -129,7 +126,7 @@ def place_around(gaussians: Gaussians, count: int = FITTED) -> Cameras:
     There are ``count`` cameras far away, ``count`` near by, at most ``count`` at positions that show most of the scene,
     and half as many on a walk.
     """
-    means = thin_out(gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64)
+    means = thin_out(gaussians, CANDIDATE_GAUSSIANS).means.astype(np.float64)
     centre, half = _extent(means)
     outside = [_around(centre, half, radii, sphere(count)) for radii in (FAR_RADII, NEAR_RADII)]
     chosen, walk = place_cameras(gaussians, count), _walk(np.median(means, axis=0), half, count // 2)
@@ -158,9 +155,11 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
     means, views = scene.gaussians.means, len(scene)
     if views == 1:
         return scene
-    count = min(int(OUTSIDE * views), MOST_OUTSIDE)
-    more = outside_cameras(means[:: max(1, len(means) // SAMPLE_GAUSSIANS)], scene.cameras, count, NEAREST, FARTHEST)
-    if views <= FEW_VIEWS:
+    count = min(int(OUTSIDE_SHARE * views), MOST_OUTSIDE)
+    more = outside_cameras(
+        means[:: max(1, len(means) // CANDIDATE_GAUSSIANS)], scene.cameras, count, OUTSIDE_LOW, OUTSIDE_HIGH
+    )
+    if views <= FEW_RENDERED_VIEWS:
         more = concat_cameras(between_cameras(scene.cameras), more)
     drawn = draw_pictures(_with_cameras(scene.gaussians, more))
     names = (*scene.names, *(f"around {view}" for view in range(len(more))))
@@ -194,17 +193,18 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it, looking in all
     directions. They are chosen one by one, at most ``num_views``. The next camera is always the candidate that shows
     the most opacity not shown yet, in pictures of a sample of the Gaussians. Images are square and grow with the number
-    of Gaussians up to ``LARGEST`` pixels per side. Raises ValueError if there is no Gaussian.
+    of Gaussians up to ``LARGEST_PIXELS`` pixels per side. Raises ValueError if there is no Gaussian.
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
-    sample = thin_out(gaussians, SAMPLE_GAUSSIANS)
+    sample = thin_out(gaussians, CANDIDATE_GAUSSIANS)
     centre, half = _extent(sample.means.astype(np.float64))
     viewmats = _candidates(centre, half)
     candidates = Cameras(viewmats, np.repeat(_lens(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
-    shares = _shares_seen(sample, candidates, CLEAR * float(np.sqrt((half * half).sum())))
-    best = _choose_candidates(shares, num_views, LEAST_GAIN)
-    size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, LARGEST))
+    shares = _shares_seen(sample, candidates, NEAR_PLANE_SHARE * float(np.sqrt((half * half).sum())))
+    least_gain = 1e-3  # a camera is added if it raises the opacity shown so far by more than this share
+    best = _choose_candidates(shares, num_views, least_gain)
+    size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST_PIXELS, LARGEST_PIXELS))
     return Cameras(viewmats[best], np.repeat(_lens(size)[None], len(best), 0), size, size)
 
 
@@ -215,7 +215,9 @@ def _lens(size: int, field: float = FIELD) -> np.ndarray:
 
 def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centre ``[3]`` and half sides ``[3]`` of the box that contains most of the means ``[n,3]``."""
-    low, high = np.quantile(means, EXTENT, axis=0)
+    # Quantiles of the positions along each axis between which the scene is assumed to lie
+    extent_quantiles = (0.05, 0.95)
+    low, high = np.quantile(means, extent_quantiles, axis=0)
     half = (high - low) / 2
     widest = float(half.max()) if half.max() > 0 else 1.0
     return (low + high) / 2, np.maximum(half, 1e-3 * widest)
@@ -224,8 +226,10 @@ def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
-    inside = [_look(centre + position * half, direction) for position in grid for direction in sphere(DIRECTIONS)]
-    return np.concatenate([_around(centre, half, FAR_RADII, sphere(AROUND)), inside])
+    inside = [
+        _look(centre + position * half, direction) for position in grid for direction in sphere(INSIDE_DIRECTIONS)
+    ]
+    return np.concatenate([_around(centre, half, FAR_RADII, sphere(AROUND_CAMERAS)), inside])
 
 
 def _around(centre: np.ndarray, half: np.ndarray, radii: float, directions: np.ndarray) -> np.ndarray:
@@ -241,7 +245,8 @@ def _walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
     angles = GOLDEN * np.arange(count)
     directions = cos(angles)[:, None] * along + sin(angles)[:, None] * side
     pairs = zip(steps, directions, strict=True)
-    return np.stack([_look(middle + step * WALKED * half.max() * along, direction) for step, direction in pairs])
+    walk_share = 0.6  # length of a walk to each side of the median, as a share of the longest half axis
+    return np.stack([_look(middle + step * walk_share * half.max() * along, direction) for step, direction in pairs])
 
 
 def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -258,7 +263,7 @@ def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return viewmat
 
 
-def choose_cameras(sample: Gaussians, candidates: Cameras, counting: np.ndarray, least_added: float) -> list[int]:
+def choose_showing(sample: Gaussians, candidates: Cameras, counting: np.ndarray, least_added: float) -> list[int]:
     """Choose candidates that show as much as possible of the ``counting [n]`` Gaussians of a canonical sample.
 
     The next candidate has to add more than the share ``least_added`` of what those before it show.
@@ -273,7 +278,8 @@ def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndar
 
     def view_shares(view: int) -> np.ndarray:
         sums, _ = contributions(tile_view(splats, **photos.camera(view), near=near))
-        return np.minimum(sums / np.float32(ENOUGH), 1) * splats.opacities
+        seen_weight = 1.0  # blending weight, summed over pixels, at which a Gaussian counts as seen
+        return np.minimum(sums / np.float32(seen_weight), 1) * splats.opacities
 
     return np.stack(parallel_map(view_shares, range(len(candidates))))
 

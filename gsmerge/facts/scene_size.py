@@ -11,12 +11,11 @@ from gsmerge.geometry.transforms import median, quantiles
 from gsmerge.photos.views import camera_kinds
 from gsmerge.types import Gaussians, Scene
 
-# Bounds for the Gaussians of captures. The median largest scale is at most LARGE times the diagonal of the box that
-# holds most Gaussians. The median coefficient of the base colours is at most BRIGHT. Fewer than FEWEST Gaussians
-# are not tested
-LARGE, BRIGHT, FEWEST = 0.25, 10.0, 100
-FLAT, FAINT = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
-SAMPLE_GAUSSIANS = 65536  # these bounds are tested on at least this many Gaussians, if there are as many
+# Bounds for the Gaussians of captures. The median largest scale is at most LARGE_SCALE times the diagonal of the box
+# that holds most Gaussians. The median coefficient of the base colours is at most BRIGHT_COLOR. Fewer than
+# FEWEST_TESTED Gaussians are not tested
+LARGE_SCALE, BRIGHT_COLOR, FEWEST_TESTED = 0.25, 10.0, 100
+FLAT_RANGE, FAINT_MEDIAN = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
 
 
 @dataclass(frozen=True)
@@ -54,22 +53,23 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
 
     The bounds are in docs/reference/conventions.md.
     """
-    if len(gaussians) < FEWEST:
+    if len(gaussians) < FEWEST_TESTED:
         return None
-    sample = gaussians[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
+    sample_gaussians = 65536  # the bounds are tested on at least this many Gaussians, if there are as many
+    sample = gaussians[:: max(1, len(gaussians) // sample_gaussians)]
     means = sample.means.astype(np.float64)
     low, high = quantiles(means, (0.01, 0.99))
     diagonal = float(np.sqrt(((high - low) ** 2).sum()))
     size, color = median(reduce(np.maximum, sample.scales.T)), median(np.abs(sample.sh0))
     low_color, high_color = quantiles(sample.sh0[:, 0], (0.01, 0.99))
-    flat, faint = float((high_color - low_color).max()) < FLAT, median(sample.opacities) < FAINT
-    if color > BRIGHT:
+    flat, faint = float((high_color - low_color).max()) < FLAT_RANGE, median(sample.opacities) < FAINT_MEDIAN
+    if color > BRIGHT_COLOR:
         problem = f"half of the base colours have coefficients beyond {color:.3g}"
     elif flat:
         problem = "the Gaussians have one flat colour"
     elif faint:
-        problem = f"half of the opacities are below {FAINT:.2g}"
-    elif size > LARGE * diagonal:
+        problem = f"half of the opacities are below {FAINT_MEDIAN:.2g}"
+    elif size > LARGE_SCALE * diagonal:
         problem = f"half of the Gaussians are at least {size / max(diagonal, 1e-30):.2g} times as large as the scene"
     else:
         return None

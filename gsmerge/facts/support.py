@@ -17,8 +17,8 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, make_scene
 
-LEAST = FitOptions().min_contribution  # a view shows a Gaussian from this blending weight in a pixel on, as in a fit
-LEVEL, SIDE = 2, 480  # pictures are smaller by at least this factor, as in a fit's survey; largest side of pictures
+# A view shows a Gaussian from this blending weight in a pixel on, as in a fit
+SHOWN_WEIGHT = FitOptions().min_contribution
 
 
 def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
@@ -28,11 +28,13 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     keeps.
     """
     splats = make_splats(gaussians)
-    pictures = blank_photos(cameras, max(LEVEL, max(cameras.width, cameras.height) / SIDE))
+    min_level = 2  # pictures are smaller by at least this factor, as in a fit's survey
+    max_side = 480  # of pictures, pixels
+    pictures = blank_photos(cameras, max(min_level, max(cameras.width, cameras.height) / max_side))
 
     def list_shown(view: int) -> np.ndarray:
         tiled = tile_view(splats, **pictures.camera(view))
-        return tiled.ids[list_contributions(tiled)[1] >= LEAST]
+        return tiled.ids[list_contributions(tiled)[1] >= SHOWN_WEIGHT]
 
     counts = np.zeros(len(gaussians), np.int32)
     for shown in in_turn(list_shown, range(len(pictures))):

@@ -17,14 +17,13 @@ from gsmerge.kernels.matrices import matmul, solve_symmetric
 from gsmerge.types import Gaussians
 
 GOLDEN = np.pi * (1 + math.sqrt(5))  # angle between successive directions that spreads them evenly
-ROUNDS = 8  # steps of the solution
-DOUBT, LEAST_ERROR = 2.0, 1e-3  # errors of sizes, as logarithms, count half from twice their median on
 ALIKE = 0.5  # angles have to vary less than half as much as sizes, as logarithms
 # Of places that explain sizes equally well, up to chance, the one that sees most is the viewer's: a plane is seen alike
 # from both sides
 LIKELY = 1.1
 CELLS = 100  # directions, half of which the scene has to cover
-FREE, NEAR = 0.25, 0.05  # free radius around a viewer, as a share of the distance that so few Gaussians fall short of
+# Free radius around a viewer, as a share of the distance that so few Gaussians fall short of
+FREE, NEAR_SHARE = 0.25, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ def find_viewer(gaussians: Gaussians) -> Viewer | None:
     angles = sizes / distances
     if 2 * num_cells < CELLS or _spread(angles) >= ALIKE * _spread(sizes):
         return None
-    return Viewer(place, FREE * float(np.quantile(distances, NEAR)), median(angles))
+    return Viewer(place, FREE * float(np.quantile(distances, NEAR_SHARE)), median(angles))
 
 
 def _look_around(means: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
@@ -64,14 +63,17 @@ def _look_around(means: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.n
 def _solve(means: np.ndarray, sizes: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, float]:
     """Move a place until sizes are most nearly proportional to distances; return it and the median error."""
     error = math.inf
-    for _ in range(ROUNDS):  # Gauss and Newton's steps
+    rounds = 8  # steps of the solution
+    doubt_factor = 2.0  # errors of sizes, as logarithms, count half from twice their median on
+    least_error = 1e-3  # added to that, so that weights are finite where half of the errors are 0
+    for _ in range(rounds):  # Gauss and Newton's steps
         offsets = means - place
         distances = np.sqrt((offsets**2).sum(1)) + np.finfo(np.float32).tiny
         angles = sizes / distances
         errors = log((angles / median(angles)).astype(np.float32)).astype(np.float64)
         error = median(np.abs(errors))
         slopes = np.concatenate([offsets / (distances**2)[:, None], np.ones((len(means), 1))], 1)
-        weighted = (slopes * robust_weights(np.abs(errors), DOUBT, LEAST_ERROR)[:, None]).T
+        weighted = (slopes * robust_weights(np.abs(errors), doubt_factor, least_error)[:, None]).T
         place = place - solve_symmetric(matmul(weighted, slopes), matmul(weighted, errors))[:3]
     return place, error
 

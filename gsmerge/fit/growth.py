@@ -17,9 +17,6 @@ from gsmerge.runtime.threads import in_turn
 OFFSET = 0.7
 FADED = 0.005  # opacity that counts as none; halves of more opaque Gaussians have 1 / 255 or more, so they are drawn
 FAINT = 0.02  # opacity of Gaussians that late in a run will fade away; without them the run takes .9 of the time
-# Optical depth of a half, as a share of the parent's depth. Halves are narrower than the parent, so two halves of 0.7
-# cover as much as the parent; a little more closes gaps
-DEPTH = 0.8
 # Most Gaussians after a growth, as a multiple of those that are left when it begins. Where many views show the same
 # surfaces, most Gaussians of the start are hidden, and the usual share of all pixels is far more than the surfaces can
 # use: further halves are smaller than the details of the photos, and most of them fade. Real scenes of 60 and 84 views
@@ -98,7 +95,10 @@ def split_parameters(parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def fade_halves(logits: np.ndarray) -> np.ndarray:
     """Return the opacity logits ``[m]`` of the halves of Gaussians with opacity ``logits [m]``."""
     transmittances = 1 / (1 + exp(logits.astype(np.float64)))  # 1 - opacity
-    return np.asarray(log(1 / power(transmittances, DEPTH) - 1))
+    # Optical depth of a half, as a share of the parent's depth. Halves are narrower than the parent, so two halves of
+    # 0.7 cover as much as the parent; a little more closes gaps
+    depth_share = 0.8
+    return np.asarray(log(1 / power(transmittances, depth_share) - 1))
 
 
 def error_masses(state: FitState, half: Photos) -> np.ndarray:

@@ -28,31 +28,32 @@ from gsmerge.types import Cameras, Gaussians, Scene
 # Bounds of three numbers: the step back, as a share of the median depth of a view; the rotation to the sides about the
 # middle of the view, degrees; and the rotation up or down, degrees. Without a step back the cameras would see the same
 # as new views, in which a fit has to fill gaps
-LOW, HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
+STEP_BACK_LOW, STEP_BACK_HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
 # Multiples of this vector, modulo one, fill a cube evenly, whatever their number (the R sequence of Roberts 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 PLACES = 42  # most views from outside, or the number of photos if that is more
-SAMPLE = 2000  # the depths of views are measured by at least this many Gaussians, if there are as many
+DEPTH_GAUSSIANS = 2000  # the depths of views are measured by at least this many Gaussians, if there are as many
 # Gaussians for each photo, of at most PLACES photos, that represent the whole input. The fewer they are, the larger
 # they are made, because a picture has the same number of pixels, however many photos there are
-ROWS = 4000
-NEAREST = 0.25  # near plane, as a share of the median depth of a view
-# Larger depths are clipped to FARTHEST times the quantile LAST of the depths, because a flyaway moves the mean depth of
-# its pixels
-LAST, FARTHEST = 0.98, 4.0
-EMPTY, SOLID = 0.15, 0.9  # opacities of the input below which a pixel is empty, and above which it shows a surface
+GAUSSIANS_PER_PHOTO = 4000
+OUTSIDE_NEAR_PLANE = 0.25  # near plane, as a share of the median depth of a view
+# Larger depths are clipped to FAR_FACTOR times the quantile FAR_QUANTILE of the depths, because a flyaway moves the
+# mean depth of its pixels
+FAR_QUANTILE, FAR_FACTOR = 0.98, 4.0
+# Opacities of the input below which a pixel is empty, and above which it shows a surface
+EMPTY_OPACITY, SOLID_OPACITY = 0.15, 0.9
 # Empty pixels do not count within this distance of the input's outlines, as a share of the width, because Gaussians
 # beside an outline fill the background that the foreground uncovers in new views
-RIM = 0.04
-MARGIN = 0.15  # a pixel is veiled if its loss (see veil_gradients) is larger: the mean depth is less by such a share
-# With at least MANY Gaussians of the start for each photo, fog weighs as much as errors of the photos. If there are
-# fewer, they are larger and reach from the borders of photos into empty space. With the full weight they would vanish
-# from both, so fog weighs less, but at least LIGHT. VEIL is the weight of veils relative to fog
-MANY, LIGHT, VEIL = 1000, 0.15, 30
-LEVEL = 3  # size of a picture's pixels in pixels of the photo; at 2 fog is as thin, at 4 it is a fifth thicker
+RIM_SHARE = 0.04
+# A pixel is veiled if its loss (see veil_gradients) is larger: the mean depth is less by such a share
+VEILED_LOSS = 0.15
+# With at least MANY_PER_PHOTO Gaussians of the start for each photo, fog weighs as much as errors of the photos. If
+# there are fewer, they are larger and reach from the borders of photos into empty space. With the full weight they
+# would vanish from both, so fog weighs less, but at least LEAST_FOG_WEIGHT. VEIL_WEIGHT is the weight of veils relative
+# to fog
+MANY_PER_PHOTO, LEAST_FOG_WEIGHT, VEIL_WEIGHT = 1000, 0.15, 30
+OUTSIDE_LEVEL = 3  # size of a picture's pixels in pixels of the photo; at 2 fog is as thin, at 4 it is a fifth thicker
 LEAST_WIDTH = 64  # least width of the pictures, pixels
-LEAST = 0.005  # a picture counts if more than this share of it is empty or solid
-TOUCHED = 1e-9  # a Gaussian takes part in a step if the gradient of its opacity is larger
 SCORED = 12  # most views in which the fog of a result is measured
 
 
@@ -87,18 +88,19 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
     num_steps = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     if num_steps == 0:
         return None
-    sample = sample_gaussians(scene, ROWS * min(len(photos), PLACES)) if len(scene.gaussians) else start
+    sample = sample_gaussians(scene, GAUSSIANS_PER_PHOTO * min(len(photos), PLACES)) if len(scene.gaussians) else start
     if len(sample) == 0 or len(photos) == 0:
         return None
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
-    points = sample.means[:: max(1, len(sample) // SAMPLE)]
-    placed = outside_cameras(points, cameras, min(num_steps, max(PLACES, len(photos))), LOW, HIGH)
+    points = sample.means[:: max(1, len(sample) // DEPTH_GAUSSIANS)]
+    placed = outside_cameras(points, cameras, min(num_steps, max(PLACES, len(photos))), STEP_BACK_LOW, STEP_BACK_HIGH)
     near, far = _depth_range(points, cameras, len(placed))
-    views = blank_photos(placed, min(LEVEL, photos.width / LEAST_WIDTH))
+    views = blank_photos(placed, min(OUTSIDE_LEVEL, photos.width / LEAST_WIDTH))
     limits = _find_limits(make_splats(sample), views, near, far)
-    fog_weight = np.float32(np.clip(len(start) / (MANY * len(photos)), LIGHT, 1.0))
-    weights = fog_weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL, 0)).astype(np.float32)
-    ids = np.flatnonzero((limits > 0).mean((1, 2)) > LEAST).tolist()
+    fog_weight = np.float32(np.clip(len(start) / (MANY_PER_PHOTO * len(photos)), LEAST_FOG_WEIGHT, 1.0))
+    weights = fog_weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL_WEIGHT, 0)).astype(np.float32)
+    min_share = 0.005  # a picture counts if more than this share of it is empty or solid
+    ids = np.flatnonzero((limits > 0).mean((1, 2)) > min_share).tolist()
     return Outside(replace(views[ids], weights=weights[ids]), limits[ids], near[ids], far[ids]) if ids else None
 
 
@@ -108,8 +110,8 @@ def _depth_range(points: np.ndarray, cameras: Cameras, count: int) -> tuple[np.n
     They follow from the depths of ``points [n,3]`` in the ``cameras`` from which the views step back, in turn.
     """
     depths = [depths_inside(points, cameras[[view]]) for view in range(min(count, len(cameras)))]
-    median, last = np.resize([quantiles(view_depths, (0.5, LAST)) for view_depths in depths], (count, 2)).T
-    return NEAREST * median, FARTHEST * last
+    median, last = np.resize([quantiles(view_depths, (0.5, FAR_QUANTILE)) for view_depths in depths], (count, 2)).T
+    return OUTSIDE_NEAR_PLANE * median, FAR_FACTOR * last
 
 
 def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarray) -> np.ndarray:
@@ -118,7 +120,8 @@ def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarra
     def view_limits(view: int) -> np.ndarray:
         depths, transmittance = blend_depths(_tile(splats, views, view, near[view]), far[view])
         opacities = 1 - transmittance
-        return np.where(mark_empty(opacities), np.inf, np.where(opacities > SOLID, depths, 0)).astype(np.float32)
+        limits = np.where(opacities > SOLID_OPACITY, depths, 0)
+        return np.where(mark_empty(opacities), np.inf, limits).astype(np.float32)
 
     return np.stack(list(in_turn(view_limits, range(len(views)))))
 
@@ -138,7 +141,7 @@ def outside_cameras(
     """Return ``count`` cameras: the given ``cameras`` in turn, each stepped back and rotated about the middle it sees.
 
     The middle is at the middle depth of the points ``means [n,3]``. ``low`` and ``high`` are the least and the largest
-    step back, rotation to the sides, and rotation up or down, in the units of ``LOW``.
+    step back, rotation to the sides, and rotation up or down, in the units of ``STEP_BACK_LOW``.
     """
     depths = [middle_depth(means, cameras[[view]]) for view in range(min(count, len(cameras)))]
     views, viewmats = [number % len(cameras) for number in range(count)], []
@@ -150,8 +153,8 @@ def outside_cameras(
 
 def mark_empty(opacities: np.ndarray) -> np.ndarray:
     """Mark the empty pixels of ``opacities [h,w]``, except for a rim around pixels that are not empty."""
-    side = 2 * round(RIM * opacities.shape[1]) + 1
-    empty = cv2.erode((opacities < EMPTY).astype(np.uint8), np.ones((side, side), np.uint8))
+    side = 2 * round(RIM_SHARE * opacities.shape[1]) + 1
+    empty = cv2.erode((opacities < EMPTY_OPACITY).astype(np.uint8), np.ones((side, side), np.uint8))
     return np.asarray(empty, bool)
 
 
@@ -171,7 +174,7 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
 
     The loss of a pixel is its opacity minus the quotient of its blended depth and the limit. Where the input is empty,
     the loss is the opacity. The loss of the view is the weighted mean over pixels. Where the input shows a surface,
-    pixels with a loss of ``MARGIN`` or less do not count.
+    pixels with a loss of ``VEILED_LOSS`` or less do not count.
     """
     views, limits = outside.views, outside.limits[view]
     assert views.weights is not None
@@ -180,12 +183,13 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     image, transmittance = blend(tiled, depths, np.zeros(3, np.float32))  # the depth is in the first channel
     inverse_limits = np.where(limits > 0, 1 / np.maximum(limits, np.float32(1e-12)), np.float32(0))
     losses = 1 - transmittance - image[..., 0] * inverse_limits
-    weights = np.where((losses > MARGIN) | np.isinf(limits), views.weights[view], 0) / np.float32(limits.size)
+    weights = np.where((losses > VEILED_LOSS) | np.isinf(limits), views.weights[view], 0) / np.float32(limits.size)
     image_gradient = np.zeros_like(image)
     image_gradient[..., 0] = -weights * inverse_limits
     g = gradients_of(tiled, depths, image, transmittance, image_gradient, -weights, with_viewmat=False)
     g.colors[:] = 0
-    return g[np.flatnonzero(g.opacities > TOUCHED)]  # Gaussians behind the limit should not gain opacity
+    min_gradient = 1e-9  # a Gaussian takes part in a step if the gradient of its opacity is larger
+    return g[np.flatnonzero(g.opacities > min_gradient)]  # Gaussians behind the limit should not gain opacity
 
 
 def score_fog(splats: Splats, outside: Outside) -> float | None:

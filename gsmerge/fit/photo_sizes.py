@@ -10,18 +10,17 @@ import numpy as np
 
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.raster.metrics import decibels
-from gsmerge.raster.photos import EPS2D, Photos, scene_photos, with_pixel_values
+from gsmerge.raster.photos import Photos, scene_photos, with_pixel_values
+from gsmerge.raster.tiled_view import EPS2D
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import PicturedScene, Scene
 
-AUTO_SCALE = 2.0  # largest scale of "auto": a step takes time by its pixels, and larger photos are rarely sharp
 MIN_AUTO_SCALE = 1.25  # least scale that "auto" uses; below it photos have the size of the views
-ALIKE = 0.01  # share of a scale that rounding of sizes may change
 MAX_GAIN = 2.0  # largest exposure factor that scores compensate
-PATCH = 32  # side of a held-out patch, pixels, at most
-HIDDEN = np.float32(1e-9)  # weight of pixels that neither count nor are held out
+PATCH_PIXELS = 32  # side of a held-out patch, pixels, at most
+HIDDEN_WEIGHT = np.float32(1e-9)  # weight of pixels that neither count nor are held out
 
 
 def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
@@ -58,7 +57,8 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
     can_enlarge = options.fit == "full" and options.half_res_part < 1
     if requested == "auto":
         enlarges = can_enlarge and auto and largest >= MIN_AUTO_SCALE
-        return (min(largest, AUTO_SCALE) if enlarges else 1.0), None
+        auto_scale = 2.0  # largest scale of "auto": a step takes time by its pixels, and larger photos are rarely sharp
+        return (min(largest, auto_scale) if enlarges else 1.0), None
     if requested == 1:
         return 1.0, None
     if not can_enlarge:
@@ -66,7 +66,8 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
             1.0,
             f"photo_scale {requested:g} is 1: larger photos need the full fit, with steps on photos of full size",
         )
-    if requested > largest * (1 + ALIKE):
+    tolerance = 0.01  # share of a scale that rounding of sizes may change
+    if requested > largest * (1 + tolerance):
         return largest, f"photo_scale {requested:g} is {largest:.3g}: the photos are no larger"
     return float(min(requested, largest)), None
 
@@ -104,7 +105,7 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
     """Return training weights ``[h,w]`` float32 per view: 0 on held-out patches, the photo's weights elsewhere.
 
-    Pixels with a weight below 1 are not held out; a weight of 0 is replaced by ``HIDDEN``.
+    Pixels with a weight below 1 are not held out; a weight of 0 is replaced by ``HIDDEN_WEIGHT``.
     """
     return [training_weight(photos, view, share, seed) for view in range(len(photos))]
 
@@ -114,7 +115,7 @@ def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.nd
 
     If the photo counts in several patches, at least one of them is held out.
     """
-    size = max(1, min(PATCH, min(photos.height, photos.width) // 4))
+    size = max(1, min(PATCH_PIXELS, min(photos.height, photos.width) // 4))
     rows, columns = -(-photos.height // size), -(-photos.width // size)
     random = np.random.default_rng([seed, view])
     counting = np.ones((rows, columns), bool) if photos.weights is None else _counting_patches(photos, view, size)
@@ -127,7 +128,7 @@ def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.nd
     if photos.weights is None:
         return full.astype(np.float32)
     weights = photos.weights[view]
-    return np.where(weights == 1, full.astype(np.float32), np.maximum(weights, HIDDEN))
+    return np.where(weights == 1, full.astype(np.float32), np.maximum(weights, HIDDEN_WEIGHT))
 
 
 def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:

@@ -13,8 +13,6 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning
 
-EPS = 1e-15  # added to the denominator of Adam's step
-
 
 @dataclass(eq=False)
 class PoseState:
@@ -45,7 +43,8 @@ class PoseState:
         next_m = betas[0] * self.m[view] + (1 - betas[0]) * slope  # Nesterov's look-ahead
         bias_m, bias_v = power(betas, self.counts[view] + np.array([1, 0]))
         m_hat, v_hat = next_m / (1 - bias_m), self.v[view] / (1 - bias_v)
-        self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * m_hat / (np.sqrt(v_hat) + EPS)
+        eps = 1e-15  # added to the denominator of Adam's step
+        self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * m_hat / (np.sqrt(v_hat) + eps)
         self.x -= self.x.mean(0)
         self.viewmats[:] = matmul(self.start, motion_matrices(self.x))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.fit.edges import Edges
 from gsmerge.fit.outside import Outside
-from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
+from gsmerge.fit.photo_sizes import HIDDEN_WEIGHT, reduced, training_weights
 from gsmerge.kernels.elementary import power
 from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
@@ -22,19 +22,16 @@ GROWTH = 0.5  # share of the steps after which Gaussians are added
 CUTS = (0.0, 0.15, 0.3, 0.5, 0.7)
 CLEARS = (0.6, 0.7, 0.8)  # shares of the steps after which runs that grow drop faint Gaussians
 FEW_VIEWS = 5  # with at most this many views a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
-MANY_STEPS = 150
+MANY_STEPS = 150  # least steps of such a run
 # Most of the first steps draw a sample of a photo's pixels, each time a different sample. A sample costs as much as the
 # photo at half size, and shows details that are lost at half size.
 STRIDE = 2
 OFFSETS = ((0, 0), (1, 1), (1, 0), (0, 1))  # columns and rows of the samples, one after the other
-SAMPLED_STEPS = 30  # shorter runs draw too few samples to see all pixels: .07 dB less at 20 steps, 1 dB at 7
 DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
 LONG_DROPOUT = 0.05  # the same share in runs of LONG_STEPS that draw each view LONG_ROUNDS times
-LONG_ROUNDS = 30
+LONG_ROUNDS = 30  # steps for each view
 LARGE_CYCLE = 5  # of this many steps, the steps LARGE_STEPS draw larger photos; more would worsen the views' own size
-LARGE_STEPS = (0, 2)
-HALF_CYCLE = 3  # with larger photos, one of this many half-size steps remains
-LONG_RUN = 300  # in longer runs the last step sizes shrink in proportion to the number of steps
+LARGE_STEPS = (0, 2)  # numbers of steps within a cycle, from 0
 # Draw modes of steps, one after the other. A mode is 1 for half size or 0 for full size, the low-pass as a share of the
 # viewers' own low-pass, and whether small Gaussians are made fainter to offset the low-pass, as some viewers do. In a
 # view that is enlarged twice, the low-pass is a quarter; from afar, it covers more of the scene. Gaussians that are
@@ -90,8 +87,8 @@ class FitRun:
     """A prepared full fit: weights of the pixels, dropout, and the share of the first steps."""
 
     job: FitJob
-    # [h,w] float32 weights of each photo at half size: 0 on held-out patches, if the fit is scored on them, `HIDDEN` on
-    # pixels that neither steps nor scores use, 1 elsewhere
+    # [h,w] float32 weights of each photo at half size: 0 on held-out patches, if the fit is scored on them,
+    # `HIDDEN_WEIGHT` on pixels that neither steps nor scores use, 1 elsewhere
     weights: list[np.ndarray]
     # [h,w] float32 weights in steps, of each photo at each size: 0 on hidden pixels, elsewhere the importance of the
     # pixel. Held-out patches are 0 only at half size
@@ -131,9 +128,10 @@ class FitRun:
             return DrawMode(2, photos[2].eps2d)
         modes = FIRST_MODES if is_early else DRAW_MODES
         size, low_pass, antialiased = modes[step % len(modes)]
+        half_cycle = 3  # with larger photos, one of this many half-size steps remains
         # Half-size photos cost short runs more than they gain. If larger photos show the scene from near, a third of
         # the half-size steps is enough
-        if not self.job.options.grows or (has_larger and step % HALF_CYCLE):
+        if not self.job.options.grows or (has_larger and step % half_cycle):
             size = 0
         return DrawMode(size, low_pass * photos[0].eps2d, antialiased, STRIDE if is_early and size == 0 else 1)
 
@@ -147,9 +145,9 @@ def prepare_fit(job: FitJob) -> FitRun:
     first_pixels = None
     if options.scored:
         whole = training_weights(photos[0], options.holdout, job.seed)
-        first_pixels = tuple((weight != 0) & (weight != HIDDEN) for weight in whole)
+        first_pixels = tuple((weight != 0) & (weight != HIDDEN_WEIGHT) for weight in whole)
         weights = reduced(whole, photos[1])
-        train_weights = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
+        train_weights = [np.where(weight == HIDDEN_WEIGHT, np.float32(0), weight) for weight in weights]
         if len(photos[0]) == 1:  # no other photo shows the held-out patches, so the fit is scored on all pixels
             weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
     step_weights = everywhere, _weigh(train_weights, photos[1]), *larger
@@ -171,7 +169,8 @@ def _can_sample(job: FitJob) -> bool:
     """
     photos, options = job.photos[0], job.options
     pixels = len(photos) * (photos.width // STRIDE) * (photos.height // STRIDE)
-    return options.steps >= SAMPLED_STEPS and not options.move_cameras and max(1, job.count) <= pixels
+    min_steps = 30  # shorter runs draw too few samples to see all pixels: .07 dB less at 20 steps, 1 dB at 7
+    return options.steps >= min_steps and not options.move_cameras and max(1, job.count) <= pixels
 
 
 def _weights_of(photos: Photos) -> list[np.ndarray]:
@@ -232,7 +231,8 @@ class Schedule:
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     """Return the step size of each of the fourteen parameters; it decays geometrically, and further in longer runs."""
-    decay = rates.decay * min(1.0, LONG_RUN / steps)
+    usual_steps = 300  # in longer runs the last step sizes shrink in proportion to the number of steps
+    decay = rates.decay * min(1.0, usual_steps / steps)
     start_rates = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
     widths = [3, 3, 4, 1, 3]  # columns of means, log scales, quaternions, opacity logit and colours
     return (np.repeat(start_rates, widths) * power(decay, progress)).astype(np.float32)

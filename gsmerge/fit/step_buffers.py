@@ -14,13 +14,12 @@ import numpy as np
 from gsmerge.fit.fit_state import FitState
 from gsmerge.kernels.raster import image_loss
 from gsmerge.kernels.raster.project import BLOCK, CAMERA, CONIC, POSE, SUMS, TILE
-from gsmerge.kernels.raster.step import PHASES, PIECE, STEP, fit_phase
+from gsmerge.kernels.raster.step import PHASES, STEP, THREAD_GAUSSIANS, fit_phase
 from gsmerge.kernels.signature import FilledTable
 from gsmerge.raster.gradient import viewmat_gradient
 from gsmerge.raster.tiled_view import cache_line_rows, hides_most
 from gsmerge.runtime.threads import parallel_map
 
-SPARE = 1.25  # allocated room, as a multiple of the intersections of a view that needs more room
 OF_STATE = ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors")
 OF_SPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 # Arrays that each step sets, with their lengths
@@ -49,7 +48,10 @@ class StepBuffers:
         self.gaussians |= {name: np.empty(n, np.int32) for name in ("ids", "order")}
         self.gaussians |= {name: np.empty(n, np.uint64) for name in ("keys", "spare")}
         self.gaussians |= {name: np.zeros(size, np.float32) for name, size in OF_STEP.items()}
-        self.gaussians |= {"conics": cache_line_rows(n, CONIC), "num_kept": np.empty(-(-n // PIECE), np.int64)}
+        self.gaussians |= {
+            "conics": cache_line_rows(n, CONIC),
+            "num_kept": np.empty(-(-n // THREAD_GAUSSIANS), np.int64),
+        }
         self.gaussians |= {"g_poses": np.empty((-(-n // BLOCK) * self.moves_camera, POSE), np.float32)}
         self.gaussians |= {"fixed": self.state.fixed.view(np.uint8)}
         self.gaussians |= {name: getattr(self.state, name) for name in OF_STATE}
@@ -78,7 +80,8 @@ class StepBuffers:
         if is_open:  # lists end where their tiles are opaque, or they would be too long
             self._run(weight.shape, "count_open")
         if table["num_intersections"] > len(self.room["flatten_ids"]):
-            self._make_room(int(SPARE * table["num_intersections"]))
+            room_factor = 1.25  # allocated room, as a multiple of the intersections of a view that needs more room
+            self._make_room(int(room_factor * table["num_intersections"]))
             return self.take(number, photo, weight, drawn, numbers)
         self._run(weight.shape, "deal_open" if is_open else "deal", "blend", "loss", "backward", "update")
         error = float(table.arrays["errors"].sum(dtype=np.float64))
@@ -110,7 +113,7 @@ class StepBuffers:
         spans, tiles, corners = 2 * self.threads, columns * lines, (columns + 1) * (lines + 1)
         shapes: dict[str, tuple[int, ...]] = {
             "image": (height, width, 3), "gradient": (height, width, 3), "transmittance": (height, width),
-            "errors": (height,), "terms": (self.threads, image_loss.ROWS, image_loss.TERMS, line),
+            "errors": (height,), "terms": (self.threads, image_loss.DERIVATIVE_ROWS, image_loss.TERMS, line),
             "rows": (self.threads, image_loss.EDGE_ROWS, line), "light": (tiles,),
         }  # fmt: skip
         counts = {"corners": (spans, corners), "counts": (spans, tiles), "offsets": (tiles + 1,)}

@@ -22,7 +22,7 @@ from gsmerge.raster.photos import Photos
 from gsmerge.raster.tiled_view import camera_numbers
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-ROWS = 16384  # Gaussians per task of an Adam step
+ADAM_ROWS = 16384  # Gaussians per task of an Adam step
 
 
 @dataclass(eq=False)
@@ -68,14 +68,14 @@ class Optimiser:
         s, fixed, constants = state.splats, state.fixed.view(np.uint8), tuple(self.constants(state, step).values())
 
         def move_rows(start: int) -> None:
-            stop = min(start + ROWS, len(g.ids))
+            stop = min(start + ADAM_ROWS, len(g.ids))
             kernels.adam(
                 state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes, fixed, g.ids,
                 g.means, g.quats, g.scales, g.opacities, g.colors, *constants, step.number, start, stop,
                 s.means, s.quats, s.scales, s.opacities, state.colors,
             )  # fmt: skip
 
-        parallel_map(move_rows, range(0, len(g.ids), ROWS))
+        parallel_map(move_rows, range(0, len(g.ids), ADAM_ROWS))
 
     def view(self, step: Step) -> tuple[np.ndarray, dict[str, Any]]:
         """Return the pixels ``[h,w,3]`` float32 of the photo that a step draws, and the camera that draws them."""

@@ -18,9 +18,9 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
 MOST_SCORED = 12  # most photos that a fit is scored on
-ENOUGH = 6  # a survey has enough photos of a Gaussian if its centre is inside this many of them
-FEWER = 0.03  # a photo is added to a survey if more than this share of its Gaussians has fewer photos than ENOUGH
-SAMPLE_GAUSSIANS = 4096  # the photos are chosen by at most about twice this many Gaussians
+ENOUGH_PHOTOS = 6  # a survey has enough photos of a Gaussian if its centre is inside this many of them
+# A photo is added to a survey if more than this share of its Gaussians has fewer photos than ENOUGH_PHOTOS
+FEWER_SHARE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Survey:
 
 
 def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
-    """Draw Gaussians into half-size photos of a fit, see :func:`choose_views`, and collect the facts about each.
+    """Draw Gaussians into half-size photos of a fit, see :func:`choose_photos`, and collect the facts about each.
 
     The size of the finest pixel refers to the largest photos.
     """
@@ -57,7 +57,7 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
         return drawn.ids, drawn.depths / focal, *survey(drawn, colors)
 
-    views, scored, images = choose_views(gaussians, half), scored_views(len(half)), []
+    views, scored, images = choose_photos(gaussians, half), choose_scored_photos(len(half)), []
     inside, peaks = np.zeros(count, bool), np.zeros(count, np.float32)
     sums, squares, pixels = np.zeros(count), np.zeros(count), np.full(count, np.inf, np.float32)
     for view, (ids, pixel_sizes, image, weights, view_peaks) in zip(views, in_turn(one_view, views), strict=True):
@@ -71,24 +71,25 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
     return Survey(score_images(images, run, half), inside, peaks, sums, squares, pixels)
 
 
-def choose_views(gaussians: Gaussians, photos: Photos) -> list[int]:
+def choose_photos(gaussians: Gaussians, photos: Photos) -> list[int]:
     """Choose the photos of a survey: the scored photos, and further ones.
 
-    A photo is added if it shows many Gaussians with fewer than ``ENOUGH`` photos so far.
+    A photo is added if it shows many Gaussians with fewer than ``ENOUGH_PHOTOS`` photos so far.
     """
-    means = gaussians.means[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
+    sample_gaussians = 4096  # the photos are chosen by at most about twice this many Gaussians
+    means = gaussians.means[:: max(1, len(gaussians) // sample_gaussians)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
     inside = (depths > NEAR_PLANE) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
-    views = scored_views(len(photos))
+    views = choose_scored_photos(len(photos))
     num_photos = inside[views].sum(0)
     for view in spread_views(len(photos)):
-        if view not in views and (inside[view] & (num_photos < ENOUGH)).sum() > FEWER * inside[view].sum():
+        if view not in views and (inside[view] & (num_photos < ENOUGH_PHOTOS)).sum() > FEWER_SHARE * inside[view].sum():
             views.append(view)
             num_photos += inside[view]
     return sorted(views)
 
 
-def scored_views(count: int) -> list[int]:
+def choose_scored_photos(count: int) -> list[int]:
     """Choose the photos out of ``count`` that a fit is scored on, at most ``MOST_SCORED``."""
     return sorted(spread_views(count)[:MOST_SCORED])
 
@@ -115,8 +116,8 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
 
 
 def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> float:
-    """Return the PSNR (dB) of renders of the :func:`scored_views` on held-out patches; NaN if none are held out."""
-    options, views = run.job.options, scored_views(len(half))
+    """Return the PSNR (dB) of renders of the scored photos on held-out patches; NaN if none are held out."""
+    options, views = run.job.options, choose_scored_photos(len(half))
     if not options.scored:
         return float("nan")
     return holdout_psnr(images, half[views], [run.weights[view] for view in views], options.tuning.min_gain)
@@ -124,7 +125,7 @@ def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> flo
 
 def score_state(state: FitState, run: FitRun, half: Photos) -> float:
     """Return the PSNR (dB) of a state on the held-out patches of the half-size photos; see :func:`score_images`."""
-    views = scored_views(len(half))
+    views = choose_scored_photos(len(half))
     return score_images(render_photos(state.splats, half, colors=state.view_colors(), views=views), run, half)
 
 

@@ -17,9 +17,9 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene, SceneT
 
-SAMPLE_GAUSSIANS = 65536  # Gaussians by which the frame is chosen
-ROWS = 65536  # Gaussians per task
-MAX_VIEWS = 32  # most views by which the unit is chosen, if views have no Gaussians of their own
+FRAME_GAUSSIANS = 65536  # Gaussians by which the frame is chosen
+FRAME_ROWS = 65536  # Gaussians per task
+MAX_UNIT_VIEWS = 32  # most views by which the unit is chosen, if views have no Gaussians of their own
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +34,12 @@ class Frame:
         means, scales = np.empty(gaussians.means.shape, np.float32), np.empty_like(gaussians.scales)
 
         def fill(first: int) -> None:
-            rows = slice(first, first + ROWS)
+            rows = slice(first, first + FRAME_ROWS)
             for axis, start in enumerate(self.origin):  # one axis at a time takes NumPy half the time
                 means[rows, axis] = (gaussians.means[rows, axis] - start) / self.unit
             np.divide(gaussians.scales[rows], self.unit, out=scales[rows])
 
-        parallel_map(fill, range(0, len(gaussians), ROWS))
+        parallel_map(fill, range(0, len(gaussians), FRAME_ROWS))
         return replace(gaussians, means=means, scales=scales)
 
     def leave(self, gaussians: Gaussians) -> Gaussians:
@@ -86,7 +86,7 @@ def scene_depth(scene: Scene) -> float:
         if homes.min() < 0:
             means, homes = means[homes >= 0], homes[homes >= 0]
         return float(lower_median(np.abs(camera_depths(means, scene.cameras.viewmats, homes // scene.pixels_per_view))))
-    views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
+    views = scene.cameras[:: max(1, len(scene) // MAX_UNIT_VIEWS)]
     pixels, depths = project(means, views)
     x, y = pixels[..., 0], pixels[..., 1]
     seen = (depths > 0) & (x > 0) & (x < views.width) & (y > 0) & (y < views.height)
@@ -98,7 +98,7 @@ def sample_rows(scene: Scene) -> slice:
     count = len(scene.gaussians)
     if count == 0:
         raise ValueError("expected at least one Gaussian, got none")
-    return slice(0, count, max(1, count // SAMPLE_GAUSSIANS))
+    return slice(0, count, max(1, count // FRAME_GAUSSIANS))
 
 
 def canonicalise(scene: SceneT, frame: Frame | None = None) -> tuple[SceneT, Frame]:

@@ -16,12 +16,12 @@ from gsmerge.values.arrays import to_float32
 
 Rule = Literal["depth", "paper"]
 
-MIN_SCALE = 1e-12
 MAX_OPACITY = 0.999  # largest opacity of a merged Gaussian, so that its logit is finite and a later fit can change it
 ROWS_PER_TASK = 4096  # groups that one task pools
-ROWS = 65536  # Gaussians whose footprints one task computes
+FOOTPRINT_ROWS = 65536  # Gaussians whose footprints one task computes
 # Columns of a group in the output of the kernel `pool`
-MEAN, COVAR, WEIGHT, MASS, EXTINCTION, FOOTPRINT, COLUMNS = slice(0, 3), slice(3, 9), 9, 10, 11, 12, 13
+POOLED_MEAN, POOLED_COVAR, POOLED_WEIGHT, POOLED_MASS = slice(0, 3), slice(3, 9), 9, 10
+POOLED_EXTINCTION, POOLED_FOOTPRINT, POOLED_COLUMNS = 11, 12, 13  # the last is the number of columns
 FULL_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # entries of an upper triangle xx xy xz yy yz zz in a flattened 3 x 3 matrix
 
 
@@ -59,12 +59,12 @@ def pixel_sizes(means: np.ndarray, homes: np.ndarray, cameras: Cameras) -> np.nd
     focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in Ks])
 
     def measure_footprints(start: int) -> None:
-        rows = slice(start, start + ROWS)
+        rows = slice(start, start + FOOTPRINT_ROWS)
         views = homes[rows] // (cameras.height * cameras.width)
         depths = np.abs(camera_depths(means[rows], viewmats, views))
         footprints[rows] = np.maximum(depths, np.float32(1e-6)) / focals.astype(np.float32)[views]
 
-    parallel_map(measure_footprints, range(0, len(means), ROWS))
+    parallel_map(measure_footprints, range(0, len(means), FOOTPRINT_ROWS))
     homeless = np.flatnonzero(homes < 0)
     if len(homeless):
         smallest = np.full(len(homeless), np.inf)
@@ -107,7 +107,7 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
     states no opacity, so the mean opacity of the members is used.
     """
     num_groups = len(starts) - 1
-    pooled = np.zeros((num_groups, COLUMNS))
+    pooled = np.zeros((num_groups, POOLED_COLUMNS))
     sh = np.zeros((num_groups, 1 + members.shN.shape[1], 3), np.float32)
 
     def pool_groups(begin: int) -> None:
@@ -119,13 +119,14 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
         )  # fmt: skip
 
     parallel_map(pool_groups, range(0, num_groups, ROWS_PER_TASK))
-    covars, extinctions = pooled[:, COVAR][:, FULL_MATRIX].reshape(-1, 3, 3), pooled[:, EXTINCTION]
+    covars, extinctions = pooled[:, POOLED_COVAR][:, FULL_MATRIX].reshape(-1, 3, 3), pooled[:, POOLED_EXTINCTION]
     if rule == "paper" and num_groups:
         scales, _ = principal_axes(covars)
         opacities = np.add.reduceat(members.opacities[ids].astype(np.float64), starts[:-1]) / np.diff(starts)
         extinctions = -log(1 - np.clip(opacities, 1e-4, MAX_OPACITY)) * scales[:, 1] * scales[:, 2]
     return Moments(
-        pooled[:, MEAN], covars, pooled[:, WEIGHT], pooled[:, MASS], extinctions, pooled[:, FOOTPRINT], sh
+        pooled[:, POOLED_MEAN], covars, pooled[:, POOLED_WEIGHT], pooled[:, POOLED_MASS], extinctions,
+        pooled[:, POOLED_FOOTPRINT], sh,
     )  # fmt: skip
 
 
@@ -139,7 +140,8 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         decompose(covars[rows], scales[rows], quats[rows])  # fills `scales` and `quats`
 
     parallel_map(decompose_rows, range(0, len(covars), ROWS_PER_TASK))
-    return np.maximum(scales, MIN_SCALE), quats
+    min_scale = 1e-12  # world units; replaces scales of 0, because opacities are divided by scales
+    return np.maximum(scales, min_scale), quats
 
 
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:

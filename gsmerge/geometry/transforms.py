@@ -20,15 +20,14 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 from gsmerge.values.arrays import Array
 
-State = TypeVar("State")  # state that a descent changes
-MORTON_BITS = 21  # bits for each axis; three axes fit into 63 bits
-DEPTH_SAMPLE = 50_000  # points; the median depth in a view is measured on about so many
-DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
+DescentState = TypeVar("DescentState")  # state that a descent changes
+SH_DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
 # More values than the first number are narrowed down before the median is taken: to those between two shares of a
 # sample of about the second number, which are so far from a half that the median is practically always between them
 FEW_VALUES, SAMPLE_VALUES, AROUND_MEDIAN = 1 << 17, 1 << 14, (0.47, 0.53)
+NORMAL_SPREAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
 NEAREST_ROWS = 1 << 14  # points per task of a search for the nearest ones
-BRIGHT = np.float32(20.0)  # harmonic of degree 0 so large that no colour is clipped at 0
+BRIGHT_SH0 = np.float32(20.0)  # harmonic of degree 0 so large that no colour is clipped at 0
 
 
 def quat_to_rotmat(quats: np.ndarray) -> np.ndarray:
@@ -193,7 +192,8 @@ def middle_depth(means: np.ndarray, camera: Cameras) -> float:
 
 def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
     """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; ``[1]`` if there are none."""
-    points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
+    depth_sample = 50_000  # points; the median depth in a view is measured on about so many
+    points = means[:: max(1, len(means) // depth_sample)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
     return np.asarray(depths[inside]) if inside.any() else np.ones(1)
@@ -331,9 +331,10 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
     if len(points) == 0:
         return codes
     low, high = points.min(0), points.max(0)
-    steps = (points - low) / np.maximum(high - low, 1e-30) * (2**MORTON_BITS - 1)
+    axis_bits = 21  # bits for each axis; three axes fit into 63 bits
+    steps = (points - low) / np.maximum(high - low, 1e-30) * (2**axis_bits - 1)
     for axis, column in enumerate(steps.astype(np.int64).T):
-        for bit in range(MORTON_BITS):
+        for bit in range(axis_bits):
             codes |= (column >> bit & 1) << (3 * bit + axis)
     return codes
 
@@ -351,7 +352,7 @@ def harmonics_rotation(num: int, rotation: np.ndarray) -> np.ndarray:
 
     Each degree is fitted to the same colours in rotated directions, which is exact.
     """
-    directions = normalize(np.random.default_rng(0).normal(size=(DIRECTIONS, 3)))
+    directions = normalize(np.random.default_rng(0).normal(size=(SH_DIRECTIONS, 3)))
     before = harmonics_in(matmul(directions, rotation), num)
     after = harmonics_in(directions, num)
     return solve(matmul(after.T, after), matmul(after.T, before))
@@ -367,7 +368,7 @@ def harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
     """Evaluate the higher harmonics in directions ``[d,3]``; return ``[d,num]`` float64."""
     means = directions.astype(np.float32)
     count = len(means)
-    sh0 = np.full((count, 1, 3), BRIGHT)
+    sh0 = np.full((count, 1, 3), BRIGHT_SH0)
     ids = np.arange(count, dtype=np.int32)
     degree0_colors = np.empty((count, 3), np.float32)
     colors = np.empty((count, 3), np.float32)
@@ -413,8 +414,11 @@ class Damping:
 
 
 def descend(
-    start: State, error: Callable[[State], float], step: Callable[[State, float], State | None], damping: Damping
-) -> State:
+    start: DescentState,
+    error: Callable[[DescentState], float],
+    step: Callable[[DescentState, float], DescentState | None],
+    damping: Damping,
+) -> DescentState:
     """Take damped steps that each lower the error, by Levenberg and Marquardt's rule, and return the last state.
 
     ``step`` takes a state and its damping, and returns the next state, or None if there is none.

@@ -24,7 +24,7 @@ from gsmerge.settings.reading import OpacityChoice, ReadHints
 from gsmerge.states.state_file import holds_features, load_state
 
 NETWORKS = ".safetensors"
-CAMERAS = (*CAMERA_ENDINGS, ".bin")
+CAMERA_FILE_ENDINGS = (*CAMERA_ENDINGS, ".bin")
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def _read(path: Path) -> FileCheck:
         return _read_levels(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
-    if suffix in CAMERAS:
+    if suffix in CAMERA_FILE_ENDINGS:
         cameras = read_cameras(path)
         return FileCheck(str(path), "cameras", len(cameras), cameras.source)
     check_file(path)
@@ -90,7 +90,7 @@ def _read(path: Path) -> FileCheck:
         find_scene_files(path)  # which says what a file without Gaussians holds
     if suffix in IMAGE_SUFFIXES | OTHER_SUFFIXES:
         raise ply.no_ply(path)
-    endings = ", ".join(dict.fromkeys((*READ_ENDINGS, *CAMERAS, NETWORKS)))
+    endings = ", ".join(dict.fromkeys((*READ_ENDINGS, *CAMERA_FILE_ENDINGS, NETWORKS)))
     raise SceneError(path, f"expected one of {endings}, found another kind of file")
 
 

@@ -44,8 +44,6 @@ from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
-_OPAQUE = 0.995  # the optical depth is capped from this opacity on
-_SATURATED = 1e-6  # float32 changes the logit of an opacity that is nearer to 0 or 1 than this
 _OWN = "gsmerge"  # name of the exporter of files that gsmerge wrote
 _FILE_KEYS = (
     "path", "layout", "format", "count", "bytes_by_attribute", "extra_columns", "extra_elements", "sh_degree",
@@ -121,14 +119,16 @@ def inspect(
 def _describe_file(ply: GaussianFile) -> dict[str, Any]:
     """Describe a file of Gaussians, without views."""
     info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
+    opaque = 0.995  # the optical depth is capped from this opacity on
+    saturated = 1e-6  # float32 changes the logit of an opacity that is nearer to 0 or 1 than this
     return {
         **{name: getattr(info, name) for name in _FILE_KEYS},
         "marks": list(kept_comments(info)),
         "bytes": info.file_bytes,
         "extents": extents(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians),
-        "num_opaque": int((opacities >= _OPAQUE).sum()),
+        "num_opaque": int((opacities >= opaque).sum()),
         "num_transparent": int((opacities < LEAST_OPACITY).sum()),
-        "num_saturated": int(((opacities <= _SATURATED) | (opacities >= 1 - _SATURATED)).sum()),
+        "num_saturated": int(((opacities <= saturated) | (opacities >= 1 - saturated)).sum()),
     }
 
 

@@ -34,7 +34,6 @@ from gsmerge.types import StrPath
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
 _PRIVATE = 0o600  # mode of a file that its owner alone can read and write
-_MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
 _STALE_SECONDS = 7 * 86400  # age at which a file is stale if its process is not visible here
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _TEMPORARY = re.compile(r"\.gsmerge-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
@@ -232,7 +231,8 @@ def _flush(path: str | Path) -> None:
 
 def temporary_path(path: Path) -> Path:
     """Return a temporary name in the folder of ``path``, with its suffix, a hash of the machine and the process id."""
-    suffix = path.suffix if len(os.fsencode(path.suffix)) <= _MAX_SUFFIX else ""
+    max_suffix = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
+    suffix = path.suffix if len(os.fsencode(path.suffix)) <= max_suffix else ""
     return path.with_name(f".gsmerge-{_machine_hash()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
 
 

@@ -23,12 +23,12 @@ from gsmerge.types import StrPath
 
 MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any real one has
 MAX_MODEL_BYTES = 256 << 20  # of a COLMAP text file, which also lists the points of every image
-MAX_VIEWS = 10_000
+MAX_VIEWS = 10_000  # of a camera file
 MAX_FILES = 100_000  # below a folder of photos
 MAX_PIXELS = 1 << 26  # of one image
 
 _ADDRESS = re.compile(r"(https?|s3|gs|ftp|file):/")  # start of a URL
-_FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20
+_FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20  # bytes of memory for any file, and for each byte of it
 _FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # steps of 20 microseconds: 5 s, and 2 s for each MB
 # Bytes of Python's objects for each of these characters in JSON, at most, in CPython 3.10 to 3.14
 _JSON_BYTES = {"[": 88, "{": 130, ":": 110, '"': 30, ",": 34}
@@ -158,7 +158,7 @@ def read_json(path: Path) -> Any:
         raise SceneError(path, f"expected JSON, found other text ({error})") from error
 
 
-def check_pixels(path: StrPath, width: int, height: int) -> None:
+def check_image_size(path: StrPath, width: int, height: int) -> None:
     """Raise SceneError if an image size is not positive or has more than 2^26 pixels."""
     if width < 1 or height < 1:
         raise SceneError(path, f"expected a positive image size, found {width} x {height}")

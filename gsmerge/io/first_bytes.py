@@ -39,8 +39,11 @@ _WRITE = "write its Gaussians as .ply, with ns-export gaussian-splat (nerfstudio
 _EXPORT = "export the scene from that program as .ply"
 FILM = "a film"
 # A program that reads other formats; remedies may have the path of the file
-PACKAGE = "@playcanvas/splat-transform@3.7"
-_PACKED_BY_OTHERS = "Gaussians in a format that is not read", f"convert it with: npx {PACKAGE} {{path}} -L 0 scene.ply"
+CONVERTER_PACKAGE = "@playcanvas/splat-transform@3.7"
+_PACKED_BY_OTHERS = (
+    "Gaussians in a format that is not read",
+    f"convert it with: npx {CONVERTER_PACKAGE} {{path}} -L 0 scene.ply",
+)
 _FILM = FILM, "save its frames as photos, and make a scene from them with a model such as Depth Anything 3"
 # Other files that are often beside scenes, by ending: their content, and the remedy
 FOREIGN: dict[str, tuple[str, str]] = {

@@ -21,7 +21,6 @@ FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content 
 CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
 _CUT = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
 HOLD_PHOTOS = (".npz", ".gsm")  # endings of files that may have photos inside
-_MAX_PARTS = 16  # parts at the end of a path that names are compared with: the file's name and folders above it
 _NAME_FOLDER = "name the folder of the photos with {option}"
 _HIDDEN = ".@"  # first characters of hidden folders, such as .thumb and @eaDir
 ImageSource = StrPath | Sequence[StrPath]
@@ -67,7 +66,8 @@ def _by_ending(root: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
 
 def _endings(path: PurePath) -> list[str]:
     """List the endings of a path, such as "a/b.png", "a/b", "b.png" and "b", the longest first."""
-    parts = path.parts[-_MAX_PARTS:]
+    max_parts = 16  # parts at the end of a path that names are compared with: the file's name and folders above it
+    parts = path.parts[-max_parts:]
     endings = [PurePosixPath(*parts[i:]) for i in range(len(parts))]
     return list(dict.fromkeys(str(name) for ending in endings for name in (ending, ending.with_suffix(""))))
 

@@ -17,7 +17,7 @@ from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES, list_images
 from gsmerge.io.scene_files import IMAGE_PLACES
 
-MAX_FOLDERS = 100  # folders that are searched in a folder of scenes
+MAX_SEARCHED = 100  # folders that are searched in a folder of scenes
 _NAME = "name the .ply of the Gaussians, or the folder that it is in"
 
 
@@ -72,7 +72,7 @@ def find_remedy(folder: Path) -> str:
     """Return what to do about a folder whose folders have no scene; empty if none of them has known content."""
     with suppress(OSError):
         subfolders = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
-        contents = [(path, _content(path)) for path in (folder, *islice(subfolders, MAX_FOLDERS))]
+        contents = [(path, _content(path)) for path in (folder, *islice(subfolders, MAX_SEARCHED))]
         for path, content in sorted(contents, key=lambda entry: entry[1] == _PHOTOS):  # photos come last
             if content is not None:
                 return f"{path} has {content[0]}: {content[1]}"

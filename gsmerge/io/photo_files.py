@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
+from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_image_size, read_errors
 from gsmerge.io.first_bytes import refuse_picture
 from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
@@ -26,29 +26,23 @@ from gsmerge.runtime.threads import parallel_map, quiet_warnings
 from gsmerge.types import Cameras
 
 _FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads; that of PNG is read here
-_ORIENTATION_TAG = 274
 # Turn of each orientation tag: quarter turns counterclockwise, plus 4 if the photo is mirrored first
 _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
-_MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of a file: four floats per pixel, and profiles or thumbnails
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
-_HALF_OPAQUE = 127
 # Of width over height: what models change that round the shorter side of a picture to a multiple of 14: 7 of 350 pixels
 ASPECT_TOLERANCE = 0.02
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of a scan; a progressive JPEG has any number of scans
-_PIXELS_PER_STEP = 50_000  # of an empty scan, per step of a budget
 _MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
 _COPIES = 2, 3  # of all pixels in memory: with OpenCV, and at most with Pillow and the conversion of its image
 _PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # of a pixel by mode; 4 in all other modes
 _COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10  # of a pixel, while decoding
-_WORK_BYTES = 9  # additional bytes of a pixel while a library decodes it
 # First bytes of a file -> Pillow's plugin; without a plugin for its first format, Pillow imports those of all formats
 _PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp"}
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 # Bytes of a scene's decoded photos that are allowed in any case, and for each byte of the files: even strongly
 # compressed photos have more than 0.03 bytes per pixel
 _FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100
-_WHITES = 1, 255, 65535  # largest value of pictures of 0 and 1 or of fractions, of 8 bits, and of 16 bits
 _SMALLER = "reduce its size: a mask to that of its photo, a photo to about that of its view"
 _BAND = 256  # rows of a mask that are converted at once
 _REDUCTIONS = {  # by which each side is divided -> OpenCV's flag
@@ -58,7 +52,7 @@ _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 Size = tuple[int, int]  # width, height, pixels
 Part = tuple[float, float, float, float]  # left, top, right, bottom of a part of a photo, in shares of its sides
-WHOLE: Part = (0.0, 0.0, 1.0, 1.0)
+WHOLE: Part = (0.0, 0.0, 1.0, 1.0)  # all of a photo
 _AT_ONCE = 128 << 20  # bytes of decoded photos in memory; if there are more, photos are decoded at each use
 
 
@@ -107,7 +101,7 @@ def decode_images(paths: Sequence[Path]) -> PhotoArrays:
         if (w, h) != size:
             problem = f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {files[0]}"
             raise SceneError(path, problem, "resize them to one size")
-    return decode_views(paths, [0] * len(paths), size) if files else []
+    return decode_photos(paths, [0] * len(paths), size) if files else []
 
 
 def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
@@ -119,7 +113,7 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
         raise SceneError(paths[0].parent, f"{problem}, {found}", "reduce their size, or leave some out")
 
 
-def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size, part: Part = WHOLE) -> PhotoArrays:
+def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size, part: Part = WHOLE) -> PhotoArrays:
     """Decode a part of the turned photo of each view to ``[h,w,3]`` uint8 of one ``size``; black without a file.
 
     If photos are large, they are decoded at each use; else a photo that several views have is decoded once. SceneError
@@ -253,7 +247,8 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     grey = _decode_channel(path, brightness)
     assert grey is not None
     brightest = float(grey.max(initial=0))
-    white = next((white for white in _WHITES if brightest <= white), brightest)
+    whites = 1, 255, 65535  # largest value of pictures of 0 and 1 or of fractions, of 8 bits, and of 16 bits
+    white = next((white for white in whites if brightest <= white), brightest)
     if grey.dtype == np.uint8 and white == 255:
         return grey
     levels = np.zeros(grey.shape, np.uint8)
@@ -275,7 +270,8 @@ def decode_alpha(path: Path) -> np.ndarray | None:
         return image.convert("RGBA").getchannel("A")
 
     values = _decode_channel(path, alpha)
-    return None if values is None or values.min() > _HALF_OPAQUE else values > _HALF_OPAQUE
+    half_opaque = 127  # of 255; a pixel counts if it is more opaque
+    return None if values is None or values.min() > half_opaque else values > half_opaque
 
 
 def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
@@ -322,7 +318,8 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
 
 def _undecodable(path: Path, size: Size) -> SceneError:
     """Make the error of an image that a library did not decode; MemoryError if there was no memory for it."""
-    np.empty((_CHANNELS + _WORK_BYTES, *size), np.uint8)  # libraries do not say that memory was the reason
+    work_bytes = 9  # additional bytes of a pixel while a library decodes it
+    np.empty((_CHANNELS + work_bytes, *size), np.uint8)  # libraries do not say that memory was the reason
     return _unreadable(path)
 
 
@@ -348,8 +345,9 @@ def _read_header(path: Path) -> tuple[Size, float]:
     num_bytes = check_file(path)
     with read_errors(path), path.open("rb") as file:
         (width, height), pixel_bytes = _parse_header(path, file)
-    if num_bytes > _MAX_PIXEL_BYTES * width * height + _MAX_EXTRA:
-        limit = f"{_MAX_PIXEL_BYTES} bytes per pixel and {_MAX_EXTRA >> 20} MiB"
+    max_pixel_bytes, max_extra = 16, 16 << 20  # of a file: four floats per pixel, and profiles or thumbnails
+    if num_bytes > max_pixel_bytes * width * height + max_extra:
+        limit = f"{max_pixel_bytes} bytes per pixel and {max_extra >> 20} MiB"
         found = f"{num_bytes >> 20} MiB for {width} x {height} pixels"
         raise SceneError(path, f"expected at most {limit}, found {found}", "save the image again")
     return (width, height), pixel_bytes
@@ -360,7 +358,8 @@ def orientation_turn(path: Path) -> int:
     with read_errors(path), quiet_warnings():
         try:
             with path.open("rb") as file, _open_image(file, (*_FORMATS, "PNG")) as image:
-                return _TURNS.get(image.getexif().get(_ORIENTATION_TAG, 0), 0)
+                orientation_tag = 274  # of EXIF
+                return _TURNS.get(image.getexif().get(orientation_tag, 0), 0)
         except Exception:  # a damaged tag may make the library raise any error; pixels are checked later
             return 0
 
@@ -384,7 +383,7 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
         raise SceneError(path, problem, "reduce its size") from error
     except Exception as error:  # a damaged header may make the library raise any error
         raise _unreadable(path) from error
-    check_pixels(path, width, height)
+    check_image_size(path, width, height)
     return (width, height), max(_COPIES[0] * _CHANNELS, _CHANNELS + pixel_bytes)
 
 
@@ -401,7 +400,8 @@ def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
 def _check_scans(path: Path, data: np.ndarray, size: Size) -> None:
     """Raise SceneError if the scans of a JPEG file, each over all pixels, take longer than its bytes allow."""
     num_scans = data.tobytes().count(_SCAN) if data[:2].tobytes() == _JPEG else 0
-    steps = num_scans * size[0] * size[1] // _PIXELS_PER_STEP
+    pixels_per_step = 50_000  # of an empty scan, per step of a budget
+    steps = num_scans * size[0] * size[1] // pixels_per_step
     ReadBudget(path, len(data)).check_steps(steps, f"steps of decoding {num_scans:,} scans")
 
 

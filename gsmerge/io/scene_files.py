@@ -70,9 +70,7 @@ _LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, se
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 _PACKED = {*SCENE_SUFFIXES} - {".ply"}
 _MAX_HEADERS = 1_000  # headers of a folder's files that are read; further files count as scenes
-_MAX_DEPTH = 3  # of the folders that are searched below a folder without a scene
 _MAX_ENTRIES = 10_000  # largest number of files and folders in these folders
-_MAX_CAMERAS, _MAX_FOLDERS = 8, 100  # cameras that are tried in turn; folders in which they are searched below a scene
 
 
 @dataclass(frozen=True)
@@ -259,12 +257,14 @@ def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, l
     known = dict.fromkeys(
         path for root in roots for path in list_cameras(root) if not _is_in_other_scene(path, root, ply)
     )
-    cameras = [*islice(known, _MAX_CAMERAS)] or [*filter(None, map(find_other_cameras, roots))][:1]
+    # Cameras that are tried in turn; folders in which they are searched below a scene
+    max_cameras, max_folders = 8, 100
+    cameras = [*islice(known, max_cameras)] or [*filter(None, map(find_other_cameras, roots))][:1]
     if cameras:
         return cameras[0], cameras[1:], False
-    folders = list_folders(roots[0])[:_MAX_FOLDERS]
+    folders = list_folders(roots[0])[:max_folders]
     below = dict.fromkeys(p for top, _ in folders for p in list_cameras(top) if not _is_in_other_scene(p, top, ply))
-    return next(filter(None, map(find_unread, roots)), of_result), [*islice(below, _MAX_CAMERAS)], bool(below)
+    return next(filter(None, map(find_unread, roots)), of_result), [*islice(below, max_cameras)], bool(below)
 
 
 def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
@@ -486,6 +486,7 @@ def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | Non
     ``links``: follow links to folders. Without them, nothing is found if there are too many entries.
     """
     found, places, num_entries = list[tuple[Path, list[str] | None]](), [(folder, 0)], 0
+    max_depth = 3  # of the folders that are searched below a folder without a scene
     for place, depth in places:  # the loop appends to this list
         with suppress(OSError), os.scandir(place) as scan:
             if depth and _plys_in(place):
@@ -499,7 +500,7 @@ def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | Non
             num_entries += len(entries)
             inner = [entry.name for entry in entries if entry.is_dir(follow_symlinks=links)]
             found.append((place, [entry.name for entry in entries if entry.is_file()]))
-            shown = {name for name in inner if name[0] != "."} - _OTHER_PICTURES if depth < _MAX_DEPTH else ()
+            shown = {name for name in inner if name[0] != "."} - _OTHER_PICTURES if depth < max_depth else ()
             places += [(place / name, depth + 1) for name in sorted(shown)]
     return found
 

@@ -10,8 +10,6 @@ from safetensors import SafetensorError, deserialize
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import parse_json, read_budget
 
-_HEADER_SIZE = 8  # bytes of the number at the start, which is the length of the header
-_ARRAY_MEMORY, _COPIES = 1800, 3  # bytes of memory for each array's description, and copies of the file, while read
 _TYPES = {
     "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
     "I8": np.int8, "U64": np.uint64, "U32": np.uint32, "U16": np.uint16, "U8": np.uint8, "BOOL": np.bool_,
@@ -28,12 +26,15 @@ def read_tensors(
     budget = read_budget(path)
     try:
         with path.open("rb") as file:
-            length_bytes = file.read(_HEADER_SIZE)
+            header_size = 8  # bytes of the number at the start, which is the length of the header
+            length_bytes = file.read(header_size)
             length = int.from_bytes(length_bytes, "little")
             if not 0 < length <= budget.file_bytes:
                 raise ValueError("no header of a safetensors file")
             header_bytes = file.read(length)
-            budget.check_memory(_ARRAY_MEMORY * header_bytes.count(b"{") + _COPIES * budget.file_bytes, "arrays")
+            # Bytes of memory for each array's description, and copies of the file, while read
+            array_memory, copies = 1800, 3
+            budget.check_memory(array_memory * header_bytes.count(b"{") + copies * budget.file_bytes, "arrays")
             header = parse_json(header_bytes.decode("utf-8"), budget)
             metadata = (header.get("__metadata__") if isinstance(header, dict) else None) or {}
             if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):

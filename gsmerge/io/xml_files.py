@@ -14,8 +14,6 @@ from xml.parsers import expat
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_budget, read_text
 
-_ELEMENT_BYTES, _ATTRIBUTE_BYTES = 200, 330  # most bytes of memory for each "<" and "=" of a file
-
 
 def read_xml(path: Path, attributes: Collection[str]) -> Element:
     """Read a file with the given ``attributes`` of its elements; SceneError if it is no XML, or too large.
@@ -24,7 +22,8 @@ def read_xml(path: Path, attributes: Collection[str]) -> Element:
     """
     text, builder, parser = read_text(path), TreeBuilder(), expat.ParserCreate()
     budget = read_budget(path)
-    budget.check_memory(_ELEMENT_BYTES * text.count("<") + _ATTRIBUTE_BYTES * text.count("="), "XML")
+    element_bytes, attribute_bytes = 200, 330  # most bytes of memory for each "<" and "=" of a file
+    budget.check_memory(element_bytes * text.count("<") + attribute_bytes * text.count("="), "XML")
 
     def start(tag: str, own: Mapping[str, str]) -> None:
         builder.start(tag, {name: own[name] for name in attributes if name in own})

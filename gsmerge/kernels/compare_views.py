@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i8, native, u1
 
-COLUMNS = 10  # values of scratch per pixel
+SCRATCH_COLUMNS = 10  # values of scratch per pixel
 
 
 @native(
@@ -33,7 +33,7 @@ def compare_views(
         depths: Depths of the Gaussians at the pixels' centres; NaN without any.
         given: Poses from which ``flows`` are measured.
         scale: Unit of ``flows`` per pixel.
-        scratch: ``[COLUMNS, largest number of pixels of a view]``.
+        scratch: ``[SCRATCH_COLUMNS, largest number of pixels of a view]``.
         curvatures: Written: Gauss-Newton's second derivatives of half the weighted squared differences with respect to
             a motion of the second camera; ``slopes`` gets the first derivatives.
         costs: Written: mean over the pixels of a robust function of their differences.

@@ -12,7 +12,6 @@ from gsmerge.kernels.signature import STATUS, declare, f4
 SLOPE, SMOOTH = np.array([-1, 0, 1], np.float32), np.array([1, 2, 1], np.float32)  # Sobel's filters
 Picture = np.ndarray[Any, Any]
 ORIENTATIONS = 8  # of a picture, as in EXIF tags: four quarter turns, and four of the mirror image
-CUBIC = -0.75  # slope parameter of the cubic convolution (Keys 1981), OpenCV's
 
 
 _filter_picture = declare(
@@ -126,7 +125,7 @@ def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
     centres = (np.arange(new) + 0.5) * (old / new) - 0.5  # of the new pixels, in old pixels
     floors, taps = np.floor(centres).astype(np.int64), np.arange(-1, 3)[:, None]
     distances = np.abs(centres - floors - taps)
-    a = CUBIC
+    a = -0.75  # slope parameter of the cubic convolution (Keys 1981), OpenCV's
     inner = ((a + 2) * distances - (a + 3)) * distances * distances + 1
     outer = ((a * distances - 5 * a) * distances + 8 * a) * distances - 4 * a
     return floors + taps, np.where(distances <= 1, inner, outer).astype(np.float32)

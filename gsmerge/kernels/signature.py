@@ -27,7 +27,7 @@ _CODES = {
     "i8": ("int64_t", ctypes.c_int64), "f4": ("float", ctypes.c_float), "f8": ("double", ctypes.c_double),
 }  # fmt: skip
 _POSITIONAL = inspect.Parameter.POSITIONAL_OR_KEYWORD
-Size = int | str  # a number, or the name of a size or of an integer argument
+ArraySize = int | str  # a number, or the name of a size or of an integer argument
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Argument:
     """
 
     code: str
-    shape: tuple[Size, ...]
-    least: Size | None = None
-    below: Size | None = None
-    most: Size | None = None
+    shape: tuple[ArraySize, ...]
+    least: ArraySize | None = None
+    below: ArraySize | None = None
+    most: ArraySize | None = None
     ascending: bool = False
     out: bool = False
     optional: bool = False
@@ -87,7 +87,7 @@ class Argument:
         return f"{np.dtype(self.code)} [{','.join(map(str, self.shape))}]"
 
 
-def _argument(code: str, *shape: Size, **rules: Any) -> Argument:
+def _argument(code: str, *shape: ArraySize, **rules: Any) -> Argument:
     return Argument(code, shape, **rules)
 
 

@@ -19,17 +19,15 @@ from gsmerge.geometry.transforms import (
 from gsmerge.io.cameras.viewer_cameras import order_views
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.measure.fog import CAMERAS
+from gsmerge.measure.fog import FOG_CAMERAS
 from gsmerge.types import Cameras
 
 PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
-MAX_TURN, MAX_BACK = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
 CURVE_PIECES = 64  # straight pieces between two cameras; the length of a curve is measured along them
 ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
 # Least and largest extent of an orbit to the sides, and up and down, as shares of the distance to its centre. With the
 # least a single photo still looks right. The largest turns the view by 14 degrees to each side.
 HORIZONTAL, VERTICAL = (0.06, 0.25), (0.03, 0.125)
-SAME = 1e-9  # cameras count as one up to this distance, as a share of a path's length
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class CameraPath:
     back: float = 0.0
 
 
-def parse_path(text: str) -> CameraPath | None:
+def parse_camera_path(text: str) -> CameraPath | None:
     """Parse a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``; None for a file name.
 
     Raises:
@@ -60,8 +58,9 @@ def parse_path(text: str) -> CameraPath | None:
     if match is None:
         form = f"{kind}{'[:DEGREES]' if kind == 'orbit' else ''}[,back:SHARE]"
         raise ValueError(f"path: expected {form}, got {text}")
-    turn = _parse_number(match["turn"], "orbit: expected degrees", MAX_TURN)
-    back = _parse_number(match["back"], "back: expected a share of the depth", MAX_BACK)
+    max_turn, max_back = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
+    turn = _parse_number(match["turn"], "orbit: expected degrees", max_turn)
+    back = _parse_number(match["back"], "back: expected a share of the depth", max_back)
     return CameraPath(kind, turn, back or 0.0)
 
 
@@ -110,7 +109,7 @@ def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]
     Returns one of the cameras of :mod:`gsmerge.measure.fog`, and its distance, in world units, from the pivot of its
     turn.
     """
-    back, turn = CAMERAS["turned"][-1]
+    back, turn = FOG_CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
     viewmat = step_outside(middle.viewmats[0], depth, back, turn)
     return replace(middle, viewmats=viewmat[None]), (1 + back) * depth
@@ -182,7 +181,8 @@ def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
     quats[1:] *= np.where(opposite, -1, 1).cumprod()[:, None]
     rows = np.concatenate([camera_centres(cameras.viewmats), 2 * depth * quats], 1)
     steps = _lengths(np.diff(rows, axis=0))
-    return rows, np.concatenate([[True], steps > SAME * max(steps.sum(), depth)])
+    tolerance = 1e-9  # cameras count as one up to this distance, as a share of a path's length
+    return rows, np.concatenate([[True], steps > tolerance * max(steps.sum(), depth)])
 
 
 def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float) -> np.ndarray:

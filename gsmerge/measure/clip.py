@@ -38,13 +38,8 @@ MAX_VIDEO_PIXELS = 1 << 23  # per frame, a little more than 3840 x 2160; encoder
 MAX_GIF_PIXELS = 1 << 27  # of all frames together; more take over 400 MB of memory, and files too large to send
 GIF_SAMPLE = 1 << 20  # pixels from which the palette of a GIF is made
 OPENCV = "opencv-contrib-python-headless"
-FOLDER = "name a folder instead, for one picture a frame"
-SWIPE_SECONDS = 6  # time in which a line moves to both sides and back
-SWIPE_SHARE = 0.9  # share of the distance to the next line or the border that a line moves
-LINES_PER_WIDTH = 480  # width of a frame divided by the width of a line
+FOLDER_HINT = "name a folder instead, for one picture a frame"
 LINE = 32  # height of a line of text at scale 1, pixels
-MIN_SHRINK = 0.6  # least factor on the size of captions that are too wide
-SHADE, TEXT_LEVEL = 0.35, 245  # brightness of the picture behind a caption, and level of its text
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +55,8 @@ class Caption:
         height, width = self.text.shape[:2]
         box = picture[self.top : self.top + height, self.left : self.left + width]
         text = self.text[: box.shape[0], : box.shape[1]]  # a tiny frame cuts it off
-        box[:] = (SHADE * box * (1 - text) + TEXT_LEVEL * text).round()
+        shade, text_level = 0.35, 245  # brightness of the picture behind a caption, and level of its text
+        box[:] = (shade * box * (1 - text) + text_level * text).round()
 
 
 def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int) -> list[Caption]:
@@ -82,9 +78,10 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
     rows: list[tuple[str, ...]] = [(name, f"{count}, {size}") for name, count, size in texts]
     if widest(rows) > max_width:
         rows = list(texts)
-    if MIN_SHRINK * widest(rows) > 0.95 * max_width:
+    min_shrink = 0.6  # least factor on the size of captions that are too wide
+    if min_shrink * widest(rows) > 0.95 * max_width:
         rows = [(name, *count.split(), size) for name, count, size in texts]
-    scale *= min(1.0, max(MIN_SHRINK, 0.95 * max_width / widest(rows)))
+    scale *= min(1.0, max(min_shrink, 0.95 * max_width / widest(rows)))
     captions = []
     for i, (name, *others) in enumerate(rows):
         lines = [shorten_text(name, max_width, scale, thickness)]
@@ -103,8 +100,10 @@ def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[i
 
     The inner borders begin evenly spread, and move together to the right, to the left, and back.
     """
-    rounds = max(1, round(frames / fps / SWIPE_SECONDS))
-    shifts = SWIPE_SHARE * sin(2 * np.pi * rounds * np.arange(frames) / frames)
+    swipe_seconds = 6  # time in which a line moves to both sides and back
+    rounds = max(1, round(frames / fps / swipe_seconds))
+    swipe_share = 0.9  # share of the distance to the next line or the border that a line moves
+    shifts = swipe_share * sin(2 * np.pi * rounds * np.arange(frames) / frames)
     borders = (np.arange(count + 1) + shifts[:, None]) * width / count
     borders[:, 0], borders[:, -1] = 0, width
     return [list(map(int, row)) for row in borders.round()]
@@ -116,7 +115,8 @@ def draw_swipe(pictures: Sequence[Picture], borders: Sequence[int], captions: Se
     ``borders`` are one frame's row of :func:`swipe_places`.
     """
     frame = np.empty_like(pictures[0])
-    half = max(1, frame.shape[1] // (2 * LINES_PER_WIDTH))
+    lines_per_width = 480  # width of a frame divided by the width of a line
+    half = max(1, frame.shape[1] // (2 * lines_per_width))
     for picture, caption, left, right in zip(pictures, captions, borders[:-1], borders[1:], strict=True):
         caption.draw(picture)
         frame[:, left:right] = picture[:, left:right]
@@ -182,7 +182,7 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
             _write_gif(temporary, list(frames), fps)
             return "GIF"
         if str(temporary).encode(errors="ignore") != os.fsencode(temporary):
-            raise SceneError(path, "expected a folder whose name is UTF-8, as OpenCV needs it for videos", FOLDER)
+            raise SceneError(path, "expected a folder whose name is UTF-8, as OpenCV needs it for videos", FOLDER_HINT)
         even_frames = (
             np.pad(frame, [(0, side % 2) for side in frame.shape[:2]] + [(0, 0)], mode="edge") for frame in frames
         )
@@ -242,7 +242,9 @@ def _open_writer(
     os.stat(str(temporary))  # if the folder has vanished, this raises an error with the reason
     names = " and ".join(name for _, name in encoders)
     raise SceneError(
-        path, f"this OpenCV has none of the encoders {names}, so it cannot write it", f"{FOLDER}, or install {OPENCV}"
+        path,
+        f"this OpenCV has none of the encoders {names}, so it cannot write it",
+        f"{FOLDER_HINT}, or install {OPENCV}",
     )
 
 

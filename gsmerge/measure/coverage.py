@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.measure.visibility import MAX_SAMPLE_GAUSSIANS, inside_views
+from gsmerge.measure.visibility import VISIBILITY_GAUSSIANS, inside_views
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.types import Gaussians, Scene
-
-HUGE_SCALE_SHARE = 0.1  # scales above this share of the box's diagonal are huge; they show no detail
 
 
 def extents(gaussians: Gaussians) -> dict[str, Any]:
@@ -27,13 +25,14 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
     names = ("diagonal", "share_outliers", "share_floaters", "scale_median", "scale_max", "share_huge")
     if len(gaussians) == 0:
         return {"box_low": [0.0] * 3, "box_high": [0.0] * 3, **dict.fromkeys(names, 0.0)}
-    step = -(-len(gaussians) // MAX_SAMPLE_GAUSSIANS)
+    step = -(-len(gaussians) // VISIBILITY_GAUSSIANS)
     points, largest = gaussians.means[::step].astype(np.float64), gaussians.scales.max(1)
     low, high = np.percentile(points, BOX_QUANTILES, axis=0)
     diagonal = np.linalg.norm(high - low)
+    huge_scale_share = 0.1  # scales above this share of the box's diagonal are huge; they show no detail
     values = (
         diagonal, beyond_scene(points).mean(), floater_share(gaussians), np.median(largest[::step]), largest.max(),
-        (largest[::step] > HUGE_SCALE_SHARE * diagonal).mean(),
+        (largest[::step] > huge_scale_share * diagonal).mean(),
     )  # fmt: skip
     shares = {name: float(value) for name, value in zip(names, values, strict=True)}
     return {"box_low": low.tolist(), "box_high": high.tolist(), **shares}
@@ -48,7 +47,7 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
     """
     if len(scene) == 0:
         return []
-    shares = shares_inside(scene, MAX_SAMPLE_GAUSSIANS)
+    shares = shares_inside(scene, VISIBILITY_GAUSSIANS)
     pixels: list[float | None] = [None] * len(scene)
     if scene.has_own_pixels:
         grid, covered = scene.get_pixels(), scene.covered

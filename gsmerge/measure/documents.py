@@ -14,8 +14,7 @@ from typing import Any
 from gsmerge.errors import Doubt, list_doubts
 from gsmerge.version import __version__
 
-SCHEMA_VERSION = 2
-MAX_WIDTH = 10_000  # columns of a table that is not printed on a terminal
+SCHEMA_VERSION = 2  # of JSON documents; increases if a program that reads them has to change
 MIN_NAME = 12  # least width of a table's first column in a narrow terminal
 
 
@@ -86,7 +85,8 @@ def text_table(
     columns ``least``, by number and in this order, are left out. Then the first column is shortened in its middle, down
     to ``MIN_NAME``. Then other columns are left out from the last on, except the first two.
     """
-    widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (columns or MAX_WIDTH) - len(indent)
+    max_width = 10_000  # columns of a table that is not printed on a terminal
+    widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (columns or max_width) - len(indent)
     shown = list(range(len(widths)))
     for place in (*least, *reversed(shown[2:])):
         name = widths[0] if place in least else min(widths[0], MIN_NAME)

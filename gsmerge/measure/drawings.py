@@ -16,9 +16,9 @@ from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
-from gsmerge.measure.camera_path import parse_path, sample_path, viewing_depth
+from gsmerge.measure.camera_path import parse_camera_path, sample_path, viewing_depth
 from gsmerge.measure.clip import (
-    FOLDER,
+    FOLDER_HINT,
     H264,
     MAX_GIF_PIXELS,
     MAX_VIDEO_PIXELS,
@@ -43,7 +43,6 @@ from gsmerge.settings.pictures import CLIPS, GIF, PICTURES
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 
-PANEL_VIEWS = 4  # rows of a panel
 SECONDS = 4  # least duration of a clip
 VIEW_FRAMES = 4  # least number of frames for each view of a spline
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
@@ -149,7 +148,8 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     group = _read(options, photos=True)
     scene = group.load.scene
     cameras, photos, pictured = options.resize(scene.cameras), scene.images, scene.photo_views
-    ids = options.choose(scene.names, PANEL_VIEWS)
+    panel_views = 4  # rows of a panel
+    ids = options.choose(scene.names, panel_views)
     names = [re.split(r"[\\/]", scene.names[i])[-1] for i in ids]
 
     def draw(_: int) -> Iterator[Picture]:
@@ -221,7 +221,7 @@ def _check_frames(output: Path, width: int, height: int, count: int) -> None:
     """Raise SceneError if the frames of a clip would take too much memory to encode."""
     if width * height > MAX_VIDEO_PIXELS:
         problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels per frame of a video, found {width} x {height}"
-        raise SceneError(output, problem, FOLDER)
+        raise SceneError(output, problem, FOLDER_HINT)
     if output.suffix.lower() == GIF and count * width * height > MAX_GIF_PIXELS:
         problem = f"expected at most {MAX_GIF_PIXELS:,} pixels in a GIF, found {count} x {width} x {height}"
         raise SceneError(output, problem, "lower --size or --frames, or name a .mp4")
@@ -230,7 +230,7 @@ def _check_frames(output: Path, width: int, height: int, count: int) -> None:
 def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
     """Read the scenes, and make the cameras of a path; also return the near plane and the ids of its views."""
     assert options.path is not None
-    path = parse_path(options.path)
+    path = parse_camera_path(options.path)
     file = None if path else Path(options.path)
     framing = options.framing
     has_own = framing.cameras is not None or framing.images is not None or read_sharp_camera(framing.ply) is not None

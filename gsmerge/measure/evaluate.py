@@ -20,7 +20,7 @@ from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.photos.views import pick_views
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
-from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
+from gsmerge.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.input import check_scene
@@ -33,7 +33,6 @@ MENDED = (
     "the photos of the input views differ from their Gaussians, or from each other, in tone, exposure or by objects"
     " that cover them; compact mends this, but the scores here use the photos as they are"
 )
-MIN_SEEN_SHARE = 0.1  # if input views have seen less of the held-out pixels, the frames of coordinates may differ
 SPLITS = ("context", "target")  # input views, and held-out views
 INPUT = "input"  # name of the scene itself among the results
 
@@ -50,7 +49,7 @@ class Quality:
     lpips_alex: float | None = None  # at least 0, lower is closer
 
 
-Pair = tuple[Quality, Quality]  # over all pixels, and over the pixels that the input views have seen
+QualityPair = tuple[Quality, Quality]  # over all pixels, and over the pixels that the input views have seen
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class ResultScores:
     def __repr__(self) -> str:
         return f"ResultScores({self.name!r}, {self.num_gaussians:,} Gaussians, {len(self.scores)} views)"
 
-    def mean(self, split: str) -> Pair:
+    def mean(self, split: str) -> QualityPair:
         """Average the scores of a split's views.
 
         Returns the mean scores over all pixels, and over the pixels that the input views have seen. ValueError for
@@ -180,7 +179,7 @@ class _Renderer:
         Also return a mask ``[h,w]`` of the pixels in which the Gaussians have an opacity of at least a half.
         """
         drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.options.antialiased)
-        return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED)
+        return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED_TRANSMITTANCE)
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
         """Render one view ``[h,w,3]``."""
@@ -297,9 +296,10 @@ def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mend
         losses = (describe_loss(name, psnrs[INPUT], psnr, OWN_PHOTOS) for name, psnr in psnrs.items())
         yield from (Doubt(loss) for loss in losses if loss is not None)
     yield from filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog))
+    min_seen_share = 0.1  # if input views have seen less of the held-out pixels, the frames of coordinates may differ
     if "target" not in splits:
         yield "no held-out views were given; on input views, fitted results score better than on new views"
-    elif (share := splits["target"].visible.mean()) < MIN_SEEN_SHARE:
+    elif (share := splits["target"].visible.mean()) < min_seen_share:
         seen = f"the input views have seen only {100 * share:.0f} % of the held-out views"
         yield Doubt(f"{seen}, which may be of another scene or in another world")
     if photos and mended:
@@ -381,7 +381,7 @@ def _score_view(
     """Add to a score the quality of a render over all pixels, over the seen pixels, and over the ``covered`` pixels."""
     photo, seen = split.views.images[view], split.visible[view]
     share = None if covered is None else float(covered.mean())
-    inside = covered if share is not None and share < WHOLE else None
+    inside = covered if share is not None and share < WHOLE_SHARE else None
     full, masked, covered_quality = _qualities(image, photo, (None, seen, inside))
     full, masked = _add_lpips((full, masked), image, photo, seen, nets)
     score = replace(score, full=full, masked=masked)
@@ -404,7 +404,9 @@ def _qualities(image: np.ndarray, photo: np.ndarray, masks: Sequence[NDArray[np.
     return [Quality(*next(scores)) if mask is None or mask.any() else Quality() for mask in pixels]
 
 
-def _add_lpips(pair: Pair, image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]) -> Pair:
+def _add_lpips(
+    pair: QualityPair, image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]
+) -> QualityPair:
     """Add LPIPS to the qualities over all pixels, and over the pixels that the input views have seen."""
     if not nets:
         return pair

@@ -25,18 +25,18 @@ from gsmerge.types import Cameras, Gaussians
 
 VIEWS = 3  # evenly spread input views from which the cameras start
 # Steps back, as shares of the median depth of a view, and turns about the point in its middle, degrees, by kind
-CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
+FOG_CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
 ALL = "all"  # kind of all these cameras together
-SIDE = 480  # largest longer side of the pictures, pixels
-EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: the input is empty below, solid above; a result has a hole below
-MARGIN = 17  # side, in pixels, of the square that erodes empty regions
-FAR_SHARE = 0.1  # fog is far if it is farther than this share of the width from every pixel that the input shows
-VEIL = 0.7  # a result has a veil where its depth is below this share of the input's depth
+FOG_PIXELS = 480  # largest longer side of the pictures, pixels
+# Opacities: the input is empty below, solid above; a result has a hole below
+FOG_EMPTY, FOG_SOLID, FOG_OPEN = 0.05, 0.9, 0.5
+EROSION_PIXELS = 17  # side, in pixels, of the square that erodes empty regions
+VEIL_SHARE = 0.7  # a result has a veil where its depth is below this share of the input's depth
 VEILED = 0.08  # a result whose worst veil is larger gets a note
 # Spikes are Gaussians at least RATIOS times as long as their second axis, and longer (3 sigma) than the share LONG of
 # the width. They are visible where a channel changes by more than CHANGED without them
 RATIOS, LONG, CHANGED = (5.0, 3.0), 0.05, 0.05
-NEAREST = 0.25  # near plane of the depths of both scenes, as a share of the view's median depth
+FOG_NEAR_PLANE = 0.25  # near plane of the depths of both scenes, as a share of the view's median depth
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class OutsidePicture:
     """Opacities and depths of a scene in one outside camera."""
 
     opacities: np.ndarray  # [h,w]
-    beyond: np.ndarray  # [h,w] opacities without Gaussians nearer than NEAREST
-    depths: np.ndarray  # [h,w] mean camera z, without Gaussians nearer than NEAREST
+    beyond: np.ndarray  # [h,w] opacities without Gaussians nearer than FOG_NEAR_PLANE
+    depths: np.ndarray  # [h,w] mean camera z, without Gaussians nearer than FOG_NEAR_PLANE
 
 
 def measure_fog(
@@ -84,23 +84,23 @@ def measure_fog(
 ) -> dict[str, dict[str, Fog]]:
     """Measure fog, veils, holes and spikes of results, by name, from outside the ``cameras`` of a ``reference`` scene.
 
-    Returns a :class:`Fog` by name of the result and kind of camera (those of :data:`CAMERAS`, and "all"). Its figures
-    are means over the pixels of all pictures of the kind. ``near``: near plane of the pictures, in world units.
+    Returns a :class:`Fog` by name of the result and kind of camera (those of :data:`FOG_CAMERAS`, and "all"). Its
+    figures are means over the pixels of all pictures of the kind. ``near``: near plane of the pictures, in world units.
     """
     reference_splats = make_splats(reference)
     splats = {name: make_splats(result) for name, result in results.items()}
     pictures: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}  # kind of camera, and counts
-    outside = list(outside_cameras(reference, cameras))
+    outside = list(fog_cameras(reference, cameras))
     for number, (kind, camera, depth) in enumerate(outside):
         progress("views from outside", number, len(outside))
-        expected = draw_outside(reference_splats, camera, near, NEAREST * depth)
+        expected = draw_depths(reference_splats, camera, near, FOG_NEAR_PLANE * depth)
         for name in results:
-            counts = count_pixels(expected, draw_outside(splats[name], camera, near, NEAREST * depth))
+            counts = sum_pixels(expected, draw_depths(splats[name], camera, near, FOG_NEAR_PLANE * depth))
             pictures[name].append((kind, np.concatenate([counts, count_spikes(results[name], camera, near)])))
     return {
         name: {
             kind: mean_fog(np.stack([counts for picture_kind, counts in rows if kind in (picture_kind, ALL)]))
-            for kind in (*CAMERAS, ALL)
+            for kind in (*FOG_CAMERAS, ALL)
         }
         for name, rows in pictures.items()
     }
@@ -117,19 +117,19 @@ def describe_fog(name: str, fog: Fog) -> str | None:
     return f"{name}: seen from outside, the result shows {' and '.join(faults)}" if faults else None
 
 
-def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras, float]]:
+def fog_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras, float]]:
     """Yield for each outside picture its kind, its camera, and the median depth of the view where the camera starts."""
-    cameras = shrink_cameras(cameras, SIDE)
+    cameras = shrink_cameras(cameras, FOG_PIXELS)
     for view in pick_views(len(cameras), VIEWS):
         camera = cameras[[view]]
         depth = middle_depth(gaussians.means, camera)
-        for kind, moves in CAMERAS.items():
+        for kind, moves in FOG_CAMERAS.items():
             for back, turn in moves:
                 viewmat = step_outside(camera.viewmats[0], depth, back, turn)
                 yield kind, replace(camera, viewmats=viewmat[None]), depth
 
 
-def draw_outside(splats: Splats, camera: Cameras, near: float, nearest: float) -> OutsidePicture:
+def draw_depths(splats: Splats, camera: Cameras, near: float, nearest: float) -> OutsidePicture:
     """Draw opacities beyond ``near``, and opacities and depths beyond ``nearest`` (world units), in one camera."""
     views = [
         tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=plane)
@@ -139,15 +139,16 @@ def draw_outside(splats: Splats, camera: Cameras, near: float, nearest: float) -
     return OutsidePicture(1 - transmittance, 1 - transmittance_beyond, depths)
 
 
-def count_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
+def sum_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
     """Return sums over pixels, and numbers of measured pixels, ``[4,2]``: near fog, far fog, holes and veil."""
-    empty, solid = (expected.opacities < EMPTY).astype(np.uint8), expected.opacities > SOLID
-    sides = MARGIN, max(MARGIN, 2 * round(FAR_SHARE * empty.shape[1]) + 1)
+    empty, solid = (expected.opacities < FOG_EMPTY).astype(np.uint8), expected.opacities > FOG_SOLID
+    far_share = 0.1  # fog is far if it is farther than this share of the width from every pixel that the input shows
+    sides = EROSION_PIXELS, max(EROSION_PIXELS, 2 * round(far_share * empty.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
     fog = [(float(actual.opacities[mask].sum(dtype=np.float64)), float(mask.sum())) for mask in masks]
-    covered = expected.beyond > SOLID
-    veil = covered & (actual.beyond > EMPTY) & (actual.depths < VEIL * expected.depths)
-    holes = float((actual.opacities[solid] < OPEN).sum()), float(solid.sum())
+    covered = expected.beyond > FOG_SOLID
+    veil = covered & (actual.beyond > FOG_EMPTY) & (actual.depths < VEIL_SHARE * expected.depths)
+    holes = float((actual.opacities[solid] < FOG_OPEN).sum()), float(solid.sum())
     return np.array([*fog, holes, (float(veil.sum()), float(covered.sum()))])
 
 
@@ -165,7 +166,7 @@ def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarr
 
 
 def mean_fog(counts: np.ndarray) -> Fog:
-    """Divide the sums of :func:`count_pixels` and :func:`count_spikes`, ``[pictures,6,2]``, by the numbers of pixels.
+    """Divide the sums of :func:`sum_pixels` and :func:`count_spikes`, ``[pictures,6,2]``, by the numbers of pixels.
 
     Veils are divided in each picture, and then averaged.
     """

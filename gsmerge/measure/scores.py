@@ -7,29 +7,30 @@ from dataclasses import asdict, fields
 from typing import Any
 
 from gsmerge.measure.documents import csv_text, document_head, note_entries, text_table, wrap_line
-from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
+from gsmerge.measure.evaluate import Evaluation, Quality, QualityPair, ResultScores
 from gsmerge.measure.fog import ALL, Fog
-from gsmerge.raster.photos import WHOLE
+from gsmerge.raster.photos import WHOLE_SHARE
 from gsmerge.runtime.memory import human_bytes, human_share
 
 Row = Sequence[str]
-Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
+TextTable = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
 
-KINDS = {"context": "input", "target": "held-out"}  # words for the views of a split
+SPLIT_WORDS = {"context": "input", "target": "held-out"}  # words for the views of a split
 SIMPLE = ("psnr", "ssim")  # measures that are also taken over the pixels that the input covers
-COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
+SCORE_COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
-OUTSIDE = {
+OUTSIDE_COLUMNS = {
     "fog_near": "near fog", "fog_far": "far fog", "holes": "holes", "veil": "veil", "veil_worst": "worst veil",
     "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
 # Columns that a narrow terminal omits, in this order
 OMITTED_FIRST = ("bytes each", "smaller by", "ms/view", "kept")
-MASKED = "_visible"  # suffix of measures over the pixels that the input views have seen
-COVERED = "_covered"  # suffix of measures over the pixels that the input covers
+MASKED_SUFFIX = "_visible"  # suffix of measures over the pixels that the input views have seen
+COVERED_SUFFIX = "_covered"  # suffix of measures over the pixels that the input covers
 CSV_COLUMNS = (
     "schema_version", "result", "num_gaussians", "ratio", "split", "view", "visible_share",
-    *METRICS, *(name + MASKED for name in METRICS), *(name + COVERED for name in ("share", *SIMPLE)), *OUTSIDE,
+    *METRICS, *(name + MASKED_SUFFIX for name in METRICS), *(name + COVERED_SUFFIX for name in ("share", *SIMPLE)),
+    *OUTSIDE_COLUMNS,
 )  # fmt: skip
 
 
@@ -89,13 +90,13 @@ def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, An
 
 def _covered(share: float | None, quality: Quality) -> dict[str, float | None]:
     """Convert the share of covered pixels and the scores over them."""
-    return {"share" + COVERED: share} | {name + COVERED: getattr(quality, name) for name in SIMPLE}
+    return {"share" + COVERED_SUFFIX: share} | {name + COVERED_SUFFIX: getattr(quality, name) for name in SIMPLE}
 
 
-def _flat(pair: Pair) -> dict[str, float | None]:
+def _flat(pair: QualityPair) -> dict[str, float | None]:
     """Convert the scores over all and over visible pixels to one dictionary."""
     full, masked = map(asdict, pair)
-    return full | {name + MASKED: value for name, value in masked.items()}
+    return full | {name + MASKED_SUFFIX: value for name, value in masked.items()}
 
 
 def evaluation_csv(document: Mapping[str, Any]) -> str:
@@ -103,12 +104,12 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
     rows = []
     for result in document["results"]:
         shared = {"schema_version": document["schema_version"], "result": result["name"]}
-        shared |= {name: result[name] for name in ("num_gaussians", "ratio", *OUTSIDE)}
+        shared |= {name: result[name] for name in ("num_gaussians", "ratio", *OUTSIDE_COLUMNS)}
         rows += [shared | view for view in result["views"]]
     return csv_text(CSV_COLUMNS, rows)
 
 
-def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
+def evaluation_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
     """Make the text tables of an evaluation: heading, columns and rows of each."""
     results = document["results"]
     yield (
@@ -118,29 +119,29 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     )
     for split in document["num_views"]:
         yield from _quality_tables(document, split)
-    outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
+    outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE_COLUMNS)) for result in results]
     heading = "Faults seen from outside that the input does not have: shares of the picture, less is better"
-    yield heading, ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
+    yield heading, ("", *OUTSIDE_COLUMNS.values()), [row for row in outside if any(row[1:])]
 
 
-def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[Table]:
+def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[TextTable]:
     """Make the tables of the mean scores over a split's views: over seen pixels, and over covered pixels.
 
     The second has no rows if the input covers nearly all pixels.
     """
     results, count = document["results"], document["num_views"][split]
     quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"
-    views = f"{quality} of {count} {KINDS[split]} view{'s' * (count > 1)}"
+    views = f"{quality} of {count} {SPLIT_WORDS[split]} view{'s' * (count > 1)}"
     means = [(result["name"], result["mean"][split]) for result in results]
     seen = (
         f"against {document['reference']}, over the pixels that the input views have seen{_describe_options(document)}"
     )
-    yield f"{views}, {seen}", ("", *COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
+    yield f"{views}, {seen}", ("", *SCORE_COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
     input_mean = next(iter(results[0]["mean"].values()))  # over the input views, if they are measured
-    lacks_pixels = (input_mean["share" + COVERED] or 1) < WHOLE
+    lacks_pixels = (input_mean["share" + COVERED_SUFFIX] or 1) < WHOLE_SHARE
     heading = f"{views}, over the pixels that the input covers"
-    yield heading, ("", "of all", *(COLUMNS[name] for name in SIMPLE)), [
-        (name, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, SIMPLE, COVERED))
+    yield heading, ("", "of all", *(SCORE_COLUMNS[name] for name in SIMPLE)), [
+        (name, f"{100 * mean['share' + COVERED_SUFFIX]:.0f} %", *_cells(mean, SIMPLE, COVERED_SUFFIX))
         for name, mean in means if lacks_pixels
     ]  # fmt: skip
 
@@ -167,7 +168,7 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
     )
 
 
-def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED) -> Iterator[str]:
+def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED_SUFFIX) -> Iterator[str]:
     """Format the figures over visible pixels, or those with another ``suffix``; missing figures become ""."""
     for name in names:
         yield _number(score[name + suffix], 2 if name == "psnr" else 3)
@@ -178,7 +179,7 @@ def _number(value: float | None, digits: int = 3) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-def filled_tables(document: Mapping[str, Any]) -> Iterator[Table]:
+def filled_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
     """Make the tables of :func:`evaluation_tables` without empty columns and tables."""
     for heading, head, rows in evaluation_tables(document):
         filled = [i for i in range(len(head)) if i == 0 or any(row[i] for row in rows)]

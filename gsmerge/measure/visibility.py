@@ -16,10 +16,8 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
 Points = NDArray[np.float64]  # [n,3]
-_OPAQUE = 0.5  # least alpha of a pixel whose rendered depth is that of a surface
-MAX_SAMPLE_GAUSSIANS = 200_000  # largest sample on which a share is measured
+VISIBILITY_GAUSSIANS = 200_000  # largest sample on which a share is measured
 _CHUNK = 1 << 16  # points processed at a time; the first ones often show all pixels
-_DILATION = 3  # side of the square that a point marks, pixels of the input views
 
 
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
@@ -39,7 +37,8 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
     drawn = render(gaussians, camera, near=near, with_depths=True)
     assert drawn.depths is not None
     depths = drawn.depths[0, ..., 0]
-    y, x = np.nonzero(drawn.alphas[0, ..., 0] > _OPAQUE)
+    min_alpha = 0.5  # least alpha of a pixel whose rendered depth is that of a surface
+    y, x = np.nonzero(drawn.alphas[0, ..., 0] > min_alpha)
     rays = matmul(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), invert(camera.Ks[0].astype(np.float64)).T)
     pose = invert(camera.viewmats[0].astype(np.float64))
     return matmul(rays * depths[y, x, None].astype(np.float64), pose[:3, :3].T) + pose[:3, 3]
@@ -70,10 +69,11 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
 
 def _side(K: np.ndarray, sources: Cameras | None) -> int:
     """Choose the side (odd, pixels) of the square that a point marks in a view with intrinsics ``K [3,3]``."""
+    mark_side = 3  # side of the square that a point marks, pixels of the input views
     if sources is None:
-        return _DILATION
+        return mark_side
     focals = [np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64))]  # pixels
-    return max(_DILATION, 2 * round((_DILATION * float(focals[0] / median(focals[1])) - 1) / 2) + 1)
+    return max(mark_side, 2 * round((mark_side * float(focals[0] / median(focals[1])) - 1) / 2) + 1)
 
 
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:

@@ -17,7 +17,16 @@ from gsmerge.geometry.transforms import covariances, rotation_entries, rotmat_to
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
 from gsmerge.networks.corrector import Corrector
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
-from gsmerge.networks.options import CORRECTED, FEATURE, MEMBER, PART, RESIDUAL, SLOTS, WIDE, NetworkOptions
+from gsmerge.networks.options import (
+    ABSOLUTE_BOUNDS,
+    CORRECTED,
+    FEATURE,
+    MEMBER_COLUMNS,
+    PART_COLUMNS,
+    RESIDUAL,
+    SLOTS,
+    NetworkOptions,
+)
 from gsmerge.networks.tokens import (
     GroupFeatures,
     compute_group_features,
@@ -147,7 +156,9 @@ class NetworkContext(Corrector):
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
         """Make tokens of Gaussians relative to their groups; see :func:`gsmerge.networks.tokens.part_tokens`."""
-        return part_tokens(parts, ids, owners, group_features, MEMBER if isinstance(parts, Members) else PART)
+        return part_tokens(
+            parts, ids, owners, group_features, MEMBER_COLUMNS if isinstance(parts, Members) else PART_COLUMNS
+        )
 
     def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
         """Apply corrections ``[g,14]`` to Feature Gaussians."""
@@ -186,7 +197,7 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
         sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
         member_ids = ids[positions][sample.reshape(-1)]
         tokens = context.make_tokens(context.members, member_ids, np.repeat(rows, width), group_features)
-        table = tokens.reshape(*mask.shape, MEMBER)
+        table = tokens.reshape(*mask.shape, MEMBER_COLUMNS)
         return context.networks.run("encoder", table, mask, group_features.group[rows])
 
     encoded = context.run_tables(sizes, options.members, options.latent + 3, run)
@@ -265,7 +276,9 @@ def run_heads(
         outputs.append(_run_head(children, (owners[rows], ids, mask), group_features, context))
         output_rows[ids[mask]] = total + np.flatnonzero(mask)
         total += mask.size
-    return scale_outputs(concat_rows(outputs)[output_rows], WIDE if options.makes_children else options.bounds)
+    return scale_outputs(
+        concat_rows(outputs)[output_rows], ABSOLUTE_BOUNDS if options.makes_children else options.bounds
+    )
 
 
 def _split_siblings(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -295,7 +308,7 @@ def _run_head(
     def run(rows: np.ndarray, _: int) -> Any:
         owners = parents[rows]
         tokens = context.make_tokens(children, ids[rows].reshape(-1), np.repeat(owners, slots), group_features)
-        table = tokens.reshape(len(rows), slots, PART)
+        table = tokens.reshape(len(rows), slots, PART_COLUMNS)
         return context.networks.run(f"heads.{slots}", latents[owners], group_features.group[owners], table, mask[rows])
 
     outputs = context.run_tables(np.full(len(parents), slots), slots, slots * RESIDUAL, run)

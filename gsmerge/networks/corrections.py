@@ -19,9 +19,11 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, like
 
-MEAN, SIZE, ROTATION, LOGIT, COLOR, MASS = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13), 13
+# Columns of a correction
+MEAN_COLUMNS, SIZE_COLUMNS, ROTATION_COLUMNS = slice(0, 3), slice(3, 6), slice(6, 9)
+LOGIT_COLUMN, COLOR_COLUMNS, MASS_COLUMN = 9, slice(10, 13), 13  # the last is only in corrections of Feature Gaussians
 HALF = 0.5  # share of the bounds that each stage before the decoder may use
-ROWS = 8192  # rows per task
+CORRECTION_ROWS = 8192  # rows per task
 
 
 def residual_limits(bounds: Bounds) -> np.ndarray:
@@ -41,10 +43,10 @@ def move_gaussians(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarr
     columns = {name: np.array(getattr(gaussians, name), np.float32, order="C") for name in names}
 
     def move(first: int) -> None:
-        rows = slice(first, first + ROWS)
+        rows = slice(first, first + CORRECTION_ROWS)
         correct_gaussians(*(column[rows] for column in columns.values()), residuals[rows], frames, owners[rows])
 
-    parallel_map(move, range(0, len(gaussians), ROWS))
+    parallel_map(move, range(0, len(gaussians), CORRECTION_ROWS))
     return replace(gaussians, **columns)
 
 
@@ -62,9 +64,9 @@ def move_features(
     fixed = (base.quats, base.scales, frames, np.ascontiguousarray(residuals[:, :RESIDUAL]))
 
     def move(first: int) -> None:
-        rows = slice(first, first + ROWS)
+        rows = slice(first, first + CORRECTION_ROWS)
         correct_features(*(column[rows] for column in (*columns.values(), *fixed)))
 
-    parallel_map(move, range(0, len(features), ROWS))
-    columns["masses"] = (columns["masses"] * exp(residuals[:, MASS])).astype(np.float32)
+    parallel_map(move, range(0, len(features), CORRECTION_ROWS))
+    columns["masses"] = (columns["masses"] * exp(residuals[:, MASS_COLUMN])).astype(np.float32)
     return replace(features, **columns)

@@ -9,16 +9,16 @@ import numpy as np
 from gsmerge.geometry.pooling import Members
 from gsmerge.geometry.transforms import camera_distances, order_others
 from gsmerge.kernels.elementary import log
-from gsmerge.kernels.gaussians.cross_view import COLUMNS, make_tree, nearest_of_others, sum_cross_view
+from gsmerge.kernels.gaussians.cross_view import SUM_COLUMNS, make_tree, nearest_of_others, sum_cross_view
 from gsmerge.raster.tiled_view import pieces
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras
 
-NUM_STATS = COLUMNS + 1
+NUM_STATS = SUM_COLUMNS + 1
 NEAR_LOG = 0.03  # largest difference of the logarithms of two depths on the same surface
-FAR = 0.3  # larger differences of the logarithms of depths are clipped to this
-MIN_OPACITY = 1 / 255  # more transparent Gaussians show no surface
-ROWS = 8192  # points per task
+FAR_LOG = 0.3  # larger differences of the logarithms of depths are clipped to this
+MIN_SURFACE_OPACITY = 1 / 255  # more transparent Gaussians show no surface
+STATS_ROWS = 8192  # points per task
 # The search compares MAX_COMPARED points per neighbour, for at least MIN_NEIGHBORS neighbours
 MAX_COMPARED, MIN_NEIGHBORS = 64, 16
 
@@ -40,22 +40,22 @@ def cross_view_stats(
         return stats
     points, colors = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(SH_C0 * sh0[:, 0])
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    size, limits = (cameras.width, cameras.height), (SH_C0, NEAR_LOG, FAR, MIN_OPACITY)
-    sums, m = np.zeros((len(points), COLUMNS)), members
+    size, limits = (cameras.width, cameras.height), (SH_C0, NEAR_LOG, FAR_LOG, MIN_SURFACE_OPACITY)
+    sums, m = np.zeros((len(points), SUM_COLUMNS)), members
     neighbors = np.sort(order_others(camera_distances(cameras))[:, :most], 1).astype(np.int32)
 
     def add_sums(begin: int) -> None:
-        end = min(begin + ROWS, len(points))
+        end = min(begin + STATS_ROWS, len(points))
         sum_cross_view(
             points, colors, views, neighbors, viewmats, Ks, *size, m.fronts, m.means, m.opacities, m.sh0, *limits,
             begin, end, sums,
         )  # fmt: skip
 
-    parallel_map(add_sums, range(0, len(points), ROWS))
+    parallel_map(add_sums, range(0, len(points), STATS_ROWS))
     seen, same, behind, in_front, color_differences, depth_differences = sums.T
     num_seen, num_same = np.maximum(seen, 1), np.maximum(same, 1)
     shares = [same / num_seen, behind / num_seen, in_front / num_seen, color_differences / num_same]
-    stats[:, :-1] = np.stack([log(1 + seen) / 3, *shares, depth_differences / num_seen / FAR], 1)
+    stats[:, :-1] = np.stack([log(1 + seen) / 3, *shares, depth_differences / num_seen / FAR_LOG], 1)
     return stats
 
 

@@ -14,9 +14,9 @@ SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
 OUTPUTS = ("residual", "absolute")
 STARTS = ("pooled", "first")
 GEOMETRIES = ("analytic", "carried")
-PART = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
-MEMBER = PART + 6  # columns of a member: also its position in footprints and its colour
-GROUP = 19 + NUM_STATS  # columns of a whole group
+PART_COLUMNS = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
+MEMBER_COLUMNS = PART_COLUMNS + 6  # columns of a member: also its position in footprints and its colour
+GROUP_COLUMNS = 19 + NUM_STATS  # columns of a whole group
 RESIDUAL = 13  # columns of a correction, see gsmerge.networks.corrections
 FEATURE = RESIDUAL + 1  # columns of a correction of a Feature Gaussian; the last one is the mass
 CORRECTED = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # columns of Feature Gaussians that change
@@ -36,7 +36,7 @@ class Bounds(Settings):
     color: float = setting(0.25, "Change of each channel of the base colour, sRGB in [0, 1].", least=0, most=8)
 
 
-WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # bounds of absolute outputs
+ABSOLUTE_BOUNDS = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # bounds of absolute outputs
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class NetworkOptions(Settings):
     @property
     def head_numbers(self) -> tuple[int, ...]:
         """Indices of the group numbers that the heads read."""
-        return tuple(range(GROUP)) if self.group_numbers else PAPER_NUMBERS
+        return tuple(range(GROUP_COLUMNS)) if self.group_numbers else PAPER_NUMBERS
 
     @property
     def reads_children(self) -> bool:
@@ -112,22 +112,22 @@ def weight_shapes(options: NetworkOptions) -> dict[str, tuple[int, ...]]:
     width, latent = options.width, options.latent
     shapes = dict[str, tuple[int, ...]]()
     if options.encoder:
-        shapes |= _set_network("encoder.set", MEMBER, options)
+        shapes |= _set_network("encoder.set", MEMBER_COLUMNS, options)
         shapes |= {**_linear("encoder.latent", width, latent), **_linear("encoder.shift", width, 3)}
     if options.merger:
-        shapes |= _set_network("merger.set", PART + latent, options)
+        shapes |= _set_network("merger.set", PART_COLUMNS + latent, options)
         shapes |= _linear("merger.out", width, FEATURE + latent)
     if options.refiner:
-        shapes |= _mlp("refiner.embed", PART + 1 + latent, width, width)
+        shapes |= _mlp("refiner.embed", PART_COLUMNS + 1 + latent, width, width)
         for i in range(options.refine_blocks):
             shapes |= _block(f"refiner.blocks.{i}", width)
-        shapes |= {**_norm("refiner.norm", width), **_mlp("refiner.join", width + GROUP, 2 * width, width)}
+        shapes |= {**_norm("refiner.norm", width), **_mlp("refiner.join", width + GROUP_COLUMNS, 2 * width, width)}
         shapes |= _linear("refiner.out", width, FEATURE + latent)
     for slots in SLOTS:
         head = f"heads.{slots}"
         shapes |= _mlp(f"{head}.seeds", latent + len(options.head_numbers), width, slots * width)
         if options.reads_children:
-            shapes |= _linear(f"{head}.child", PART, width)
+            shapes |= _linear(f"{head}.child", PART_COLUMNS, width)
         shapes |= {**_block(f"{head}.block", width), **_norm(f"{head}.norm", width)}
         shapes |= _linear(f"{head}.out", width, RESIDUAL)
     return shapes
@@ -140,7 +140,7 @@ def _set_network(name: str, token: int, options: NetworkOptions) -> dict[str, tu
     for i in range(options.blocks):
         shapes |= _block(f"{name}.blocks.{i}", width)
     shapes |= {f"{name}.pool.seed": (1, 1, width), **_block(f"{name}.pool", width)}
-    return shapes | _mlp(f"{name}.join", width + GROUP, 2 * width, width)
+    return shapes | _mlp(f"{name}.join", width + GROUP_COLUMNS, 2 * width, width)
 
 
 def _block(name: str, width: int) -> dict[str, tuple[int, ...]]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsmerge.geometry.transforms import rotation_entries
-from gsmerge.networks.corrections import COLOR, LOGIT, MEAN, ROTATION, SIZE
+from gsmerge.networks.corrections import COLOR_COLUMNS, LOGIT_COLUMN, MEAN_COLUMNS, ROTATION_COLUMNS, SIZE_COLUMNS
 from gsmerge.types import SH_C0, Gaussians
 
 
@@ -50,12 +50,12 @@ def skew_vectors(matrices: Tensor) -> Tensor:
 def move_tensors(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> Gaussians:
     """Apply corrections ``[n,13]`` to Gaussians of tensors, in frames ``[n,3,3]`` (axes as columns, world)."""
     g = gaussians
-    odds, factor = g.opacities, torch.exp(residuals[:, LOGIT])
+    odds, factor = g.opacities, torch.exp(residuals[:, LOGIT_COLUMN])
     return replace(
         g,
-        means=g.means + rotate_vectors(frames, residuals[:, MEAN] * gaussian_sizes(g.scales)[:, None]),
-        quats=rotate_quats(rotate_vectors(frames, residuals[:, ROTATION]), g.quats),
-        scales=g.scales * torch.exp(residuals[:, SIZE]),
+        means=g.means + rotate_vectors(frames, residuals[:, MEAN_COLUMNS] * gaussian_sizes(g.scales)[:, None]),
+        quats=rotate_quats(rotate_vectors(frames, residuals[:, ROTATION_COLUMNS]), g.quats),
+        scales=g.scales * torch.exp(residuals[:, SIZE_COLUMNS]),
         opacities=(odds * factor / (1 + odds * (factor - 1))).clamp(0, 1),  # the logit plus the correction
-        sh0=g.sh0 + residuals[:, None, COLOR] / SH_C0,
+        sh0=g.sh0 + residuals[:, None, COLOR_COLUMNS] / SH_C0,
     )

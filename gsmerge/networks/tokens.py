@@ -15,11 +15,9 @@ import numpy as np
 from gsmerge.geometry.pooling import Members, feature_to_gaussians
 from gsmerge.kernels.networks.tokens import describe_groups, describe_parts, place_frames
 from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
-from gsmerge.networks.options import GROUP, MEMBER, PART
+from gsmerge.networks.options import GROUP_COLUMNS, MEMBER_COLUMNS, PART_COLUMNS
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, as_array
-
-TOKENS = 4096  # tokens of one table; their activations take a megabyte, which fits a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +30,12 @@ class GroupFeatures:
     sizes: Array  # [g] geometric mean of the two largest scales, world units
     footprints: np.ndarray  # [g] size of one pixel, world units
     views: np.ndarray  # [g] int64 view of the frame
-    group: Array  # [g,GROUP] numbers that describe the whole group
+    group: Array  # [g,GROUP_COLUMNS] numbers that describe the whole group
 
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
     """Compute the networks' inputs for Feature Gaussians."""
-    views = choose_views(features, members, cameras)
+    views = choose_token_views(features, members, cameras)
     stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
     return describe_features(features, views, np.diff(features.starts), stats, cameras)
 
@@ -50,21 +48,21 @@ def describe_features(
     ``views [g]`` is the view of each Feature Gaussian, ``num_members [g]`` its number of members, and ``stats [g,7]``
     its agreement with other views.
     """
-    bare = make_group_features(features, views, np.zeros((len(features), GROUP), np.float32), cameras)
-    base, group = bare.base, np.empty((len(features), GROUP), np.float32)
+    bare = make_group_features(features, views, np.zeros((len(features), GROUP_COLUMNS), np.float32), cameras)
+    base, group = bare.base, np.empty((len(features), GROUP_COLUMNS), np.float32)
     sums = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
     describe_groups(
         base.means, base.scales, base.opacities, base.sh0, *sums, num_members, bare.footprints,
         bare.frames, bare.sizes, _viewmats(cameras), views, group,
     )  # fmt: skip
-    group[:, GROUP - NUM_STATS :] = np.nan_to_num(stats)
+    group[:, GROUP_COLUMNS - NUM_STATS :] = np.nan_to_num(stats)
     return replace(bare, group=group)
 
 
 def make_group_features(
     features: FeatureGaussians, views: np.ndarray, group: np.ndarray, cameras: Cameras
 ) -> GroupFeatures:
-    """Assemble the networks' inputs from known ``views [g]`` and numbers ``group [g,GROUP]``."""
+    """Assemble the networks' inputs from known ``views [g]`` and numbers ``group [g,GROUP_COLUMNS]``."""
     base = contiguous(feature_to_gaussians(features))
     frames, sizes = np.empty((len(features), 3, 3), np.float32), np.empty(len(features), np.float32)
     place_frames(base.means, base.scales, _viewmats(cameras), views, frames, sizes)
@@ -85,7 +83,7 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
     return np.ascontiguousarray(as_array(cameras.viewmats), np.float64)
 
 
-def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
+def choose_token_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
     """Choose a view ``[g]`` int64 for each Feature Gaussian: its own, or after merging the view of most opacity."""
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)
@@ -101,17 +99,21 @@ def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras)
 
 
 def part_tokens(
-    parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures, columns: int = PART
+    parts: Gaussians | Members,
+    ids: np.ndarray,
+    owners: np.ndarray,
+    group_features: GroupFeatures,
+    columns: int = PART_COLUMNS,
 ) -> np.ndarray:
     """Make tokens that describe the Gaussians ``ids [n]`` relative to their groups ``owners [n]``.
 
-    Returns ``[n,columns]``. The first PART columns are written for all Gaussians, the others up to MEMBER only for
-    members.
+    Returns ``[n,columns]``. The first PART_COLUMNS columns are written for all Gaussians, the others up to
+    MEMBER_COLUMNS only for members.
     """
     g, out = group_features, np.zeros((len(ids), columns), np.float32)
     describe_parts(
         parts.means, parts.quats, parts.scales, parts.opacities, parts.sh0, g.base.means, g.base.sh0, g.frames,
-        g.sizes, g.footprints, ids.astype(np.int64, copy=False), owners, columns == MEMBER, out,
+        g.sizes, g.footprints, ids.astype(np.int64, copy=False), owners, columns == MEMBER_COLUMNS, out,
     )  # fmt: skip
     return out
 
@@ -123,9 +125,10 @@ def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray
     """
     bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # exponents of the next power of two
     widths = np.minimum(1 << bits, max_width)
+    max_tokens = 4096  # tokens of one table; their activations take a megabyte, which fits a processor's cache
     for width in np.unique(widths):
         rows = np.flatnonzero(widths == width)
-        step = max(1, TOKENS // int(width))
+        step = max(1, max_tokens // int(width))
         for start in range(0, len(rows), step):
             yield rows[start : start + step], int(width)
 

@@ -14,7 +14,17 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gsmerge.kernels.networks.layers import GELU, PLAIN, TANH, attend, dense, normalise, pack, padded, scratch_size
+from gsmerge.kernels.networks.layers import (
+    GELU,
+    PLAIN,
+    TANH,
+    attend,
+    dense,
+    normalise,
+    pack_weights,
+    padded,
+    scratch_size,
+)
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.values.arrays import Array
 
@@ -166,4 +176,4 @@ class NetworkWeights:
             wide = np.zeros((width, heads * padded(size)), np.float32)
             wide[:, padded_columns] = weight
             weight = wide
-        return *pack(weight, bias), len(bias)
+        return *pack_weights(weight, bias), len(bias)

@@ -16,19 +16,18 @@ from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Quality, ResultScores, evaluate
 from gsmerge.measure.lpips import lpips_available
-from gsmerge.measure.preview import OUTSIDE, Picture, to_picture
+from gsmerge.measure.preview import OUTSIDE_VIEW, Picture, to_picture
 from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.photos.views import even_views
 from gsmerge.raster import render
 from gsmerge.raster.metrics import is_worse
-from gsmerge.raster.photos import NEAR_PLANE, WHOLE
+from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s
-MAX_VIEWS = 32  # of more views, only so many at equal intervals are shown; each takes up to 300 kB
-WEBP_QUALITY = 90  # stills of this quality score within 1 dB of lossless stills
+MAX_SHOWN_VIEWS = 32  # of more views, only so many at equal intervals are shown; each takes up to 300 kB
 SplitViews = tuple[Cameras, np.ndarray, Sequence[str]]  # cameras in the world, photos and names of a split
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
 
@@ -107,7 +106,7 @@ class ViewData:
         return any(view.held_out for view in self.views)
 
 
-def collect(
+def collect_page_data(
     title: str,
     scene: Scene,
     results: Mapping[str, Gaussians],
@@ -151,7 +150,7 @@ def _collect(
     *,
     light: bool,
 ) -> ViewData:
-    """Make the content of a page from an evaluation and its stills; see :func:`collect`."""
+    """Make the content of a page from an evaluation and its stills; see :func:`collect_page_data`."""
     pictures = photo_array(evaluation.pictures)
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
@@ -172,7 +171,7 @@ def _collect(
     measured_notes = evaluation.notes if results else ()  # they concern results
     notes = (*measured_notes, *_limits(sides, len(shown), len(views)))
     covered_share, _ = evaluation.results[0].mean_covered("context")
-    lacks_pixels = covered_share is not None and covered_share < WHOLE
+    lacks_pixels = covered_share is not None and covered_share < WHOLE_SHARE
     agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
     return ViewData(
         title, tuple(sides), shown, outside, len(views), evaluation.reference, notes,
@@ -223,7 +222,7 @@ def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, pl
     camera, distance = outside_camera(scene.cameras.numpy(), named[INPUT].means)
     renders = (render(gaussians, camera, near=NEAR_PLANE * frame.unit) for gaussians in named.values())
     return PageView(
-        name=OUTSIDE,
+        name=OUTSIDE_VIEW,
         place=place,
         held_out=False,
         camera=frame.enter_cameras(camera),
@@ -243,7 +242,8 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 def encode_still(picture: Picture) -> bytes:
     """Encode a picture as WebP."""
-    return encode_picture(picture, WEBP_QUALITY)
+    webp_quality = 90  # stills of this quality score within 1 dB of lossless stills
+    return encode_picture(picture, webp_quality)
 
 
 def _pack(
@@ -284,13 +284,13 @@ def _side(
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
-    """Choose at most ``MAX_VIEWS`` views and the worst view, sorted by the scores of the first result, worst first."""
+    """Choose at most ``MAX_SHOWN_VIEWS`` views and the worst view, by the scores of the first result, worst first."""
 
     def quality(view: PageView) -> float:
         score = view.scores[:2][-1].psnr
         return np.inf if score is None else score
 
-    ids = set(even_views(len(views), min(len(views), MAX_VIEWS)))
+    ids = set(even_views(len(views), min(len(views), MAX_SHOWN_VIEWS)))
     ids.add(min(range(len(views)), key=lambda i: quality(views[i])))
     return tuple(sorted((views[i] for i in sorted(ids)), key=quality))
 

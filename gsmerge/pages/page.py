@@ -24,13 +24,12 @@ if TYPE_CHECKING:
     import jinja2
 
 # Content security policy: a page may run only its own scripts and styles, which the policy names by their hashes
-PICTURES = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
+PICTURES_POLICY = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
 # Spark decodes in WebAssembly and sorts in a worker; its text contains both as data: addresses
-SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
-POLICY = "{policy}"  # placeholder in the templates until the hashes are known
+SOLID_POLICY = f"{PICTURES_POLICY} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
+POLICY_MARK = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
-NONE = "-"  # replaces a missing figure
-FASTER = 1.2  # the headline mentions a ratio of drawing times from this value on
+MISSING = "-"  # replaces a missing figure
 
 
 def view_page(data: ViewData) -> bytes:
@@ -52,7 +51,7 @@ def view_page(data: ViewData) -> bytes:
     own = reference_words(data)[1]
     page = render_template(
         "view.html",
-        policy=SOLID,
+        policy=SOLID_POLICY,
         data=data,
         results=results,
         table=results_table(data),
@@ -152,7 +151,8 @@ def speed(data: ViewData, place: int = 1) -> float | None:
 
 def speed_words(ratio: float | None) -> str:
     """Return the end of the headline, rounded to one digit from 3 on; "" if a result is not clearly faster."""
-    if ratio is None or ratio < FASTER:
+    min_ratio = 1.2  # the headline mentions a ratio of drawing times from this value on
+    if ratio is None or ratio < min_ratio:
         return ""
     times = f"about {float(f'{ratio:.1g}'):.0f}" if ratio >= 3 else f"{ratio:.1f}"
     return f", {times}\u00a0\u00d7\u00a0faster to draw"
@@ -163,7 +163,7 @@ def size_words(data: ViewData, place: int) -> str:
     side = data.sides[place]
     share = human_share(side.num_gaussians / max(data.sides[0].num_gaussians, 1), 1)
     quality = _number(side.mean.psnr, 1)
-    words = [share, human_bytes(side.file_bytes), *([f"{quality} dB"] if quality != NONE else [])]
+    words = [share, human_bytes(side.file_bytes), *([f"{quality} dB"] if quality != MISSING else [])]
     return _unbroken(" · ".join(words))
 
 
@@ -198,7 +198,7 @@ def figures(data: ViewData, place: int) -> list[Figure]:
             scores.append(_score_figure(label, name, old, new, own=own, is_result=place > 0))
     if is_expected:
         gain = after.new_gain
-        words = NONE if gain is None else "{:+.1f} to {:+.1f} dB".format(*gain)
+        words = MISSING if gain is None else "{:+.1f} to {:+.1f} dB".format(*gain)
         sizes.append(Figure("New views, expected", "", words, "up" if gain is not None and gain[0] > 0 else ""))
     return sizes + (scores if data.scored else [])
 
@@ -230,7 +230,7 @@ def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:
     columns["Share"] = [human_share(side.num_gaussians / max(first.num_gaussians, 1), 1) for side in data.sides]
     if data.lacks_pixels:
         columns["PSNR, covered"] = [_number(side.covered.psnr, 2) for side in data.sides]
-    filled = {head: cells for head, cells in columns.items() if set(cells) != {NONE}}
+    filled = {head: cells for head, cells in columns.items() if set(cells) != {MISSING}}
     return list(filled), [list(row) for row in zip(*filled.values(), strict=True)]
 
 
@@ -240,8 +240,8 @@ def _unbroken(text: str) -> str:
 
 
 def _number(value: float | None, digits: int) -> str:
-    """Format a number; a missing number and the infinite PSNR of equal pictures become ``NONE``."""
-    return NONE if value is None or value == float("inf") else f"{value:.{digits}f}"
+    """Format a number; a missing number and the infinite PSNR of equal pictures become ``MISSING``."""
+    return MISSING if value is None or value == float("inf") else f"{value:.{digits}f}"
 
 
 def _view(view: PageView) -> dict[str, Any]:
@@ -250,12 +250,12 @@ def _view(view: PageView) -> dict[str, Any]:
         "name": view.name,
         "held_out": view.held_out,
         "outside": view.outside,
-        **camera_numbers(view.camera, view.distance),
+        **page_camera(view.camera, view.distance),
         "scores": [[_finite(score.psnr), _finite(score.ssim), _finite(score.lpips_alex)] for score in view.scores],
     }
 
 
-def camera_numbers(camera: Cameras, distance: float) -> dict[str, Any]:
+def page_camera(camera: Cameras, distance: float) -> dict[str, Any]:
     """Convert a camera for a page's script: row-major world to camera, intrinsics in pixels, distance of the scene."""
     return {
         "viewmat": camera.viewmats[0].reshape(-1).tolist(),
@@ -290,7 +290,7 @@ def render_template(name: str, policy: str, **values: Any) -> str:
     text = _environment().get_template(name).render(version=__version__, **values)
     text = text.encode("utf-8", "replace").decode("utf-8")  # names of files may have lone surrogates
     hashes = {kind: " ".join(_hashes(text, kind)) for kind in ("script", "style")}
-    return text.replace(POLICY, html.escape(policy.format(**hashes)), 1)
+    return text.replace(POLICY_MARK, html.escape(policy.format(**hashes)), 1)
 
 
 def _hashes(page: str, kind: str) -> list[str]:

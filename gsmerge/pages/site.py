@@ -15,20 +15,18 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
-from gsmerge.pages.page import VIEWER, base64_text, camera_numbers, data_uri, describe_gain, render_template
+from gsmerge.pages.page import VIEWER, base64_text, data_uri, describe_gain, page_camera, render_template
 from gsmerge.photos.views import even_views
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
 # Only its own scripts; Spark has data: addresses and a worker in its text
-POLICY = (
+SITE_POLICY = (
     "default-src 'none'; img-src data:; style-src {style}; script-src {script} blob: 'wasm-unsafe-eval';"
     " worker-src data: blob:; connect-src data: blob:"
 )
 NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}
-MAX_VIEWS = 64  # largest number of viewpoints in the page
-REST = 43_000  # least bytes of a page without viewer: scripts, licences, and picture and textures of one Gaussian
-LONGEST_TITLE = 255  # bytes; a title is a file name
+MAX_VIEWPOINTS = 64  # largest number of viewpoints in the page
 LICENSED = ("spark", "three", "fflate")
 
 
@@ -40,12 +38,15 @@ def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> 
 
 def least_bytes() -> int:
     """Return the least number of bytes of a page without its Gaussians: the viewer as text, and the rest."""
-    return int(4 / 3 * VIEWER.stat().st_size) + REST
+    # Least bytes of a page without viewer: scripts, licences, and picture and textures of one Gaussian
+    page_bytes = 43_000
+    return int(4 / 3 * VIEWER.stat().st_size) + page_bytes
 
 
 def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
     """Return the largest number of bytes that a page takes with any title."""
-    return len(make_page(gaussians, cameras, "x" * LONGEST_TITLE, comments).encode())
+    longest_title = 255  # bytes; a title is a file name
+    return len(make_page(gaussians, cameras, "x" * longest_title, comments).encode())
 
 
 def _read_licences() -> bytes:
@@ -62,10 +63,10 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
     viewpoints = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
     start = 0 if is_free else median_camera(viewpoints)  # the first placed viewpoint is outside
     poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
-    views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWS)), start})
+    views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWPOINTS)), start})
     inside = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, comments)}
     return render_template(
-        "site.html", policy=POLICY, title=title, count=len(gaussians), names=NAMES,
+        "site.html", policy=SITE_POLICY, title=title, count=len(gaussians), names=NAMES,
         poster=data_uri(poster, "image/webp"), licences=data_uri(_read_licences(), "text/plain"),
         inside={NAMES[name]: base64_text(content) for name, content in inside.items()},
         gain=None if expected is None else describe_gain(*expected.bounds),
@@ -73,7 +74,7 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
         json_data={
             "names": NAMES, "free": is_free, "start": views.index(start),
             "views": [
-                camera_numbers(viewpoints[[view]], middle_depth(gaussians.means, viewpoints[[view]])) for view in views
+                page_camera(viewpoints[[view]], middle_depth(gaussians.means, viewpoints[[view]])) for view in views
             ],
         },
     )  # fmt: skip

@@ -16,9 +16,7 @@ from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.types import SH_C0, Cameras, Gaussians
 
 MAX_GAUSSIANS = 2_000_000  # larger scenes have only stills, since a page gets too large and loads too slowly
-ROW_BYTES = 20  # bytes of a Gaussian in a .spz, besides one for each harmonic
 MAX_SPZ_BYTES = 40_000_000  # before compression; enough for 2 million Gaussians without harmonics
-FINE = 11  # bits of a position within the scene; browsers keep 10 bits and the sign
 COARSE_COUNT = 300_000  # more Gaussians are as small as pixels and may be less exact
 # Step sizes of the numbers of a .spz (opacity, colour, logarithm of the scale), and levels of half a turn's rotation.
 # With COARSE, pictures are at 50 dB from pictures of the exact scene
@@ -43,11 +41,13 @@ def pack_splats(
     if count > MAX_GAUSSIANS:
         return None, 0
     highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREE)
-    fitting = (d for d in range(highest + 1) if (ROW_BYTES + _num_harmonics(d)) * count <= MAX_SPZ_BYTES)
+    row_bytes = 20  # bytes of a Gaussian in a .spz, besides one for each harmonic
+    fitting = (d for d in range(highest + 1) if (row_bytes + _num_harmonics(d)) * count <= MAX_SPZ_BYTES)
     degree = max(fitting, default=0)
     steps, levels = COARSE if count > COARSE_COUNT else EXACT
     drawn = means.take(rows, 0)
-    fraction = spz.choose_fraction(drawn, FINE)
+    position_bits = 11  # bits of a position within the scene; browsers keep 10 bits and the sign
+    fraction = spz.choose_fraction(drawn, position_bits)
     head: dict[str, Any] = {"count": count, "degree": degree, "fraction": fraction}
     positions = None
     if cameras is not None and homes is not None and (homes >= 0).all():

@@ -19,7 +19,7 @@ from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.read import GaussianFile, read_gaussians
 from gsmerge.io.scene_files import find_scene_files, scene_title
-from gsmerge.pages.data import collect
+from gsmerge.pages.data import collect_page_data
 from gsmerge.pages.page import headline, view_page
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
@@ -27,8 +27,7 @@ from gsmerge.scene.input import as_scene
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
 from gsmerge.values.arguments import check_arguments
 
-MAX_SOLID = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
-HEIGHT = 820  # height of a page in a notebook, pixels
+NOTEBOOK_HEIGHT = 820  # height of a page in a notebook, pixels
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,7 +41,7 @@ class Page:
         return f"Page({self.headline}, {human_bytes(len(self.text))})"
 
     def _repr_html_(self) -> str:
-        style = f"width: 100%; height: {HEIGHT}px; border: 0"
+        style = f"width: 100%; height: {NOTEBOOK_HEIGHT}px; border: 0"
         return f'<iframe srcdoc="{html.escape(self.text)}" style="{style}" allowfullscreen></iframe>'
 
     @check_arguments
@@ -113,8 +112,9 @@ def view(
         for name, result in named.items()
         if (moved := getattr(result, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
     }
-    is_light = len(read.gaussians) > MAX_SOLID if light is None else light
-    data = collect(
+    max_solid = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
+    is_light = len(read.gaussians) > max_solid if light is None else light
+    data = collect_page_data(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
         [_num_bytes(scene), *(_num_bytes(result) for result in loaded.values())], held_out,
         cameras=cameras, new_gains=gains, light=is_light, progress=progress or (lambda *_: None),

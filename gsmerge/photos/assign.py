@@ -23,17 +23,14 @@ import numpy as np
 
 from gsmerge.geometry.transforms import median
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.photos.offsets import NEAR_PIXELS, SIDE, TOLERANCE, PhotoOffsets, find_offsets
+from gsmerge.photos.offsets import NEAR_PIXELS, OFFSET_PIXELS, ZERO_OFFSET, PhotoOffsets, find_offsets
 from gsmerge.photos.pictures import ViewPictures
-from gsmerge.photos.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
+from gsmerge.photos.scores import NOISE_MARGIN, SCORE_PIXELS, Comparer, fisher_z, measure_noise
 from gsmerge.runtime.threads import parallel_map
 
 SIGNIFICANT = 2.0  # standard deviations of noise; smaller scores and smaller differences of scores count as noise
-MAX_COMPARED = 4  # photos with the highest scores that are compared with a view part by part
 MIN_EXPLAINED = 0.5  # share of the variance of a view that a photo explains; above it, the photo matches the view
 MIN_CONTRAST = 1 / 255  # root mean square, the rounding of 8 bits; pictures with less contrast cannot be compared
-IMPOSSIBLE = 1e6  # cost of a pair whose shapes differ
-MIN_PER_TASK, MAX_TASKS = 8, 16  # photos per task, and number of tasks; each task reads the pictures of all views
 FIRST_PHOTOS = 256  # evenly spaced photos of a film that are compared first; their best neighbourhoods come next
 
 
@@ -48,7 +45,8 @@ class Assignment(NamedTuple):
 class Candidates:
     """Photos that may show the views of a scene."""
 
-    read: Callable[[int], np.ndarray]  # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to SIDE pixels
+    # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to OFFSET_PIXELS pixels
+    read: Callable[[int], np.ndarray]
     count: int
     tag: Callable[[int], int]  # photo -> orientation in its EXIF tag, 0 to 7
 
@@ -90,7 +88,7 @@ class Assigner:
     """
 
     def __init__(self, show: Callable[[int], ViewPictures], candidates: Candidates) -> None:
-        small = show(SIZES[-1])
+        small = show(SCORE_PIXELS[-1])
         self.candidates, self._show = candidates, show
         self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
         self._offsets = dict[tuple[int, Assignment], PhotoOffsets | None]()
@@ -99,13 +97,15 @@ class Assigner:
     @cached_property
     def shown(self) -> ViewPictures:
         """Pictures of the views, large enough to search for parts."""
-        return self._show(SIDE)
+        return self._show(OFFSET_PIXELS)
 
     def score(self, photos: Iterable[int]) -> _Scores:
         """Compare photos with all views."""
         ids = tuple(dict.fromkeys(photos))
         new = [photo for photo in ids if photo not in self._correlations]
-        task_size = max(MIN_PER_TASK, -(-len(new) // MAX_TASKS))
+        # Photos per task, and number of tasks; each task reads the pictures of all views
+        min_per_task, max_tasks = 8, 16
+        task_size = max(min_per_task, -(-len(new) // max_tasks))
 
         def compare(start: int) -> np.ndarray:
             return self._comparer.correlate([self.candidates.read(photo) for photo in new[start : start + task_size]])
@@ -150,7 +150,7 @@ class Assigner:
             [np.zeros(0), *(view_offsets.distances for view_offsets in other_offsets if view_offsets)]
         )
         threshold = 2 * float(np.median(distances)) if len(distances) else 0.0
-        return replace(offsets, tolerance=TOLERANCE + min(threshold, NEAR_PIXELS)).verdict is False
+        return replace(offsets, tolerance=ZERO_OFFSET + min(threshold, NEAR_PIXELS)).verdict is False
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
         """Check the photos that names or their order propose for views.
@@ -186,7 +186,7 @@ class Assigner:
             correlation = scores.correlations[view, columns[row], assignment.orientation]
             matches = score > least or correlation**2 > MIN_EXPLAINED
             matches = matches and score > highest - SIGNIFICANT
-            is_clear = score > MARGIN and score >= highest
+            is_clear = score > NOISE_MARGIN and score >= highest
             if is_clear and exact:
                 out[view], confirmed[view] = assignment, True
             elif matches or (not self.has_contrast[view] and scores.fits(assignment)):
@@ -233,7 +233,7 @@ class Assigner:
             if similarity is not None:
                 return similarity
             score = scores.of(*pair)
-            return 1 - MARGIN / score if score > MARGIN else 0.0  # always below the similarity of parts
+            return 1 - NOISE_MARGIN / score if score > NOISE_MARGIN else 0.0  # always below the similarity of parts
 
         return _choose(pairs, parallel_map(compare, pairs))
 
@@ -246,10 +246,11 @@ class Assigner:
             return {}
         step, tag = -(-len(photos) // FIRST_PHOTOS), self.candidates.tag
         compared = set(range(0, len(photos), step))  # indices into ``photos``
+        max_compared = 4  # photos with the highest scores that are compared with a view part by part
         while True:
             scores = self.score(photos[index] for index in sorted(compared))
             best = scores.best()
-            columns = {view: np.argsort(-best[view], kind="stable")[:MAX_COMPARED] for view in views}
+            columns = {view: np.argsort(-best[view], kind="stable")[:max_compared] for view in views}
             peaks = {photos.index(scores.photos[column]) for ids in columns.values() for column in ids}
             neighbours = {peak + offset for peak in peaks for offset in range(1 - step, step)}
             neighbours &= set(range(len(photos)))
@@ -332,6 +333,7 @@ def _match(scores: np.ndarray) -> np.ndarray:
         return np.asarray(best)
     from scipy.optimize import linear_sum_assignment  # here because it takes long to load
 
-    rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, IMPOSSIBLE))
+    impossible_cost = 1e6  # cost of a pair whose shapes differ
+    rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, impossible_cost))
     out[rows] = columns
     return out

@@ -21,13 +21,13 @@ from gsmerge.photos.scores import stands_out
 from gsmerge.runtime.threads import parallel_map
 
 BLOCKS = 12  # along the longer side
-SOLID = 0.2  # least opacity of a block that is compared; fainter blocks show only a few Gaussians
-LEVELS = 33  # number of quantiles of a tone curve
-STEP = 0.05  # change of middle grey by a third of a stop, the smallest exposure step of cameras
+SOLID_BLOCK = 0.2  # least opacity of a block that is compared; fainter blocks show only a few Gaussians
+TONE_LEVELS = 33  # number of quantiles of a tone curve
+EXPOSURE_STEP = 0.05  # change of middle grey by a third of a stop, the smallest exposure step of cameras
 VISIBLE = 0.01  # root mean square of differences that are just visible on plain surfaces
-RIDGE = 1e-6  # ridge of the least squares, relative to the mean square of colours; keeps maps of grey photos finite
-Change = Callable[[np.ndarray], np.ndarray]  # maps colours [...,3]
-Fit = Callable[[np.ndarray, np.ndarray, np.ndarray], Change]  # from colours [n,3] to targets [n,3], weights [n]
+ChangeColors = Callable[[np.ndarray], np.ndarray]  # maps colours [...,3]
+# From colours [n,3] to targets [n,3], weights [n]
+FitColors = Callable[[np.ndarray, np.ndarray, np.ndarray], ChangeColors]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ def _sum_squares(errors: np.ndarray) -> float:
 def cut_blocks(pairs: Pairs) -> Blocks:
     """Average photos and pictures over blocks."""
     small = pairs.shrink(BLOCKS)
-    return Blocks(small.photos, small.shown.pictures, small.shown.weights > SOLID)
+    return Blocks(small.photos, small.shown.pictures, small.shown.weights > SOLID_BLOCK)
 
 
 def fit_tones(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -88,7 +88,8 @@ def fit_map(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.
     """Fit the linear map ``[4,3]`` of colours to targets by least squares; its last row is a constant."""
     columns = np.concatenate([colors, np.ones((len(colors), 1))], 1).astype(np.float64)
     weighted = columns * weights[:, None]
-    normal = matmul(weighted.T, columns) + RIDGE * len(colors) * np.eye(4)
+    ridge = 1e-6  # ridge of the least squares, relative to the mean square of colours; keeps maps of grey photos finite
+    normal = matmul(weighted.T, columns) + ridge * len(colors) * np.eye(4)
     return solve(normal, matmul(weighted.T, targets.astype(np.float64)))
 
 
@@ -140,12 +141,12 @@ def plain_blocks(blocks: Blocks) -> Blocks:
     return Blocks(plain, blocks.pictures, blocks.solid)
 
 
-def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:
+def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> ChangeColors:
     mean = (targets * weights[:, None]).sum(0, dtype=np.float64) / max(float(weights.sum(dtype=np.float64)), 1e-9)
     return partial(np.full_like, fill_value=mean)
 
 
-def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: Fit) -> np.ndarray:
+def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: FitColors) -> np.ndarray:
     """Change photos ``[v,h,w,3]`` by two-fold cross-fitting.
 
     Each half of the blocks is changed by the fit to the other half.
@@ -178,4 +179,4 @@ def _weigh_quantiles(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     order = np.argsort(values, kind="stable")
     sums = np.cumsum(weights[order], dtype=np.float64)
     shares = (sums - weights[order] / 2) / sums[-1]
-    return np.interp((np.arange(LEVELS) + 0.5) / LEVELS, shares, values[order].astype(np.float64))
+    return np.interp((np.arange(TONE_LEVELS) + 0.5) / TONE_LEVELS, shares, values[order].astype(np.float64))

@@ -18,7 +18,7 @@ from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels.pictures import convolve
 from gsmerge.photos.assign import Assigner, Candidates
 from gsmerge.photos.colors import (
-    STEP,
+    EXPOSURE_STEP,
     VISIBLE,
     cut_blocks,
     explains,
@@ -33,7 +33,7 @@ from gsmerge.photos.colors import (
     vary_in_hue,
 )
 from gsmerge.photos.photo_change import PhotoChange, change_large
-from gsmerge.photos.pictures import SIDE, Pairs, ViewPictures, draw_views, pair_photos, show_views
+from gsmerge.photos.pictures import PICTURE_PIXELS, Pairs, ViewPictures, draw_canonical, pair_photos, show_views
 from gsmerge.photos.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.photos.scores import stands_out
 from gsmerge.photos.views import camera_kinds
@@ -46,13 +46,10 @@ from gsmerge.types import PicturedScene
 
 # Signed differences of single pixels are averaged over 5 x 5 pixels. Then a blur of 1.5 pixels, as by models, makes
 # 0.5 % of the pixels differ by a step.
-WINDOW = np.full(5, 1 / 5, np.float32)
+MEAN_WINDOW = np.full(5, 1 / 5, np.float32)
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
-FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
-HUE_SAMPLE = 2_000  # approximate number of pixels of a photo whose hues are compared, if it has as many
-GREY = 0.25  # of the variation of the Gaussians' hues; photos whose hues vary less are grey
-MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
-LEAST_PERCENT = 1  # of a photo; no note says that less of it differs
+COMPARED_OPACITY = 0.05  # opacity below which a pixel's Gaussian is not compared
+GREY_VARIATION = 0.25  # of the variation of the Gaussians' hues; photos whose hues vary less are grey
 STRAY_PHOTOS = "do not show what the Gaussians show"  # said of photos that are not used
 
 
@@ -111,7 +108,7 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
     for group in groups:
         before = stored.errors(group)
         if explains(before, toned.errors(group)) and stands_out(before - back.errors(group)):
-            is_clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > STEP)
+            is_clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > EXPOSURE_STEP)
             colors, targets = (images[group].reshape(-1, 3) for images in (pairs.photos, pairs.shown.pictures))
             curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
             for view in group:
@@ -121,12 +118,13 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
 
 def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
     """Find the ``views`` whose photos have no hues while their Gaussians have; return the share that photos have."""
-    shares, step = dict[int, float](), 1 + pairs.photos[0].size // (3 * HUE_SAMPLE)
+    hue_sample = 2_000  # approximate number of pixels of a photo whose hues are compared, if it has as many
+    shares, step = dict[int, float](), 1 + pairs.photos[0].size // (3 * hue_sample)
     for view in views:
         weights = pairs.shown.weights[view].reshape(-1)[::step]
         photo, shown = (images[view].reshape(-1, 3)[::step] for images in (pairs.photos, pairs.shown.pictures))
         hues, shown_hues = (vary_in_hue(colors, weights) for colors in (photo, shown))
-        if hues < min(VISIBLE, GREY * shown_hues) and shown_hues > VISIBLE and photo.std() > VISIBLE:
+        if hues < min(VISIBLE, GREY_VARIATION * shown_hues) and shown_hues > VISIBLE and photo.std() > VISIBLE:
             shares[view] = hues / shown_hues
     return shares
 
@@ -137,7 +135,7 @@ def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedSc
     if scene.has_own_pixels:
         colors = row_pictures(scene)[views]
     else:
-        colors = draw_views(scene.gaussians, scene.cameras[views], max(scene.images.shape[1:3])).pictures
+        colors = draw_canonical(scene.gaussians, scene.cameras[views], max(scene.images.shape[1:3])).pictures
     for view, picture in zip(views, colors, strict=True):
         changes[view] = PhotoChange(cover=np.full(picture.shape[:2], True), colors=picture, bright=False)
     note(
@@ -154,7 +152,7 @@ def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
     If depth is wrong, wrong Gaussians in front may set the tone of a drawing. The base colours of all Gaussians come
     from the photos, even if other Gaussians hide them in drawings. So they show whether the tone really differs.
     """
-    solid = np.flatnonzero(scene.gaussians.opacities > FAINT)
+    solid = np.flatnonzero(scene.gaussians.opacities > COMPARED_OPACITY)
     step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
     counting = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     levels = np.concatenate([scene.images[view][counting[view]][::step] for view in views])
@@ -163,7 +161,7 @@ def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
     rows = solid[np.linspace(0, len(solid) - 1, len(levels)).astype(np.int64)]
     colors = sh0_to_rgb(scene.gaussians.sh0[rows, 0]).clip(0, 1)
     curve = fit_tones(levels, colors, np.ones(len(levels), np.float32))
-    return bool(np.median(np.abs(map_tones(curve, levels) - levels).mean(1)) > STEP)
+    return bool(np.median(np.abs(map_tones(curve, levels) - levels).mean(1)) > EXPOSURE_STEP)
 
 
 def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
@@ -187,7 +185,7 @@ def find_matching_views(
     candidates = Candidates(lambda photo: photos[ids[photo]], len(ids), lambda _: 0)
 
     def show(side: int) -> ViewPictures:
-        return (shown.shrink(side) if shown.drawn and side <= SIDE else show_views(scene, side))[ids]
+        return (shown.shrink(side) if shown.drawn and side <= PICTURE_PIXELS else show_views(scene, side))[ids]
 
     assigner = Assigner(show, candidates)
     confirmed_photos, _ = assigner.confirm(range(len(ids)), exact=True)
@@ -251,8 +249,9 @@ def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Seq
     toned = {view: changes[view].tones for view in views if changes[view].tones is not None}
     if not toned:
         return
+    middle_grey = 128  # level of 255 at which notes report the change of tone
     factors = [
-        float(curve[:, MIDDLE_GREY].mean()) / (MIDDLE_GREY / 255) for curve in toned.values() if curve is not None
+        float(curve[:, middle_grey].mean()) / (middle_grey / 255) for curve in toned.values() if curve is not None
     ]
     low, high = min(factors), max(factors)
     factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
@@ -266,7 +265,8 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
     """Note in which of some photos something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
     max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
-    if max_percent < LEAST_PERCENT:
+    least_percent = 1  # of a photo; no note says that less of it differs
+    if max_percent < least_percent:
         return
     note(
         f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians"
@@ -286,8 +286,8 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
         weights = known.astype(np.float32)
         difference = (changes[view](scene.images[view]) - picture) * weights[..., None]
-        red, green, blue = np.moveaxis(np.abs(convolve(difference, WINDOW, WINDOW)), -1, 0)
-        differs = known & ((red + green + blue) / 3 > STEP * convolve(weights, WINDOW, WINDOW))
+        red, green, blue = np.moveaxis(np.abs(convolve(difference, MEAN_WINDOW, MEAN_WINDOW)), -1, 0)
+        differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * convolve(weights, MEAN_WINDOW, MEAN_WINDOW))
         return fill_gaps(differs[..., None], known)[..., 0]
 
     def differ_drawn(views: np.ndarray, rows: RowPicture) -> None:
@@ -299,7 +299,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     inside = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     pictures, pixels = row_pictures(scene), scene.get_pixels()
     shown = pixels.shown
-    known = shown & (scene.gaussians.opacities[pixels.fronts] > FAINT) & inside
+    known = shown & (scene.gaussians.opacities[pixels.fronts] > COMPARED_OPACITY) & inside
     hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
     picture_rows(scene, differ_drawn, np.asarray((hidden | ~inside).any((1, 2))))
     return hidden, pictures

@@ -30,10 +30,8 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Exposure
 from gsmerge.types import Cameras, PicturedScene, Scene
 
-SAMPLE_PIXELS = 2000  # pixels of a view that are looked up in the other views
-SAME_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
-LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
-MIN_PAIRS = 60  # least number of pixels that two views share
+EXPOSURE_PIXELS = 2000  # pixels of a view that are looked up in the other views
+NOISE_LEVEL, CLIPPED_LEVEL = 0.05, 0.95  # colours in between are neither noise nor clipped
 # The following three bounds were chosen on the plain exports of 15 captures. Root mean square of the logarithmic gains:
 # above the bound in nine of ten draws of random gains of 0.8 to 1.25 for five photos, and in six unchanged captures
 DIFFERENT = 0.06
@@ -44,11 +42,11 @@ FOLLOWS, OPPOSED = 0.5, -0.6
 # Distance of a gain from the mean gain of its two nearest views, relative to that of random gains: 0.71 to 1.22 with
 # gains of 0.5 to 2; 0.19 to 0.57 if exposure drifts and compensation loses 1.7 dB or more; 0.67 for four views in a row
 UNEXPECTED = 0.69
-COARSE = 4  # the brightness of a photo is measured on every COARSE-th pixel of every COARSE-th row
-MAX_WEIGHTED_PIXELS = 1000  # pixels up to which the weight of a pair of views grows
-BRIGHT = 1.15  # gain from which on clipped pixels no longer count
-NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
-NEAREST, FARTHER = 6, 2  # a view is compared with the nearest views, and with further views at equal steps of rank
+COARSE_STEP = 4  # the brightness of a photo is measured on every COARSE_STEP-th pixel of every COARSE_STEP-th row
+BRIGHT_GAIN = 1.15  # gain from which on clipped pixels no longer count
+CLIPPED_NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
+# A view is compared with the nearest views, and with further views at equal steps of rank
+NEAREST_VIEWS, FARTHER_VIEWS = 6, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +90,7 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
 
 def _find_objection(scene: PicturedScene, views: Sequence[int], gains: np.ndarray) -> str:
     """Return why photos should stay unchanged, or an empty text."""
-    view_gains, photos = gains[list(views)], [scene.images[view][::COARSE, ::COARSE] for view in views]
+    view_gains, photos = gains[list(views)], [scene.images[view][::COARSE_STEP, ::COARSE_STEP] for view in views]
     brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
     if is_metered(brightness, view_gains):
         return "this looks like automatic exposure (photos with larger factors are not brighter)"
@@ -139,6 +137,7 @@ class _Pixels:
     def look_up(self, view: int, rows: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
         """Find the pixels ``rows`` of a view whose surface another view shows; return their indices and its pixels."""
         poses = self.cameras.viewmats[other].astype(np.float64), self.cameras.Ks[other].astype(np.float64)
+        same_depth = 0.05  # difference of the logarithms of two depths of one surface
         return find_surfaces(
             self.means[view],
             rows,
@@ -147,7 +146,7 @@ class _Pixels:
             *poses,
             self.cameras.width,
             NEAR_PLANE,
-            SAME_DEPTH,
+            same_depth,
         )
 
 
@@ -165,18 +164,21 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
     """Measure the ratios of colours between views that see the same surfaces."""
     size, pixels = scene.pixels_per_view, _pixels_of(scene)
     photos = scene.images.reshape(len(scene), size, 3)
-    sample = np.random.default_rng(0).permutation(size)[:SAMPLE_PIXELS]
+    sample = np.random.default_rng(0).permutation(size)[:EXPOSURE_PIXELS]
     partners = choose_partners(camera_distances(scene.cameras[list(views)]))
 
     def measure(row: int) -> list[_Pair]:
         view, pairs = views[row], list[_Pair]()
         rows = sample[pixels.valid[view, sample]]
+        min_pairs = 60  # least number of pixels that two views share
         for other in (views[column] for column in partners[row]):
             found, other_rows = pixels.look_up(view, rows, other)
             here, there = photos[view].take(rows[found], axis=0), photos[other].take(other_rows, axis=0)
-            red, green, blue = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).T
+            red, green, blue = (
+                (here > NOISE_LEVEL) & (here < CLIPPED_LEVEL) & (there > NOISE_LEVEL) & (there < CLIPPED_LEVEL)
+            ).T
             clear = red & green & blue
-            if clear.sum() >= MIN_PAIRS:
+            if clear.sum() >= min_pairs:
                 ratios = log(there[clear].astype(np.float64) / here[clear])
                 pairs.append(_Pair(view, other, medians(ratios), len(ratios)))
         return pairs
@@ -190,17 +192,18 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
     The nearest views share the most surfaces. Views at equal steps of rank connect groups of cameras.
     """
     order = order_others(distances)
-    if order.shape[1] > NEAREST + FARTHER:
-        steps = np.linspace(NEAREST, order.shape[1] - 1, FARTHER).round().astype(int)
-        order = order[:, [*range(NEAREST), *steps]]
+    if order.shape[1] > NEAREST_VIEWS + FARTHER_VIEWS:
+        steps = np.linspace(NEAREST_VIEWS, order.shape[1] - 1, FARTHER_VIEWS).round().astype(int)
+        order = order[:, [*range(NEAREST_VIEWS), *steps]]
     return np.sort(order, axis=1)
 
 
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
     """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; all are zero without pairs."""
     matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
+    max_weighted_pixels = 1000  # pixels up to which the weight of a pair of views grows
     for pair in pairs:
-        ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, MAX_WEIGHTED_PIXELS))
+        ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, max_weighted_pixels))
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])
         right[ends] += weight * np.array([-pair.ratios, pair.ratios])
     matrix[np.diag_indices(num_views)] += 1e-6  # views without pairs get a gain of one
@@ -213,9 +216,9 @@ def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
 
     A surface that is clipped in all photos, such as a sky, is not marked, because no photo would show it then.
     """
-    clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT)).any(-1)
+    clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT_GAIN)).any(-1)
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
-    order = order_others(camera_distances(scene.cameras))[:, :NEIGHBOURS]
+    order = order_others(camera_distances(scene.cameras))[:, :CLIPPED_NEIGHBOURS]
 
     def confirm(view: int) -> np.ndarray:
         rows, is_shown = np.flatnonzero(flat[view] & pixels.valid[view]), np.zeros_like(flat[view])

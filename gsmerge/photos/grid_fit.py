@@ -31,7 +31,6 @@ from gsmerge.photos.offsets import correlate_parts
 from gsmerge.photos.pictures import ViewPictures
 from gsmerge.photos.scores import stands_out
 
-_JPEG_BLOCK = 8  # pixels of a side
 _TILES = 4  # most pictures beside or below each other in a photo
 _HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
 
@@ -98,8 +97,9 @@ def sharpen(inner: Part, size: Size, shape: Size) -> Part:
     width, height = part_size(size, inner)
     times = max(1, round(width / shape[0]))
     sides = times * shape[0], times * shape[1]
+    jpeg_block = 8  # pixels of a side of the blocks of a JPEG
     if (
-        max(abs(width - sides[0]), abs(height - sides[1])) > _JPEG_BLOCK
+        max(abs(width - sides[0]), abs(height - sides[1])) > jpeg_block
         or max(sides[0] / size[0], sides[1] / size[1]) > 1
     ):
         return inner

@@ -26,17 +26,14 @@ from gsmerge.io.photo_files import (
 )
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.photos.offsets import SIDE
+from gsmerge.photos.offsets import OFFSET_PIXELS
 from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import NONE
 from gsmerge.types import PROTECTED, Cameras, Pixels, StrPath
 
-_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _WHITE = np.uint8(255)
-_JPEG_TEXTURE = 0.2  # largest share of the pixels of a smooth mask that JPEG makes uneven
-_MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
 
 
 class CameraMaskError(SceneError):
@@ -71,14 +68,15 @@ class MaskFiles:
         """Read which pixels ``[h,w]`` of a view count, and their weights; None: all pixels count, with weight 1."""
         photo, counts, importance = self.photos[view] if self.photos else None, None, None
         alpha = None if photo is None else decode_alpha(photo)
+        min_level = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
         if alpha is not None:
             opaque = cut_part(turn_picture(alpha, self.turns[view]), self.part) * _WHITE
-            counts = self._reduce(opaque, view) > _MASK_LEVEL
+            counts = self._reduce(opaque, view) > min_level
         if (mask := self.masks[view]) is not None:
             levels = self._read_levels(mask, view)
             is_light = levels > _WHITE // 2
             light = self._reduce(is_light * _WHITE, view)
-            counts = (light > _MASK_LEVEL) if counts is None else counts & (light > _MASK_LEVEL)
+            counts = (light > min_level) if counts is None else counts & (light > min_level)
             if (levels[is_light] < _WHITE).any():  # the weight is the mean over the pixels that count
                 importance = self._reduce(levels * is_light, view) / np.maximum(light, np.float32(1))
         if (mask := self.protecting[view]) is not None:
@@ -176,7 +174,7 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     A picture of several colours is one for certain. A grey one may be if it changes from pixel to pixel as the photo of
     its view does, unless most of its pixels have one of two levels, as in masks with soft edges.
     """
-    picture = np.rint(decode_small(mask, SIDE) * _WHITE)
+    picture = np.rint(decode_small(mask, OFFSET_PIXELS) * _WHITE)
     spread = np.ptp(picture, axis=-1)
     if spread.mean() > 1:
         colors = picture[spread >= spread.max() / 2]
@@ -186,8 +184,11 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     if np.median(np.abs(grey - np.where(grey > middle, white, black))) <= 1:
         return 0
     photo = photos[view]
-    small = cv2.resize(photo, limit_size((photo.shape[1], photo.shape[0]), 2 * SIDE), interpolation=cv2.INTER_AREA)
-    return _texture(grey) > max(_texture(small.mean(-1)) / 2, _JPEG_TEXTURE)  # nearer to the photo's than to a mask's
+    small = cv2.resize(
+        photo, limit_size((photo.shape[1], photo.shape[0]), 2 * OFFSET_PIXELS), interpolation=cv2.INTER_AREA
+    )
+    jpeg_texture = 0.2  # largest share of the pixels of a smooth mask that JPEG makes uneven
+    return _texture(grey) > max(_texture(small.mean(-1)) / 2, jpeg_texture)  # nearer to the photo's than to a mask's
 
 
 def _texture(grey: np.ndarray) -> float:
@@ -240,7 +241,8 @@ def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple
     if counts is None:
         return masks, []
     share = float(1 - counts.mean())
-    if share < _MAX_MASKED:
+    max_masked = 0.98  # share of the pixels of photos that masks may leave out
+    if share < max_masked:
         count = int((~counts.all((1, 2))).sum())
         note = f"masks leave out {100 * share:.0f} % of the photos' pixels; {count} of {len(counts)} photos have a mask"
         shown = None if pixels is None or "masks" in files.named or files.masks is None else pixels.shown

@@ -12,15 +12,16 @@ from functools import cached_property
 
 import numpy as np
 
+from gsmerge.geometry.transforms import NORMAL_SPREAD
 from gsmerge.photos.pictures import ViewPictures
-from gsmerge.photos.scores import MARGIN, NORMAL, find_contrast, fisher_z
+from gsmerge.photos.scores import NOISE_MARGIN, find_contrast, fisher_z
 from gsmerge.raster.photos import shrink_pictures
 
-SIDE = 256  # pixels of the longer side of both pictures
-PART, REACH = 32, 12  # pixels: side of a part, and largest offset that is searched
-AROUND = 30  # pixels: side of the square whose mean is subtracted to get contrast
-TAPS = 64  # size of the Fourier transforms, at least PART + 2 REACH
-TOLERANCE = 1  # pixels: offsets up to it count as zero, since the peak of a correlation is that wide
+OFFSET_PIXELS = 256  # pixels of the longer side of both pictures
+PART_PIXELS, MOST_OFFSET = 32, 12  # pixels: side of a part, and largest offset that is searched
+CONTRAST_PIXELS = 30  # pixels: side of the square whose mean is subtracted to get contrast
+TAPS = 64  # size of the Fourier transforms, at least PART_PIXELS + 2 MOST_OFFSET
+ZERO_OFFSET = 1  # pixels: offsets up to it count as zero, since the peak of a correlation is that wide
 NEAR_PIXELS = 3  # pixels by which offsets of parts may differ in one common motion, because their depths differ
 
 
@@ -30,7 +31,7 @@ class PhotoOffsets:
 
     offsets: np.ndarray  # [n,2] pixels down and right
     similarity: float  # mean of Fisher's z of all parts at offset zero
-    tolerance: float = TOLERANCE  # pixels: offsets up to it count as zero
+    tolerance: float = ZERO_OFFSET  # pixels: offsets up to it count as zero
 
     @cached_property
     def distances(self) -> np.ndarray:
@@ -63,9 +64,9 @@ def correlate_parts(shown: ViewPictures, view: int, photo: np.ndarray) -> np.nda
     """Return Fisher's z ``[n]`` of the correlations between parts of a photo and the same parts of a view."""
     weight = shown.weights[view]
     height, width = weight.shape
-    photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
-    view_contrast = find_contrast(shown.pictures[view], weight, AROUND)
-    starts = [np.arange(0, side, max(1, PART * max(height, width) // SIDE)) for side in (height, width)]
+    photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, CONTRAST_PIXELS)
+    view_contrast = find_contrast(shown.pictures[view], weight, CONTRAST_PIXELS)
+    starts = [np.arange(0, side, max(1, PART_PIXELS * max(height, width) // OFFSET_PIXELS)) for side in (height, width)]
 
     def add(values: np.ndarray) -> np.ndarray:
         """Add weighted values ``[h,w,3]`` over each part."""
@@ -78,27 +79,29 @@ def correlate_parts(shown: ViewPictures, view: int, photo: np.ndarray) -> np.nda
 def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffsets | None:
     """Search for the parts of a view in an upright ``photo [h,w,3]``, which may have any size.
 
-    ``shown`` are pictures of the views with up to :data:`SIDE` pixels on the longer side. None if they are too small to
-    be cut into parts.
+    ``shown`` are pictures of the views with up to :data:`OFFSET_PIXELS` pixels on the longer side. None if they are too
+    small to be cut into parts.
     """
     weight = shown.weights[view]
     height, width = weight.shape
-    if min(height, width) < 2 * PART:
+    if min(height, width) < 2 * PART_PIXELS:
         return None
-    photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
-    view_contrast = find_contrast(shown.pictures[view], weight, AROUND)
-    padded = np.pad(photo_contrast, ((REACH, REACH), (REACH, REACH), (0, 0)))
+    photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, CONTRAST_PIXELS)
+    view_contrast = find_contrast(shown.pictures[view], weight, CONTRAST_PIXELS)
+    padded = np.pad(photo_contrast, ((MOST_OFFSET, MOST_OFFSET), (MOST_OFFSET, MOST_OFFSET), (0, 0)))
     scores = _score_offsets(padded, view_contrast, weight)
     middle = np.median(scores, 1)
-    noise = NORMAL * np.median(np.abs(scores - middle[:, None]), 1) + 1e-6
-    stand_out = scores.max(1) - middle > MARGIN * noise
-    offsets = np.stack(np.divmod(scores[stand_out].argmax(1), 2 * REACH + 1), 1) - REACH
+    noise = NORMAL_SPREAD * np.median(np.abs(scores - middle[:, None]), 1) + 1e-6
+    stand_out = scores.max(1) - middle > NOISE_MARGIN * noise
+    offsets = np.stack(np.divmod(scores[stand_out].argmax(1), 2 * MOST_OFFSET + 1), 1) - MOST_OFFSET
     return PhotoOffsets(offsets, float(scores[:, scores.shape[1] // 2].mean()))
 
 
 def _score_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return Fisher's z ``[n,(2 REACH + 1)^2]`` of each part of a picture at every offset in a padded photo."""
-    rows, columns = (np.arange(0, side - PART + 1, PART) + (side % PART) // 2 for side in weight.shape)
+    """Return Fisher's z ``[n,(2 MOST_OFFSET + 1)^2]`` of each part of a picture at every offset in a padded photo."""
+    rows, columns = (
+        np.arange(0, side - PART_PIXELS + 1, PART_PIXELS) + (side % PART_PIXELS) // 2 for side in weight.shape
+    )
     corners = [(top, left) for top in rows for left in columns]
 
     def transform_parts(array: np.ndarray, side: int) -> np.ndarray:
@@ -106,16 +109,16 @@ def _score_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -
         parts = np.stack([array[top : top + side, left : left + side] for top, left in corners])
         return np.fft.rfft2(np.moveaxis(parts, -1, 1) if parts.ndim == 4 else parts, (TAPS, TAPS))
 
-    shifts = slice(0, 2 * REACH + 1)
-    searched = PART + 2 * REACH  # side of the square of the photo in which a part is searched
+    shifts = slice(0, 2 * MOST_OFFSET + 1)
+    searched = PART_PIXELS + 2 * MOST_OFFSET  # side of the square of the photo in which a part is searched
     weighted, photo_squares = picture * weight[..., None], (photo * photo).sum(-1)
-    spectrum = transform_parts(photo, searched) * transform_parts(weighted, PART).conj()
+    spectrum = transform_parts(photo, searched) * transform_parts(weighted, PART_PIXELS).conj()
     products = np.fft.irfft2(spectrum.sum(1))[:, shifts, shifts]
-    photo_spectrum = transform_parts(photo_squares, searched) * transform_parts(weight, PART).conj()
+    photo_spectrum = transform_parts(photo_squares, searched) * transform_parts(weight, PART_PIXELS).conj()
     photo_energies = np.fft.irfft2(photo_spectrum)[:, shifts, shifts]
     picture_squares = (weighted * picture).sum(-1)
     picture_energies = np.stack([
-        picture_squares[top : top + PART, left : left + PART].sum() for top, left in corners
+        picture_squares[top : top + PART_PIXELS, left : left + PART_PIXELS].sum() for top, left in corners
     ])  # fmt: skip
     lengths = np.sqrt(np.maximum(photo_energies, 1e-9) * np.maximum(picture_energies, 1e-9)[:, None, None])
     return fisher_z(products / lengths).reshape(len(corners), -1)

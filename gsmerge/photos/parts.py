@@ -16,14 +16,13 @@ from gsmerge.io.photo_files import ASPECT_TOLERANCE, WHOLE, decode_image, image_
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.photos.assign import Assigner, Assignment, Candidates
 from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_parts, sharpen
-from gsmerge.photos.offsets import SIDE
+from gsmerge.photos.offsets import OFFSET_PIXELS
 from gsmerge.photos.pictures import show_views
 from gsmerge.photos.scene_photos import Proposal
 from gsmerge.photos.views import pick_views
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
-_COMPARED = 8  # most photos whose parts are compared with their views
 _BAR_SPREAD = 8  # largest range of a bar's colours, of 255
 
 
@@ -47,7 +46,8 @@ def choose_part(
     """
     proposal = proposal.without_broken() or proposal
     named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
-    views, photos = zip(*(named[i] for i in pick_views(len(named), _COMPARED)), strict=True) if named else ((), ())
+    max_compared = 8  # most photos whose parts are compared with their views
+    views, photos = zip(*(named[i] for i in pick_views(len(named), max_compared)), strict=True) if named else ((), ())
     sizes = [image_size(proposal.pool[photo]) for photo in photos]
     shapes_differ = not all(same_shape(size, sizes[0]) for size in sizes)
     if not photos or shapes_differ or any(map(proposal.tag, photos)):
@@ -59,9 +59,9 @@ def choose_part(
         with suppress(SceneError):
             whole = decode_image(proposal.pool[photos[number]], size)
             above, below, left, right = count_bars(whole, _BAR_SPREAD)
-            small = resize_to(size, limit_size(size, 4 * SIDE)).photos([whole])[0]
+            small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
             return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
-        return np.zeros((SIDE, SIDE, 3), np.float32), np.zeros(4)
+        return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)
 
     pictures, bars = zip(*parallel_map(read, range(len(photos))), strict=True)
     left, above, right, below = np.median(bars, 0).tolist()
@@ -71,7 +71,7 @@ def choose_part(
     if grid_fit is None:
         inner = sharpen(inner, sizes[0], shape)
     fits += list_parts(sizes[0], shape if grid_fit is None else None, inner)
-    fit = choose_fit(show_views(scene, SIDE)[views], pictures, fits)
+    fit = choose_fit(show_views(scene, OFFSET_PIXELS)[views], pictures, fits)
     if isinstance(fit, GridFit) or fit == WHOLE_FIT:
         return None
     candidates = Candidates(lambda photo: fit.cut(pictures[photo]), len(photos), lambda _: 0)

@@ -14,9 +14,8 @@ from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import IMAGE_SUFFIXES, propose_images
 from gsmerge.io.photo_files import decode_small, image_size, same_shape
 from gsmerge.io.scene_files import list_folders
-from gsmerge.photos.offsets import SIDE
+from gsmerge.photos.offsets import OFFSET_PIXELS
 
-_MAX_FOLDERS = 4  # folders whose photos are compared with the views
 _ROUNDING = 1 / 255  # mean difference of channels that rounding to 8 bits may cause
 _MODEL_FOLDERS = {"sparse", "colmap", "distorted"}  # names of folders that have COLMAP's models
 
@@ -59,7 +58,8 @@ def find_named_photos(
         nested = len(pools[folder]), -len(folder.parts), folder  # the folder itself rather than one above it
         return -count, -num_exact, not folder.is_relative_to(roots[0]), *look, *nested
 
-    best = [folder for count, *_, folder in sorted(map(rank, pools)) if -count > num_known][:_MAX_FOLDERS]
+    max_folders = 4  # folders whose photos are compared with the views
+    best = [folder for count, *_, folder in sorted(map(rank, pools)) if -count > num_known][:max_folders]
     if not best:
         return None
     pool = list(dict.fromkeys(path for folder in best for path in pools[folder]))
@@ -69,7 +69,7 @@ def find_named_photos(
 def is_grey(path: Path) -> bool:
     """Return whether an image file has no colours, as masks and depths; False where it cannot be read."""
     with suppress(SceneError):
-        return bool(np.ptp(decode_small(path, SIDE), axis=-1).mean() <= _ROUNDING)
+        return bool(np.ptp(decode_small(path, OFFSET_PIXELS), axis=-1).mean() <= _ROUNDING)
     return False
 
 

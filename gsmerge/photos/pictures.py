@@ -17,8 +17,8 @@ from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import LEAST_OPACITY, blank_photos, photo_errors, photos_of, pixel_weights, shrink_pictures
 from gsmerge.types import Cameras, Gaussians, Scene
 
-SAMPLE_GAUSSIANS = 1 << 17  # Gaussians that are drawn
-SIDE = 96  # pixels of the longer side of pictures that photos are compared with
+PICTURE_GAUSSIANS = 1 << 17  # Gaussians that are drawn
+PICTURE_PIXELS = 96  # pixels of the longer side of pictures that photos are compared with
 _CANONICAL = Frame(np.zeros(3), 1.0)  # of canonical scenes
 
 
@@ -93,8 +93,8 @@ def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
     """Pair ``photos [v,h,w,3]`` with pictures of the Gaussians of a canonical scene."""
     shown = show_views(scene, frame=_CANONICAL)
     if scene.has_own_pixels:
-        return Pairs(photos[_sample_grid(scene.cameras, SIDE)], shown)
-    reduction = max(1.0, max(scene.cameras.width, scene.cameras.height) / SIDE)
+        return Pairs(photos[_sample_grid(scene.cameras, PICTURE_PIXELS)], shown)
+    reduction = max(1.0, max(scene.cameras.width, scene.cameras.height) / PICTURE_PIXELS)
     return Pairs(photos_of(photos, scene.cameras, reduction).images, shown)
 
 
@@ -105,10 +105,10 @@ def show_views(scene: Scene, side: int | None = None, frame: Frame | None = None
     a sample of the Gaussians. ``frame`` is the canonical frame of the scene, if known.
     """
     if scene.has_own_pixels:
-        return _show_rows(scene, SIDE) if side is None else _show_rows(scene, 2 * side).shrink(side)
-    sampled = Scene(thin_out(scene.gaussians, SAMPLE_GAUSSIANS), scene.cameras, None, None, scene.names)
+        return _show_rows(scene, PICTURE_PIXELS) if side is None else _show_rows(scene, 2 * side).shrink(side)
+    sampled = Scene(thin_out(scene.gaussians, PICTURE_GAUSSIANS), scene.cameras, None, None, scene.names)
     canonical, _ = canonicalise(sampled, frame)
-    shown = draw_views(canonical.gaussians, canonical.cameras, side or SIDE)
+    shown = draw_canonical(canonical.gaussians, canonical.cameras, side or PICTURE_PIXELS)
     inside = pixel_weights(scene.masks, *shown.weights.shape[2:0:-1])
     return shown if inside is None else replace(shown, weights=shown.weights * (inside == 1))
 
@@ -134,7 +134,7 @@ def _sample_grid(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
     return slice(None), pixels, pixels
 
 
-def draw_views(gaussians: Gaussians, cameras: Cameras, side: int) -> ViewPictures:
+def draw_canonical(gaussians: Gaussians, cameras: Cameras, side: int) -> ViewPictures:
     """Render canonical Gaussians, and divide their transparency out."""
     blank = blank_photos(cameras, max(1.0, max(cameras.width, cameras.height) / side))
     renders = photo_errors(gaussians, blank, lambda _, image, transmittance: (image, 1 - transmittance))

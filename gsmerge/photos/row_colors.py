@@ -20,7 +20,7 @@ from gsmerge.kernels.pictures import blur
 from gsmerge.photos.views import camera_kinds, subset
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.composite import blend, view_colors
-from gsmerge.raster.photos import COVERED, WHOLE, blank_photos
+from gsmerge.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE, blank_photos
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
@@ -32,11 +32,10 @@ PHOTOS = "photos"
 ROW_COLORS = "the model's own pixels"
 RENDERS = "renders of the input"
 NO_PHOTOS = f"no photos: {ROW_COLORS} are used instead; name photos with --images"
-FAINT = 0.1  # opacity of a pixel's Gaussians below which their colours mean little
+FAINT_OPACITY = 0.1  # opacity of a pixel's Gaussians below which their colours mean little
 # Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 in exports of
 # nine captures. After a blur of 2 pixels they differ by .39, where Gaussians of wrong depth hide others
-BLUR = 8.0
-DISAGREE = 0.2  # the drawing is used from this mean difference of blurred colours over the channels (sRGB) on
+ROW_BLUR_PIXELS = 8.0
 T = TypeVar("T")
 
 
@@ -54,7 +53,7 @@ def add_row_colors(scene: Scene, *, has_photos: bool = False) -> PicturedScene:
 
     num_drawn = sum(picture_rows(scene, keep))
     share = num_drawn / masks.size
-    detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE else ""
+    detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE_SHARE else ""
     if detail or not has_photos:  # otherwise an earlier note has said that photos do not count
         note((f"photos do not count: {ROW_COLORS} are used instead" if has_photos else NO_PHOTOS) + detail)
     return PicturedScene.with_pictures(scene, images, None if masks.all() else masks)
@@ -97,10 +96,11 @@ def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
     alpha = 1 - transmittance
     drawn = (drawing / np.maximum(alpha, np.float32(1e-3))[..., None]).clip(0, 1)
     weights = np.minimum(opacity, alpha)  # of the difference of both pictures, which are blurred; a mean over channels
-    red, green, blue = np.moveaxis(np.abs(blur((row_picture - drawn) * weights[..., None], BLUR)), -1, 0)
-    agree = (red + green + blue) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6))) < DISAGREE
-    solid = transmittance < COVERED
-    by_row = (opacity > 0) & ~(solid & ((opacity < FAINT) | ~agree))
+    red, green, blue = np.moveaxis(np.abs(blur((row_picture - drawn) * weights[..., None], ROW_BLUR_PIXELS)), -1, 0)
+    disagreement = 0.2  # the drawing is used from this mean difference of blurred colours over the channels (sRGB) on
+    agree = (red + green + blue) / (3 * np.maximum(blur(weights, ROW_BLUR_PIXELS), np.float32(1e-6))) < disagreement
+    solid = transmittance < COVERED_TRANSMITTANCE
+    by_row = (opacity > 0) & ~(solid & ((opacity < FAINT_OPACITY) | ~agree))
     known = by_row | solid
     picture = fill_gaps(np.where(by_row[..., None], row_picture, drawn), known)
     return RowPicture(picture, known, known & ~by_row, drawing.clip(0, 1))

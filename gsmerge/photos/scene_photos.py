@@ -31,8 +31,8 @@ from gsmerge.io.photo_files import (
     Size,
     decode_image,
     decode_images,
+    decode_photos,
     decode_small,
-    decode_views,
     image_size,
     orientation_turn,
     part_size,
@@ -43,7 +43,7 @@ from gsmerge.kernels.pictures import turn_picture
 from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
 from gsmerge.photos.colors import cut_blocks
 from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
-from gsmerge.photos.offsets import SIDE, correlate_parts
+from gsmerge.photos.offsets import OFFSET_PIXELS, correlate_parts
 from gsmerge.photos.photo_folders import capture_folder, count_pixels, find_named_photos
 from gsmerge.photos.pictures import Pairs, ViewPictures, show_views
 from gsmerge.photos.scores import stands_out
@@ -267,7 +267,7 @@ def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_
             width, height = part
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
             raise SceneError(proposal.folder, problem)
-    return replace(photos, pictures=decode_views(paths, turns, proposal.fit.stretch(size), proposal.fit.part))
+    return replace(photos, pictures=decode_photos(paths, turns, proposal.fit.stretch(size), proposal.fit.part))
 
 
 def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:
@@ -309,9 +309,9 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
 
     def read(photo: int) -> np.ndarray:
         try:
-            small = decode_small(proposal.pool[photo], SIDE)
+            small = decode_small(proposal.pool[photo], OFFSET_PIXELS)
         except SceneError:  # an unreadable photo is black and fits no view
-            small = np.zeros((SIDE, SIDE, 3), np.float32)
+            small = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
         small = proposal.fit.cut(small)
         return small if fit is None else fit.cut(small)
 
@@ -355,7 +355,7 @@ def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
     """Find how the photos that show a scene's views were resized and cropped to the grid of its rows."""
     simple, *other_fits = list_fits((scene.cameras.width, scene.cameras.height))
     views = range(len(scene))
-    shown, chosen = show_views(scene, SIDE), list[np.ndarray | None]()
+    shown, chosen = show_views(scene, OFFSET_PIXELS), list[np.ndarray | None]()
     assigner = Assigner(partial(show_views, scene), _list_candidates(proposal, None))
     for view, likely in assigner.list_likely(views, range(len(proposal.pool))).items():
         photos = [turn_picture(assigner.candidates.read(photo), turn) for photo, turn in likely]
@@ -381,7 +381,9 @@ def has_nearer_colors(scene: Scene, other: Scene) -> bool:
 
     images = scene.images
     assert images is not None
-    return stands_out(measure(images, show_views(other, SIDE)) - measure(images, show_views(scene, SIDE)))
+    return stands_out(
+        measure(images, show_views(other, OFFSET_PIXELS)) - measure(images, show_views(scene, OFFSET_PIXELS))
+    )
 
 
 def name_by_photos(

@@ -13,24 +13,23 @@ from functools import cached_property
 
 import numpy as np
 
-from gsmerge.geometry.transforms import median
+from gsmerge.geometry.transforms import NORMAL_SPREAD, median
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import ORIENTATIONS, blur, turn_back
 from gsmerge.photos.pictures import ViewPictures, fit_size
 from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
 
-SIZES = (24, 64)  # pixels of the longer side at which pictures are compared
-AROUND = 6  # side of the picture in standard deviations of the local mean
-REACH = 2  # standard deviations at which the local mean is cut off
-MARGIN = 5.0  # standard deviations of noise by which evidence must exceed the noise
-NORMAL = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
-CLOSEST = 0.999  # larger correlations are clipped to it
+SCORE_PIXELS = (24, 64)  # pixels of the longer side at which pictures are compared
+PICTURE_SPREADS = 6  # side of the picture in standard deviations of the local mean
+CUT_OFF_SPREADS = 2  # standard deviations at which the local mean is cut off
+NOISE_MARGIN = 5.0  # standard deviations of noise by which evidence must exceed the noise
 
 
 def fisher_z(correlations: np.ndarray) -> np.ndarray:
     """Return Fisher's z, the inverse hyperbolic tangent of correlations."""
-    clipped = correlations.clip(-CLOSEST, CLOSEST)
+    max_correlation = 0.999  # larger correlations are clipped to it
+    clipped = correlations.clip(-max_correlation, max_correlation)
     return np.asarray(0.5 * log((1 + clipped) / (1 - clipped)))
 
 
@@ -41,8 +40,8 @@ def find_contrast(picture: np.ndarray, weight: np.ndarray | None = None, side: i
     the picture. ``weight [h,w]`` are weights of the pixels, by default 1.
     """
     weight = np.ones(picture.shape[:2], np.float32) if weight is None else weight
-    sigma = (side or max(picture.shape[:2])) / AROUND
-    sums = blur(np.dstack([picture * weight[..., None], weight]), sigma, round(REACH * 2 * sigma) | 1)
+    sigma = (side or max(picture.shape[:2])) / PICTURE_SPREADS
+    sums = blur(np.dstack([picture * weight[..., None], weight]), sigma, round(CUT_OFF_SPREADS * 2 * sigma) | 1)
     return np.asarray(picture - sums[..., :3] / np.maximum(sums[..., 3:], np.float32(LEAST_OPACITY)))
 
 
@@ -62,7 +61,7 @@ class Comparer:
 
     def __init__(self, shown: ViewPictures) -> None:
         self.views = len(shown)
-        self._small = small = [shown.shrink(side) for side in SIZES]
+        self._small = small = [shown.shrink(side) for side in SCORE_PIXELS]
         width, height = small[0].weights.shape[2:0:-1]
         self._portrait, self._square = height > width, height == width
         self.least_noise = 1 / np.sqrt(width * height)  # of Fisher's z, if all pixels are independent
@@ -90,7 +89,7 @@ class Comparer:
         are landscape or vice versa, and for views without Gaussians.
         """
         out = np.full((len(photos), self.views, ORIENTATIONS), np.nan)
-        small = [shrink_pictures(photo[None], *fit_size(photo.shape[1::-1], SIZES[-1]))[0] for photo in photos]
+        small = [shrink_pictures(photo[None], *fit_size(photo.shape[1::-1], SCORE_PIXELS[-1]))[0] for photo in photos]
         shapes = np.array([photo.shape for photo in photos]).reshape(-1, 3)
         square, portrait = shapes[:, 0] == shapes[:, 1], shapes[:, 0] > shapes[:, 1]
         upright = self._square | square | (portrait == self._portrait)
@@ -138,7 +137,7 @@ def measure_noise(z_scores: np.ndarray, least: float) -> tuple[np.ndarray, float
     """
     flat = z_scores.reshape(len(z_scores), -1)
     middle = np.array([_median_of_known(scores) for scores in flat], flat.dtype)
-    return middle, max(NORMAL * _median_of_known(np.abs(flat - middle[:, None]).reshape(-1)), least)
+    return middle, max(NORMAL_SPREAD * _median_of_known(np.abs(flat - middle[:, None]).reshape(-1)), least)
 
 
 def _median_of_known(scores: np.ndarray) -> float:
@@ -163,8 +162,8 @@ def signed_ranks(gains: np.ndarray) -> float:
 
 
 def stands_out(gains: np.ndarray) -> bool:
-    """Return True if gains ``[n]`` are above zero by more than :data:`MARGIN` standard deviations of their noise.
+    """Return True if gains ``[n]`` are above zero by more than :data:`NOISE_MARGIN` standard deviations of their noise.
 
     The gains must be held out: their views, or their parts of views, were not used to fit the change.
     """
-    return signed_ranks(gains) > MARGIN
+    return signed_ranks(gains) > NOISE_MARGIN

@@ -17,9 +17,6 @@ from gsmerge.types import Cameras, Gaussians
 from gsmerge.values.arrays import Array as AnyArray
 from gsmerge.values.arrays import ArrayFields, as_array
 
-MIN_OPACITY = 1e-6  # blended depths are divided by the opacity of their pixel, or by this if it is smaller
-NOTEBOOK_VIEWS = 4  # number of a rendering's views that a notebook shows
-
 
 def background_color(background: ArrayLike) -> Array:
     """Expand a background of one or three numbers to ``[3]``; ValueError for others."""
@@ -64,7 +61,8 @@ def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Arr
     Depths of Gaussians are clipped at ``farthest``.
     """
     blended, transmittance = blend(tiled, depth_colors(tiled, farthest), np.zeros(3, np.float32))
-    return blended[..., 0] / np.maximum(1 - transmittance, np.float32(MIN_OPACITY)), transmittance
+    min_opacity = 1e-6  # blended depths are divided by the opacity of their pixel, or by this if it is smaller
+    return blended[..., 0] / np.maximum(1 - transmittance, np.float32(min_opacity)), transmittance
 
 
 def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
@@ -156,7 +154,8 @@ class Rendering(ArrayFields):
         """Encode the first views, side by side, as the picture that a notebook shows."""
         if len(self.images) == 0:
             return None
-        row = np.concatenate(list(as_array(self.images[:NOTEBOOK_VIEWS])), 1)[..., ::-1]
+        notebook_views = 4  # number of a rendering's views that a notebook shows
+        row = np.concatenate(list(as_array(self.images[:notebook_views])), 1)[..., ::-1]
         return cv2.imencode(".png", (row.clip(0, 1) * 255).round().astype(np.uint8))[1].tobytes()
 
 

@@ -14,9 +14,9 @@ WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviat
 INNER = (slice(WINDOW // 2, -(WINDOW // 2)), slice(WINDOW // 2, -(WINDOW // 2)))  # centres of windows in the image
 C1, C2 = 0.01**2, 0.03**2  # stabilisers of SSIM (K1 = .01, K2 = .03) for a data range of 1
 MAX_LOSS = 0.5  # dB of PSNR that a result may lose against its input without a warning
-SPARE = 1.0  # dB by which a loss on a sample of photos may be wrong; on fifteen captures it is by .9 dB at most
+SAMPLE_LOSS = 1.0  # dB by which a loss on a sample of photos may be wrong; on fifteen captures it is by .9 dB at most
 MAX_PSNR = 120.0  # dB that replace the infinite PSNR of equal pictures
-POOR = 30.0  # dB of PSNR between a result and its input; below it their views look different
+POOR_PSNR = 30.0  # dB of PSNR between a result and its input; below it their views look different
 
 
 def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
@@ -91,10 +91,10 @@ def describe_loss(name: str, before: float | None, after: float | None, pictures
 
 
 def describe_distance(psnr: float | None) -> str | None:
-    """Describe that a result looks different from its input; None if ``psnr`` (dB) is at least ``POOR``, or None."""
-    if psnr is None or psnr >= POOR:
+    """Describe that a result looks different from its input; None if ``psnr`` is None or ``POOR_PSNR`` dB or more."""
+    if psnr is None or psnr >= POOR_PSNR:
         return None
-    return f"the result looks different from its input: {psnr:.1f} dB, below {POOR:g} dB"
+    return f"the result looks different from its input: {psnr:.1f} dB, below {POOR_PSNR:g} dB"
 
 
 def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:

@@ -14,7 +14,7 @@ from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
 from gsmerge.raster.metrics import MAX_PSNR, psnr_within
-from gsmerge.raster.tiled_view import Splats, make_splats, tile_view
+from gsmerge.raster.tiled_view import EPS2D, Splats, make_splats, tile_view
 from gsmerge.runtime.memory import make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -24,21 +24,22 @@ Score = TypeVar("Score")
 LEAST_OPACITY = 1 / 255  # rasterizers draw no smaller opacity
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
 # Gaussians. Larger scenes tile one view at a time, since a tiled view takes as much memory; threads share the view
-ONE_AT_A_TIME = 400_000
-# The scored tiles of a sample are shifted by STEP columns, a prime, from a line to the next. A sample has at least
+ERRORS_ONE_AT_A_TIME = 400_000
+# The scored tiles of a sample are shifted by TILE_STEP columns, a prime, from a line to the next. A sample has at least
 # LEAST_TILES of a view, so small views are scored whole: with 48, six views of 256 x 480 said a gain 1.0 dB too large
-STEP, LEAST_TILES = 13, 100
-MASKED = np.float32(0.1)  # weight of pixels outside masks; with a weight of 0 the Gaussians there would drift
-COVERED = np.float32(0.5)  # transmittance below which a pixel counts as covered by Gaussians
-WHOLE = 0.98  # share of covered pixels from which on the whole view counts as covered
-EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
+TILE_STEP, LEAST_TILES = 13, 100
+MASKED_WEIGHT = np.float32(0.1)  # weight of pixels outside masks; with a weight of 0 the Gaussians there would drift
+COVERED_TRANSMITTANCE = np.float32(0.5)  # transmittance below which a pixel counts as covered by Gaussians
+WHOLE_SHARE = 0.98  # share of covered pixels from which on the whole view counts as covered
 
 
 class RenderScore(NamedTuple):
     """Score of one render against a photo."""
 
     psnr: float  # dB over the scored pixels: pixels inside the mask, and inside the scored tiles
-    covered_psnr: float  # dB over the scored pixels that are covered; psnr from a share of WHOLE on, NaN for share 0
+    covered_psnr: (
+        float  # dB over the scored pixels that are covered; psnr from a share of WHOLE_SHARE on, NaN for share 0
+    )
     share: float  # share of the scored pixels that are covered
     covered: np.ndarray  # [h,w] bool, the scored pixels that are covered
 
@@ -168,12 +169,12 @@ def with_pixel_values(photos: Photos, scene: Scene) -> Photos:
 
 
 def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
-    """Convert masks ``[v,h,w]`` to pixel weights ``[v,height,width]`` float32: 1 inside, ``MASKED`` outside."""
+    """Convert masks ``[v,h,w]`` to pixel weights ``[v,height,width]`` float32: 1 inside, ``MASKED_WEIGHT`` outside."""
     if masks is None:
         return None
     size = width, height
     levels = [cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) for mask in masks]
-    return np.where(np.stack(levels) == 255, np.float32(1), MASKED)
+    return np.where(np.stack(levels) == 255, np.float32(1), MASKED_WEIGHT)
 
 
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
@@ -229,7 +230,7 @@ def photo_errors(
         return score(view, *composite(tiled, colors))
 
     view_ids = range(len(photos)) if views is None else views
-    if len(splats) > ONE_AT_A_TIME:
+    if len(splats) > ERRORS_ONE_AT_A_TIME:
         return [score_view(view) for view in view_ids]
     return parallel_map(score_view, view_ids)
 
@@ -254,7 +255,7 @@ def score_photos(
         return scored_tiles(view, photos.width, photos.height, every)
 
     def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> RenderScore:
-        return _score_view(image, masks.get(view, transmittance < COVERED), photos, view, every)
+        return _score_view(image, masks.get(view, transmittance < COVERED_TRANSMITTANCE), photos, view, every)
 
     return _mean_score(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings))
 
@@ -276,7 +277,7 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
     mask = _scored_pixels(photos, view, every)
     covered = covered if mask is None else covered & mask
     share = float(covered.sum() / (covered.size if mask is None else max(1, mask.sum())))
-    masks = [mask, covered] if 0 < share < WHOLE else [mask]
+    masks = [mask, covered] if 0 < share < WHOLE_SHARE else [mask]
     psnrs = psnr_within(np.clip(image, 0, 1, out=image), photos.images[view], masks)
     return RenderScore(psnrs[0], psnrs[-1] if share else math.nan, share, covered)
 
@@ -305,7 +306,7 @@ def scored_tiles(view: int, width: int, height: int, every: int) -> np.ndarray |
     if every <= 1:
         return None
     lines = view + np.arange(tile_height)[:, None]
-    return np.asarray((STEP * lines + np.arange(tile_width)) % every == 0)
+    return np.asarray((TILE_STEP * lines + np.arange(tile_width)) % every == 0)
 
 
 def render_photos(gaussians: Gaussians | Splats, photos: Photos, **settings: Any) -> list[np.ndarray]:

@@ -20,17 +20,14 @@ from gsmerge.values.arrays import distinct
 
 Array = NDArray[Any]
 
-PIECE = 1 << 13  # least number of Gaussians or intersections per thread
+THREAD_PIECE = 1 << 13  # least number of Gaussians or intersections per thread
 # Intersections of a view, and mean intersections per Gaussian. Above both, most Gaussians are hidden, so lists are cut
 CROWDED, CROWDED_EACH = 1 << 24, 16
-EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
-NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
+EPS2D = 0.3  # low-pass of the rasterizer, which widens Gaussians; square pixels of the full-size image
+WORLD_NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
 # Directions are clamped at this share of the image outside its borders, as in gsplat, since the first-order projection
 # is too inexact farther out
-SPARE = 0.15
-FAR_ORIGIN = 16  # means are shifted if their centre is farther from zero than so many times their spread
-ORIGIN_SAMPLE = 4096  # least number of means, if there are as many, from which centre and spread are measured
-CACHE_LINE = 16  # float32 values per cache line
+SPARE_SHARE = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +72,15 @@ class TiledView:
 
 def _spread_origin(means: Array) -> Array:
     """Return zero, or the centre of Gaussians if they are too far from zero for float32."""
-    sample = means[:: max(1, len(means) // ORIGIN_SAMPLE)].astype(np.float64)
+    origin_sample = 4096  # least number of means, if there are as many, from which centre and spread are measured
+    sample = means[:: max(1, len(means) // origin_sample)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
         return np.zeros(3)
     centre = medians(sample)
     spread = medians(np.abs(sample - centre)).max()
-    return centre if np.abs(centre).max() > FAR_ORIGIN * spread else np.zeros(3)
+    far_origin = 16  # means are shifted if their centre is farther from zero than so many times their spread
+    return centre if np.abs(centre).max() > far_origin * spread else np.zeros(3)
 
 
 def _shift(means: Array, origin: Array) -> Array:
@@ -108,7 +107,7 @@ def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats
     return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}, origin=zero)
 
 
-def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
+def num_pieces(count: int, threads: int, least: int = THREAD_PIECE) -> int:
     """Choose the number of pieces of work: up to four per thread, each with about ``least`` items or more."""
     return 1 if threads == 1 else max(1, min(4 * threads, count // least))
 
@@ -119,7 +118,7 @@ def pieces(count: int, threads: int) -> list[tuple[int, int]]:
     return [(count * i // num, count * (i + 1) // num) for i in range(num)]
 
 
-def tile_ranges(tiled: TiledView, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
+def tile_ranges(tiled: TiledView, threads: int, least: int = THREAD_PIECE) -> list[tuple[int, int]]:
     """Split tiles into ranges for the threads with about equal numbers of intersections, at least about ``least``."""
     count = len(tiled.flatten_ids)
     num = num_pieces(count, threads, least)
@@ -130,11 +129,11 @@ def tile_ranges(tiled: TiledView, threads: int, least: int = PIECE) -> list[tupl
 
 def camera_numbers(
     viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool,
-    near: float = NEAR_PLANE, far: float = FAR_PLANE,
+    near: float = WORLD_NEAR_PLANE, far: float = FAR_PLANE,
 ) -> Array:  # fmt: skip
     """Return the numbers of a camera in the order of the kernels."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    spare_x, spare_y = SPARE * width / fx, SPARE * height / fy
+    spare_x, spare_y = SPARE_SHARE * width / fx, SPARE_SHARE * height / fy
     camera = np.zeros(projection.CAMERA, np.float32)
     camera[projection.ROTATION : projection.SHIFT] = viewmat[:3, :3].ravel()
     camera[projection.SHIFT : projection.FX] = viewmat[:3, 3]
@@ -172,8 +171,9 @@ def _visible(
 
 def cache_line_rows(count: int, width: int) -> Array:
     """Allocate ``[count,width]`` float32 at the start of a cache line, so that short rows do not span two lines."""
-    buffer = np.empty(count * width + CACHE_LINE, np.float32)
-    start = -(buffer.ctypes.data // buffer.itemsize) % CACHE_LINE
+    cache_line = 16  # float32 values per cache line
+    buffer = np.empty(count * width + cache_line, np.float32)
+    start = -(buffer.ctypes.data // buffer.itemsize) % cache_line
     return buffer[start : start + count * width].reshape(count, width)
 
 
@@ -272,7 +272,7 @@ def tile_view(
     *,
     eps2d: float = EPS2D,
     antialiased: bool = False,
-    near: float = NEAR_PLANE,
+    near: float = WORLD_NEAR_PLANE,
     far: float = FAR_PLANE,
     opacities: Array | None = None,
     keep: Array | None = None,

@@ -41,10 +41,8 @@ PROPERTIES: dict[Check, str] = {
     "again": "compacted again to the same count, not more than {same:g} dB below",
 }
 SEED = 7  # seed of all random choices
-BROKEN_SHARE = 0.01  # share of the rows that become NaN
 MAX_WORSE = 0.1  # dB by which a result may be below its input
 MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that the result of a changed scene may lose compared with the unchanged scene
-FIT_SLACK = 1.0  # additional tolerance after a full fit, dB, since rounding changes thin structures by up to this
 SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference, and largest ratio, of counts
 _QUICK = EvaluateOptions(lpips=(), fog=False)
 
@@ -95,7 +93,8 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
 def break_rows(setup: StressScene) -> StressScene:
     """Break a random share of the rows, at least one, as if the file had NaN there."""
     count = len(setup.scene.gaussians)
-    broken = np.random.default_rng(SEED).choice(count, max(1, round(BROKEN_SHARE * count)), replace=False)
+    broken_share = 0.01  # share of the rows that become NaN
+    broken = np.random.default_rng(SEED).choice(count, max(1, round(broken_share * count)), replace=False)
     return replace(setup, scene=take_rows(setup.scene, np.delete(np.arange(count), broken)))
 
 
@@ -230,7 +229,8 @@ def _quality(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
 
 def _fit_slack(options: CompactOptions) -> float:
     """Return the additional tolerance (dB) of results with these options."""
-    return FIT_SLACK if options.fit.fit == "full" else 0.0
+    fit_slack = 1.0  # additional tolerance after a full fit, dB, since rounding changes thin structures by up to this
+    return fit_slack if options.fit.fit == "full" else 0.0
 
 
 def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:

@@ -23,7 +23,7 @@ M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
 # Bytes that a run needs
 BYTES_FIXED = 250_000_000  # interpreter and libraries
-BYTES_PER_GAUSSIAN = 150
+BYTES_PER_GAUSSIAN = 150  # of the scene, without higher harmonics
 BYTES_PER_VALUE = 4.5  # for each value of higher harmonics: of the scene, and of some of its groups
 BYTES_PER_PIXEL = 90  # the photo as floats, and arrays of segmentation and rendering
 # A conversion: of a Gaussian, up to a .sog or .glb; a .ply takes a third. Of each value of higher harmonics

@@ -15,7 +15,7 @@ from typing import Any
 from gsmerge.runtime.memory import memory_problem
 from gsmerge.runtime.work import Call, LostProcess, WorkerPool
 
-LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 LOST, FEWER = "its process was killed or ended unexpectedly", "perhaps out of memory, try fewer --jobs"
 
 
@@ -67,12 +67,12 @@ class ProcessPool(WorkerPool):
 @contextmanager
 def _library_threads(count: int) -> Iterator[None]:
     """Let NumPy's libraries use ``count`` threads in processes that are started within the block."""
-    before = {name: os.environ[name] for name in LIBRARIES if name in os.environ}
-    os.environ.update(dict.fromkeys(LIBRARIES, str(count)))
+    before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(count)))
     try:
         yield
     finally:
-        for name in LIBRARIES:
+        for name in THREAD_VARIABLES:
             del os.environ[name]
         os.environ.update(before)
 

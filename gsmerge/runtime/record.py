@@ -23,12 +23,11 @@ STAGES = (
 )  # fmt: skip
 FIT_STEP = "fit: "  # reports of a fit's steps begin with this
 BEFORE_FIT = 0.8  # share of the stages' seconds that pass before the fits
-MAX_NAMED = 4  # largest number of items that a note lists
 # Stages after which memory is released, since other threads have freed much of it
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 
-class Part(NamedTuple):
+class RunPart(NamedTuple):
     """A part of a run: the seconds of its fits and of all other stages, of which only the ratios count here."""
 
     stages: float
@@ -45,7 +44,7 @@ class Part(NamedTuple):
 class Forecast:
     """Share of a run that is done, by the seconds of its parts; within a part, by the steps of its fits."""
 
-    parts: list[Part] = field(default_factory=list)  # The present one and those after it
+    parts: list[RunPart] = field(default_factory=list)  # The present one and those after it
     spent: float = 0.0  # Seconds of the parts that have ended
     has_begun: bool = False
     fit: int = 0  # Fit of the present part, from 0, with its last step
@@ -57,10 +56,10 @@ class Forecast:
         if self.has_begun:
             self.spent += self.parts.pop(0).seconds
         if not self.parts:  # more parts than were expected
-            self.parts.append(Part(0.0))
+            self.parts.append(RunPart(0.0))
         self.has_begun, self.fit, self.step, self.part_spent = True, 0, 0, 0.0
 
-    def expect(self, parts: Iterable[Part]) -> None:
+    def expect(self, parts: Iterable[RunPart]) -> None:
         """Set the parts that follow the present one."""
         self.parts[self.has_begun :] = parts
 
@@ -137,13 +136,16 @@ def _write_to(record: Record) -> Iterator[Record]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Time a block or function as one of ``STAGES``; within another stage, its time counts for the outer stage."""
+    """Time a block or function as a stage; within another stage, its time counts for the outer stage.
+
+    Progress of a name that is not one of ``STAGES`` counts the stages before it.
+    """
     record = _current.get()
     if record is None or record.running is not None:
         yield
         return
     if name not in record.seconds:  # the second part of a stage is not a new step
-        report_progress(name, STAGES.index(name), len(STAGES))
+        report_progress(name, STAGES.index(name) if name in STAGES else len(record.seconds), len(STAGES))
     record.running, start = name, time.perf_counter()
     try:
         yield
@@ -156,8 +158,9 @@ def stage(name: str) -> Iterator[None]:
 
 def list_some(items: Sequence[str], separator: str = ", ") -> str:
     """List the first items for a note, and the number of further ones."""
-    rest = f" and {len(items) - MAX_NAMED} more" if len(items) > MAX_NAMED else ""
-    return separator.join(items[:MAX_NAMED]) + rest
+    max_named = 4  # largest number of items that a note lists
+    rest = f" and {len(items) - max_named} more" if len(items) > max_named else ""
+    return separator.join(items[:max_named]) + rest
 
 
 def note(text: str) -> None:
@@ -187,7 +190,7 @@ def adopt(part: Record) -> None:
     record.notes += [text for text in part.notes if text not in record.notes]
 
 
-def expect_parts(parts: Iterable[Part]) -> None:
+def expect_parts(parts: Iterable[RunPart]) -> None:
     """Set the parts that the current run expects after its present part, replacing earlier expectations."""
     current_record().forecast.expect(parts)
 

@@ -22,10 +22,8 @@ from gsmerge.runtime.record import Record, record_part, report_progress
 from gsmerge.runtime.threads import use_threads
 
 T = TypeVar("T")
-CONNECT_TIMEOUT = 10.0  # seconds to reach a cluster
 RETRIES = 5  # repetitions of a call whose process or node was lost
 SMALL_STORE = 100 << 20  # bytes of shared objects on a cluster of this machine
-CALLS_PER_PROCESS = 200  # a process is then replaced, so that memory leaks of libraries cannot add up
 
 
 class Call(NamedTuple):
@@ -183,7 +181,8 @@ class RayPool(WorkerPool):
     def __init__(self, cluster: Cluster, threads: int, *, jobs: int = 0) -> None:
         self.cluster, self.ray = cluster, cluster.ray
         self.threads, self.jobs = threads, jobs
-        self.function = self.ray.remote(max_retries=RETRIES, max_calls=CALLS_PER_PROCESS)(_call_in_folder)
+        calls_per_process = 200  # a process is then replaced, so that memory leaks of libraries cannot add up
+        self.function = self.ray.remote(max_retries=RETRIES, max_calls=calls_per_process)(_call_in_folder)
         self.keys: dict[Any, Any] = {}  # key of each running call, by the reference to its result
 
     @property
@@ -250,7 +249,8 @@ def _join(ray: ModuleType, address: str | None, store_bytes: int | None) -> None
     try:
         host, _, port = address.removeprefix("ray://").rpartition(":")
         if host and port.isdecimal():  # if nothing listens there, Ray itself would wait for minutes
-            with closing(socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT)):
+            connect_timeout = 10.0  # seconds to reach a cluster
+            with closing(socket.create_connection((host.strip("[]"), int(port)), timeout=connect_timeout)):
                 pass
         ray.init(address=address, **quiet)
     except (OSError, ValueError, RuntimeError) as error:

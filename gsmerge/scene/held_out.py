@@ -21,11 +21,7 @@ from gsmerge.scene.read import Loaded
 from gsmerge.scene.views import limit_photo_size
 from gsmerge.types import Scene, StrPath, Views
 
-_MAX_ANGLE = 0.2  # degrees by which a view's two poses may differ after one frame is moved to the other
-_MAX_SHIFT = 0.005  # largest distance between a view's two poses, relative to the extent of all views
-_MIN_SHARED = 3  # views that determine the similarity between two worlds
 _OPTION = "evaluate --target-images"  # gsmerge view has no such option
-_SAME_POSE = 1e-4  # largest distance of equal poses, relative to the scene's distance; and difference of rotations
 
 
 @dataclass(frozen=True)
@@ -122,14 +118,17 @@ def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict
         return stored, {}
     theirs = camera_file.viewmats[list(named)]
     ours = load.scene.cameras.viewmats[list(named.values())]
-    frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(named) >= _MIN_SHARED)
+    min_shared = 3  # views that determine the similarity between two worlds
+    frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(named) >= min_shared)
+    max_angle = 0.2  # degrees by which a view's two poses may differ after one frame is moved to the other
+    max_shift = 0.005  # largest distance between a view's two poses, relative to the extent of all views
     for frame in frames:
         moved, centres = frame.move_viewmats(theirs), camera_centres(ours)
         cosines = ((moved[:, :3, :3] * ours[:, :3, :3]).sum((1, 2)) - 1) / 2
         distance = np.linalg.norm(camera_centres(moved) - centres, axis=1).max()
         spread = float(np.linalg.norm(np.ptp(centres, axis=0), axis=0)) or 1.0
         angle = np.degrees(arccos(cosines.clip(-1, 1))).max()
-        if angle <= _MAX_ANGLE and distance / spread <= _MAX_SHIFT:
+        if angle <= max_angle and distance / spread <= max_shift:
             return frame, named
     return stored, {}
 
@@ -153,8 +152,9 @@ def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
+    same_pose = 1e-4  # largest distance of equal poses, relative to the scene's distance; and difference of rotations
     # The limit is relative to the distance of the scene, since a single view has no distance between views
-    limit = _SAME_POSE * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
+    limit = same_pose * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
     same_place = np.linalg.norm(camera_centres(moved)[:, None] - camera_centres(ours), axis=2) <= limit
-    same_rotation = np.abs(moved[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= _SAME_POSE
+    same_rotation = np.abs(moved[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= same_pose
     return {int(i): int(view) for i, view in zip(*np.nonzero(same_place & same_rotation), strict=True)}

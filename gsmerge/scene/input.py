@@ -37,7 +37,7 @@ def check_scene(scene: Scene) -> None:
         if values is not None:
             check_numbers(name, values)
     check_values(gaussians)
-    check_cameras(as_array(cameras.viewmats), as_array(cameras.Ks))
+    check_poses(as_array(cameras.viewmats), as_array(cameras.Ks))
 
 
 def check_values(columns: Mapping[str, Array]) -> None:
@@ -64,7 +64,7 @@ def _lie_within(values: np.ndarray, low: float, high: float) -> bool:
     return bool(np.fmin.reduce(values, axis=None) >= low and np.fmax.reduce(values, axis=None) <= high)
 
 
-def check_cameras(viewmats: np.ndarray, Ks: np.ndarray) -> None:
+def check_poses(viewmats: np.ndarray, Ks: np.ndarray) -> None:
     """Raise SceneError for impossible poses ``[c,4,4]`` or intrinsics ``[c,3,3]``."""
     for view, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
         if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-3:

@@ -63,7 +63,7 @@ from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
 T = TypeVar("T")
-SUMS = ("file_bytes", "num_nonfinite")  # facts about the files of several scenes that are added
+SUMMED_FACTS = ("file_bytes", "num_nonfinite")  # facts about the files of several scenes that are added
 
 
 @check_arguments
@@ -153,7 +153,7 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
     return replace(
         used[0],
         scene=scene,
-        info=replace(used[0].info, **{name: sum(getattr(load.info, name) for load in used) for name in SUMS}),
+        info=replace(used[0].info, **{name: sum(getattr(load.info, name) for load in used) for name in SUMMED_FACTS}),
         files=files,
         exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
         notes=(*notes, *joined.notes),

@@ -13,7 +13,7 @@ from gsmerge.io.photo_files import (
     PhotoArrays,
     PhotoTransform,
     Size,
-    decode_views,
+    decode_photos,
     keep_photos,
     limit_size,
     photo_size,
@@ -26,7 +26,6 @@ from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # size of all photos as floats, up to which photos are not resized unless rows have no pixels
-_FLOAT_PIXEL = 12  # bytes of a pixel as three floats
 _ROUNDING = 1e-6  # pixels
 
 
@@ -93,7 +92,7 @@ def find_larger_and_masks(
     def read(view: int) -> np.ndarray:
         if not paths:
             return cut(view, photos.pictures[view])
-        return cut(view, decode_views([paths[view]], [photos.turns[view]], stored, photos.part)[0])
+        return cut(view, decode_photos([paths[view]], [photos.turns[view]], stored, photos.part)[0])
 
     large = None
     if window.is_larger:
@@ -140,7 +139,8 @@ def limit_photo_size(
     if size is None:
         return photos, []
     pixels = len(photos) * size[0] * size[1]
-    if not unaligned and (_FLOAT_PIXEL * pixels <= _MAX_BYTES or 2 * rows > pixels):
+    float_pixel = 12  # bytes of a pixel as three floats
+    if not unaligned and (float_pixel * pixels <= _MAX_BYTES or 2 * rows > pixels):
         return photos, []
     transform, notes = _limit(size, max_side)
     return photos if transform is None else keep_photos(transform.photos(photos)), notes

@@ -15,10 +15,9 @@ from fractions import Fraction
 from gsmerge.errors import UsageError
 from gsmerge.settings.setting import Settings, setting, suggest_name
 
-SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes
+UNIT_BYTES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes
 AUTO = "auto"
-GREY_PSNR = 6.0  # dB; a picture of the mean grey reaches this on any photo, so nobody asks for less
-COUNT = r"\d[\d_]*|\d{1,3}(?:,\d{3})+|\d*\.?\d+(?:k|m|e\d)"  # Gaussians: 40000, 40_000, 40,000, 40k, 4e4
+COUNT_PATTERN = r"\d[\d_]*|\d{1,3}(?:,\d{3})+|\d*\.?\d+(?:k|m|e\d)"  # Gaussians: 40000, 40_000, 40,000, 40k, 4e4
 DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
 
 
@@ -119,9 +118,10 @@ def parse_quality(text: str) -> float:
     """
     match = re.fullmatch(r"(-?)(\d*\.?\d+)\s*db", str(text).strip().lower(), re.ASCII)
     value = float(match[2]) if match else math.inf
-    if match is None or not math.isfinite(value) or (value < GREY_PSNR and not match[1]):
+    grey_psnr = 6.0  # dB; a picture of the mean grey reaches this on any photo, so nobody asks for less
+    if match is None or not math.isfinite(value) or (value < grey_psnr and not match[1]):
         hint = f'; perhaps "{text}dB"' if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else ""
-        hint = f'; perhaps "-{value:g}dB"' if match is not None and 0 < value < GREY_PSNR else hint
+        hint = f'; perhaps "-{value:g}dB"' if match is not None and 0 < value < grey_psnr else hint
         raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}{hint}')
     return -value if match[1] else value
 
@@ -157,7 +157,7 @@ def parse_budget(budget: str | int | None, num_input: int) -> int:
         (40000, 25000)
     """
     text = str(budget).strip()
-    match = re.fullmatch(rf"(?:{COUNT})|(\d*\.?\d+)\s*%", text, re.ASCII | re.IGNORECASE)
+    match = re.fullmatch(rf"(?:{COUNT_PATTERN})|(\d*\.?\d+)\s*%", text, re.ASCII | re.IGNORECASE)
     if not match:
         is_fraction = re.fullmatch(r"\d*\.\d+", text, re.ASCII) is not None
         percent = float(text) * (100 if float(text) < 1 else 1) if is_fraction else 0.0
@@ -189,7 +189,7 @@ def parse_bytes(size: str | int) -> int:
     """
     text = str(size).strip()
     match = re.fullmatch(r"(\d*\.?\d+)\s*([A-Za-z]*)", text, re.ASCII)
-    unit = SIZES.get((match[2] or "B").upper()) if match else None
+    unit = UNIT_BYTES.get((match[2] or "B").upper()) if match else None
     if match is None or unit is None:
         raise ValueError(f'budget: expected a size as "5MB" or "800KiB", got {text!r}')
     return int(Fraction(match[1]) * unit)

@@ -36,10 +36,10 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
 # Settings that decide the number of Gaussians
 COUNTS = ("superpixels", "k", "budget")
 # Values for a run on a piece of a scene, which is a block or a batch of views: the whole scene decides these
-PIECE: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
+ONE_PIECE: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
 # Values for a run that tries settings on some of the views
 TRIAL: dict[str, Any] = {
-    **PIECE, "budget": None, "quality": None, "levels": 1, "crop": None, "drop": None,
+    **ONE_PIECE, "budget": None, "quality": None, "levels": 1, "crop": None, "drop": None,
     "photo_scale": 1.0, "recipe": None,
 }  # fmt: skip
 

@@ -12,7 +12,6 @@ Fit = Literal["full", "none"]
 STEPS = 320  # of the full fit
 LONG_STEPS = 600  # runs of at least so many steps gain from a little dropout
 USUAL_SHARE = 0.044  # Gaussians per pixel; photos with a quarter of the pixels suffice for this number
-TOO_FEW_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all their Gaussians
 # Steps for each photo, as a step draws one. Runs with fewer do not draw every photo before they grow, and do better
 # without: of 100 real views 20.9 dB for 20.7, in .6 of the time
@@ -119,7 +118,8 @@ class FitOptions(Settings):
         """Share of the steps, the first ones, that draw a quarter of the pixels."""
         if self.half_res_share is not None:
             return self.half_res_share
-        if self.steps < TOO_FEW_STEPS:
+        too_few_steps = 20  # shorter runs have no time for full-size photos
+        if self.steps < too_few_steps:
             return 1.0
         most = 0.5 if self.steps >= LONG_STEPS else 1.0  # details come last, and long runs have the time for them
         share = 1.0 if self.share is None or not self.grows else self.share / USUAL_SHARE

@@ -19,10 +19,10 @@ KRule = Literal["saliency", "distortion"]
 
 SEGMENTATIONS = ("rdseg", "bass", "bass-st", "grid")
 SHARE = "4.4%"  # superpixels per pixel by default
-MAX_CHILDREN = 8
+MAX_CHILDREN = 8  # most Gaussians of a superpixel
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # K differs between groups, and is one of these values
 USUAL_K = 1  # the K of "auto", except for a single camera without a long fit
-NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours to compare; measurements: docs/internals/notebook.md
+MATCH_NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours to compare; measurements: docs/internals/notebook.md
 CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, optionally with three angles in degrees"
 CROP_NUMBERS = {"sphere": (4,), "box": (6, 9)}
 DROPS = ("floaters", "sky", "transparent", "unseen")
@@ -109,7 +109,7 @@ class MatchOptions(Settings):
     @property
     def num_neighbors(self) -> int:
         """Number of nearest neighbours in other views that each Feature Gaussian is compared with."""
-        return self.neighbors or NEIGHBORS["aabb" if self.match == "aabb" else "overlap"]
+        return self.neighbors or MATCH_NEIGHBORS["aabb" if self.match == "aabb" else "overlap"]
 
 
 @dataclass(frozen=True)

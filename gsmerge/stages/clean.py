@@ -16,15 +16,12 @@ from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
 
 BOX_QUANTILES = (1, 99)  # percentiles of the positions along each axis that bound the scene's box
-OUTLIER_BOX = 10.0  # Gaussians are far from the scene if they lie outside of a box this many times as large
-NEIGHBORS = 8  # number of nearest Gaussians; a floater touches none of them
-TOUCH = 3.0  # two Gaussians touch if their distance is at most this many times the sum of their largest scales
-APART = 3.0  # the nearest Gaussian of a floater is farther away than this many times the median distance
+FLOATER_NEIGHBORS = 8  # number of nearest Gaussians; a floater touches none of them
 # A Gaussian hangs across the scene if its second or its largest scale exceeds the first or second share in CURTAIN of
-# half the diagonal of the scene's box, and also exceeds WIDER times the median of this scale. Exports, and results
-# without a fit, have no such Gaussians
-CURTAIN, WIDER = (0.1, 0.33), 8.0
-MAX_SAMPLE_GAUSSIANS = 200_000  # the share of floaters is estimated from at most about this many Gaussians
+# half the diagonal of the scene's box, and also exceeds CURTAIN_FACTOR times the median of this scale. Exports, and
+# results without a fit, have no such Gaussians
+CURTAIN, CURTAIN_FACTOR = (0.1, 0.33), 8.0
+FLOATER_GAUSSIANS = 200_000  # the share of floaters is estimated from at most about this many Gaussians
 
 ToWorld = Callable[[Gaussians], Gaussians]
 Counts = dict[str, int]
@@ -38,7 +35,8 @@ def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.nda
     """
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
     half = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
-    return np.asarray((np.abs(means - (low + high) / 2) > OUTLIER_BOX * half).any(1))
+    outlier_box = 10.0  # Gaussians are far from the scene if they lie outside of a box this many times as large
+    return np.asarray((np.abs(means - (low + high) / 2) > outlier_box * half).any(1))
 
 
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
@@ -51,13 +49,14 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     """
     rows = np.arange(len(gaussians)) if rows is None else rows
     means, sizes = gaussians.means.astype(np.float64), _sorted_scales(gaussians)[1].astype(np.float64)
-    if len(means) <= NEIGHBORS:
+    if len(means) <= FLOATER_NEIGHBORS:
         return np.zeros(len(rows), bool)
     nearest, touched = _nearest_of(means, sizes, rows, 1)
-    isolated = ~touched & (nearest > APART * np.median(nearest))
+    apart_factor = 3.0  # the nearest Gaussian of a floater is farther away than this many times the median distance
+    isolated = ~touched & (nearest > apart_factor * np.median(nearest))
     candidates = np.flatnonzero(isolated)  # most Gaussians touch the nearest one; few need the search for more
     if len(candidates):
-        isolated[candidates] = ~_nearest_of(means, sizes, rows[candidates], NEIGHBORS)[1]
+        isolated[candidates] = ~_nearest_of(means, sizes, rows[candidates], FLOATER_NEIGHBORS)[1]
     return isolated | beyond_scene(means[rows], means) | curtains(gaussians, rows)
 
 
@@ -67,7 +66,9 @@ def _nearest_of(means: np.ndarray, sizes: np.ndarray, rows: np.ndarray, count: i
     ``means [n,3]`` and ``sizes [n]`` are those of all rows, of which the ``count`` nearest are near.
     """
     ids, distances = find_nearest(means, count, rows)
-    return distances[:, 0], (distances <= TOUCH * (sizes[rows, None] + sizes[ids])).any(1)
+    # Two Gaussians touch if their distance is at most this many times the sum of their largest scales
+    touch_factor = 3.0
+    return distances[:, 0], (distances <= touch_factor * (sizes[rows, None] + sizes[ids])).any(1)
 
 
 def _sorted_scales(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +83,7 @@ def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
     low, high = np.percentile(gaussians.means.astype(np.float64), BOX_QUANTILES, axis=0)
     radius = np.sqrt(((high - low) ** 2).sum()) / 2
     is_wide = [
-        (scales[rows] > radius * share) & (scales[rows] > WIDER * np.median(scales))
+        (scales[rows] > radius * share) & (scales[rows] > CURTAIN_FACTOR * np.median(scales))
         for scales, share in zip(_sorted_scales(gaussians), CURTAIN, strict=True)
     ]
     return np.asarray(is_wide[0] | is_wide[1])
@@ -90,7 +91,7 @@ def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
 
 def floater_share(gaussians: Gaussians) -> float:
     """Estimate the share of finite Gaussians that are :func:`floaters`; 0 without Gaussians."""
-    rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // MAX_SAMPLE_GAUSSIANS)))
+    rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // FLOATER_GAUSSIANS)))
     return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
 
 

@@ -18,8 +18,7 @@ from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, PicturedScene, Scene
 from gsmerge.values.arrays import as_array
 
-GROUPS_PER_TASK = 8192
-REFILLS = 3  # rounds that replace Gaussians too faint to be seen; a few of the new Gaussians are faint again
+GROUPS_PER_TASK = 8192  # groups that a thread decodes at a time
 PLANE_WEIGHT = 1 / 16  # weight of squared distances from a group's plane, in the unit of the children's features
 
 
@@ -104,7 +103,8 @@ def deal_visible(
     ``total`` if the groups have too few members.
     """
     extra = max(0, total - num_groups)
-    for _ in range(REFILLS + 1):
+    refills = 3  # rounds that replace Gaussians too faint to be seen; a few of the new Gaussians are faint again
+    for _ in range(refills + 1):
         gaussians = make(1 + np.bincount(order[:extra], minlength=num_groups))
         missing = total - int((gaussians.opacities >= min_opacity).sum())
         if missing <= 0 or extra >= len(order):

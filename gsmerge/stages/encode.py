@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsmerge.geometry.pooling import ROWS, Members, Moments, Rule, pool_members
+from gsmerge.geometry.pooling import FOOTPRINT_ROWS, Members, Moments, Rule, pool_members
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import cross_view_stats
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 # Factors on the optical depth of a group if more views see through it than have a surface at its position: ALONE if no
 # other view has a surface there, DISPUTED if some do
 ALONE, DISPUTED = 0.15, 0.39
-NEAREST_VIEWS = 64  # number of nearest views that are compared; more views hardly change the result
 
 
 def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
@@ -66,11 +65,11 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
     labels = np.empty(len(members.pixels), np.int32)
 
     def label(start: int) -> None:
-        rows = slice(start, start + ROWS)
+        rows = slice(start, start + FOOTPRINT_ROWS)
         pixels = members.pixels[rows]
         labels[rows] = np.where(pixels >= 0, flat[pixels] + offsets[pixels // scene.pixels_per_view], -1)
 
-    parallel_map(label, range(0, len(labels), ROWS))
+    parallel_map(label, range(0, len(labels), FOOTPRINT_ROWS))
     starts, ids = group_members(labels, int(counts.sum()))
     sizes = np.diff(starts)
     has_members, views = sizes > 0, np.repeat(np.arange(len(scene)), groups.counts)
@@ -96,6 +95,7 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
     """Lower the optical depth of groups if more views see through them than have a surface at their position."""
     f = features
-    _, same_share, behind_share, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, NEAREST_VIEWS).T
+    nearest_views = 64  # number of nearest views that are compared; more views hardly change the result
+    _, same_share, behind_share, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, nearest_views).T
     factors = np.where(behind_share > same_share, np.where(same_share > 0, DISPUTED, ALONE), 1)
     return replace(features, gains=features.gains * factors.astype(np.float32))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.facts.holes import SIZE, make_gaussians
+from gsmerge.facts.holes import NEW_SIZE_PIXELS, make_round_gaussians
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.fit.outside import Outside
 from gsmerge.geometry.transforms import is_inside, project
@@ -28,19 +28,18 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 
 # Chosen on seven training captures
-SHARE = 0.03  # most new Gaussians, as a share of the fitted ones
-LEVEL = 8  # side of a drawing's pixel in pixels of the views; it is coarse, because the filling is blurred anyway
-BESIDE = -0.1  # position of a camera just beside the views, as a share of the distance to the nearest view
-MARGIN = 0.05  # margin of the drawings on each side, as a share of their sides
-CLEAR, SOLID = 0.1, 0.05  # transmittance above which a pixel is a gap, and below which it shows a surface
-# A surface is not continued if it is nearer than NEARER times the farthest depth in a window around the pixel, whose
-# half side is WINDOW times the width
-WINDOW, NEARER = 0.08, 0.85
-SOFT = 2.0  # standard deviation in pixels of the blur by which colours and inverse depths spread into gaps
-MOST_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
+FILLED_SHARE = 0.03  # most new Gaussians, as a share of the fitted ones
+FILL_LEVEL = 8  # side of a drawing's pixel in pixels of the views; it is coarse, because the filling is blurred anyway
+FILL_MARGIN = 0.05  # margin of the drawings on each side, as a share of their sides
+# Transmittance above which a pixel is a gap, and below which it shows a surface
+GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05
+# A surface is not continued if it is nearer than NEARER_SHARE times the farthest depth in a window around the pixel,
+# whose half side is WINDOW_SHARE times the width
+WINDOW_SHARE, NEARER_SHARE = 0.08, 0.85
+MOST_FILLED_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
 DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # candidate depths of a Gaussian, relative to the surface's depth
-REACH = 2  # a Gaussian reaches into a picture from at most this many pixels beside it
-FRONT = 0.98  # a camera would see a Gaussian in front of this share of a surface's depth
+BESIDE_PIXELS = 2  # a Gaussian reaches into a picture from at most this many pixels beside it
+FRONT_SHARE = 0.98  # a camera would see a Gaussian in front of this share of a surface's depth
 
 
 @stage("fill")
@@ -49,17 +48,20 @@ def fill_between(
 ) -> Gaussians:
     """Make Gaussians that fill gaps seen from cameras between or just beside those of the photos.
 
-    There are at most ``most`` new Gaussians, and at most ``SHARE`` times the number of ``fitted`` Gaussians. Gaps seen
-    from half-way cameras come first. The new Gaussians continue the farthest surface beside a gap. No photo and no view
-    from ``outside`` contradicts them, because they stand where these views do not see them. Each is in the field of
-    view of some photo, unless ``beyond``. Scenes of more than ``MOST_VIEWS`` views get none, because photos show nearly
-    everything between them.
+    There are at most ``most`` new Gaussians, and at most ``FILLED_SHARE`` times the number of ``fitted`` ones. Gaps
+    seen from half-way cameras come first. The new Gaussians continue the farthest surface beside a gap. No photo and no
+    view from ``outside`` contradicts them, because they stand where these views do not see them. Each is in the field
+    of view of some photo, unless ``beyond``. Scenes of more than ``MOST_FILLED_VIEWS`` views get none, because photos
+    show nearly everything between them.
     """
-    added, max_count = fitted[:0], min(most, int(SHARE * len(fitted)))
-    if max_count == 0 or not 1 < len(cameras) <= MOST_VIEWS:
+    added, max_count = fitted[:0], min(most, int(FILLED_SHARE * len(fitted)))
+    if max_count == 0 or not 1 < len(cameras) <= MOST_FILLED_VIEWS:
         return added
     cameras = _small_cameras(cameras)
-    between, splats = _widen(between_cameras(cameras, BESIDE)), make_splats(fitted)
+    # Position of a camera just beside the views, as a share of the distance to the nearest view. Chosen on seven
+    # training captures
+    beside = -0.1
+    between, splats = _widen(between_cameras(cameras, beside)), make_splats(fitted)
     if len(between) == 0:  # all views look in different directions
         return added
     drawings = parallel_map(lambda view: _draw(splats, between, view), range(len(between)))
@@ -107,10 +109,10 @@ class Seen:
     def contradict(self, points: np.ndarray) -> np.ndarray:
         """Return a mask ``[n]`` of the points ``[n,3]`` that stand in front of a surface, or in a gap of a camera."""
         (pixels, z), size = project(points, self.cameras), np.array([self.cameras.width, self.cameras.height])
-        inside = (z > 0) & ((pixels >= -REACH) & (pixels < size + REACH)).all(2)
+        inside = (z > 0) & ((pixels >= -BESIDE_PIXELS) & (pixels < size + BESIDE_PIXELS)).all(2)
         camera, point = np.nonzero(inside)
         column, row = np.clip(pixels[inside].astype(np.int64), 0, size - 1).T
-        wrong = self.clear[camera, row, column] | (z[inside] < FRONT * self.farthest[camera, row, column])
+        wrong = self.clear[camera, row, column] | (z[inside] < FRONT_SHARE * self.farthest[camera, row, column])
         return np.bincount(point[wrong], minlength=len(points)) > 0
 
 
@@ -124,15 +126,15 @@ def lies_between(known: np.ndarray) -> np.ndarray:
 
 
 def _small_cameras(cameras: Cameras) -> Cameras:
-    """Return the cameras with pixels ``LEVEL`` times as large."""
-    width, height = (max(LEVEL, round(side / LEVEL)) for side in (cameras.width, cameras.height))
+    """Return the cameras with pixels ``FILL_LEVEL`` times as large."""
+    width, height = (max(FILL_LEVEL, round(side / FILL_LEVEL)) for side in (cameras.width, cameras.height))
     scales = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
     return replace(cameras, Ks=cameras.Ks.astype(np.float64) * scales, width=width, height=height)
 
 
 def _widen(cameras: Cameras) -> Cameras:
     """Return the cameras with a margin on each side."""
-    right, down = (round(MARGIN * side) for side in (cameras.width, cameras.height))
+    right, down = (round(FILL_MARGIN * side) for side in (cameras.width, cameras.height))
     Ks = cameras.Ks + np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
     return replace(cameras, Ks=Ks, width=cameras.width + 2 * right, height=cameras.height + 2 * down)
 
@@ -150,9 +152,9 @@ def _draw(splats: Splats, cameras: Cameras, view: int) -> tuple[np.ndarray, np.n
 
 def _find_seen(cameras: Cameras, drawings: Sequence[tuple[np.ndarray, np.ndarray]]) -> Seen:
     """Find surfaces and gaps from the mean depths ``[h,w]`` and transmittance ``[h,w]`` of each camera."""
-    around = np.ones((2 * REACH + 1,) * 2, np.uint8)
+    around = np.ones((2 * BESIDE_PIXELS + 1,) * 2, np.uint8)
     farthest = np.stack([cv2.dilate(depths, around) for depths, _ in drawings])
-    return Seen(cameras, farthest, np.stack([transmittance > CLEAR for _, transmittance in drawings]))
+    return Seen(cameras, farthest, np.stack([transmittance > GAP_TRANSMITTANCE for _, transmittance in drawings]))
 
 
 def _continue_surfaces(
@@ -170,7 +172,7 @@ def _continue_surfaces(
     first depth that no view contradicts. If all depths are contradicted, there is no Gaussian. ``seen`` are the
     surfaces in the photos' cameras and in the cameras between them.
     """
-    gaps, surface_depths, colors = _spread_into_gaps(drawing, round(WINDOW * camera.width), beyond=beyond)
+    gaps, surface_depths, colors = _spread_into_gaps(drawing, round(WINDOW_SHARE * camera.width), beyond=beyond)
     eye, rays = camera.centres[0], _rays(gaps, camera)
     depths = np.array(DEPTH_FACTORS)[:, None] * surface_depths.astype(np.float64)
     points = (eye + depths[..., None] * rays).reshape(-1, 3)
@@ -178,11 +180,13 @@ def _continue_surfaces(
     for views in seen:
         wrong[~wrong] = views.contradict(points[~wrong])
     if outside is not None:
-        wrong[~wrong] = outside.contradict(points[~wrong], FRONT)
+        wrong[~wrong] = outside.contradict(points[~wrong], FRONT_SHARE)
     possible = ~wrong.reshape(depths.shape)
     rows = np.flatnonzero(possible.any(0))
     first_possible = depths[possible.argmax(0)[rows], rows]
-    return make_gaussians(eye, rays[rows], first_possible, SIZE / camera.Ks[0][0, 0], colors[rows], num_higher)
+    return make_round_gaussians(
+        eye, rays[rows], first_possible, NEW_SIZE_PIXELS / camera.Ks[0][0, 0], colors[rows], num_higher
+    )
 
 
 def _spread_into_gaps(
@@ -193,14 +197,17 @@ def _spread_into_gaps(
     Returns the pixels of gaps that are filled, ``[h,w]`` bool, and the depth ``[n]`` and the colour ``[n,3]`` of each.
     """
     depths, transmittance, image = drawing
-    solid, clear = transmittance < SOLID, transmittance > CLEAR
+    solid, clear = transmittance < SURFACE_TRANSMITTANCE, transmittance > GAP_TRANSMITTANCE
     window = np.ones((2 * reach + 1,) * 2, np.uint8)
-    known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), window))
+    known = solid & (depths >= NEARER_SHARE * cv2.dilate(np.where(solid, depths, np.float32(0)), window))
     clear &= cv2.dilate(known.astype(np.uint8), window) > 0
     clear &= beyond | lies_between(known)
     image = image / np.maximum(1 - transmittance, 1e-6)[..., None]
     values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
-    sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
+    # Standard deviation in pixels of the blur by which colours and inverse depths spread into gaps. Chosen on seven
+    # training captures
+    blur_pixels = 2.0
+    sums = blur(fill_gaps(values, known) * (clear | known)[..., None], blur_pixels)[clear]
     inverse_depths, colors, weights = sums[:, 0], sums[:, 1:4], sums[:, 4]
     return clear, weights / inverse_depths, colors / weights[:, None]
 

@@ -18,7 +18,7 @@ from gsmerge.types import Decoded
 SHORT = 60  # steps of a fit that tells which of two starts becomes better
 # Step sizes of a fit to renders, relative to the usual, if all Gaussians stay: a start is near to the renders, and the
 # distance from one Gaussian to the next is as the root of their number
-STEP = 0.09
+RENDERS_STEP = 0.09
 
 
 def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int) -> float:
@@ -50,7 +50,7 @@ def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: in
     returned as it is.
     """
     share = len(start.gaussians) / len(prepared.scene.gaussians)
-    options = replace(options, tuning=options.tuning.scaled(min(1.0, STEP / math.sqrt(share))))
+    options = replace(options, tuning=options.tuning.scaled(min(1.0, RENDERS_STEP / math.sqrt(share))))
     scene, reference = prepared.scene_around if options.grows else prepared.scene, prepared.reference
     held_out = reference.score_views if reference.placed else ()
     views = [view for view in range(len(scene)) if view not in held_out]

@@ -21,8 +21,6 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians
 from gsmerge.values.arrays import to_float32
 
-ROUND_SHARE = 0.25  # least share of the Gaussians that remains after a round
-CELL_SHARE = 0.2  # least share of a cell's Gaussians that remains after a round; longer chains of merges make haze
 # Chosen on training scenes by the PSNR of views from random cameras (docs/internals/notebook.md#bare-files)
 COLOR_WEIGHT = 0.6  # weight of squared distances of harmonics of degree 0, relative to costs in nats
 # Costs are multiplied by a power of the masses. The first power favours large parts of the pictures, for scenes; the
@@ -30,8 +28,8 @@ COLOR_WEIGHT = 0.6  # weight of squared distances of harmonics of degree 0, rela
 POWERS = 1.0, 0.3
 FLATNESS = 0.01  # least scale, relative to the largest, so that the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4  # least opacity of Gaussians that are merged, so that masses stay positive
-WIDER = 0.05  # most growth of scales for each doubling of the merged number; without it gaps would open
-CELLS_PER_TASK = 256
+MOST_WIDENING = 0.05  # most growth of scales for each doubling of the merged number; without it gaps would open
+CELLS_PER_TASK = 256  # cells that a thread merges at a time
 NEXT_AXIS = [1, 2, 0]  # the axis after each axis, so that products with it cover the three pairs of axes
 
 
@@ -66,9 +64,10 @@ def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) 
         return gaussians
     cloud = cloud_of(gaussians)
     cloud.weights[:] = power_of(cloud.masses, power)
+    round_share = 0.25  # least share of the Gaussians that remains after a round
     while len(cloud) > count:
-        cloud = _merge_round(cloud, max(count, int(ROUND_SHARE * len(cloud))))
-    return gaussians_of(cloud, gaussians, WIDER)
+        cloud = _merge_round(cloud, max(count, int(round_share * len(cloud))))
+    return gaussians_of_cloud(cloud, gaussians, MOST_WIDENING)
 
 
 def cloud_of(g: Gaussians) -> Cloud:
@@ -90,8 +89,10 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
 
     def merge_cells(begin: int) -> None:
         end = min(begin + CELLS_PER_TASK, len(starts) - 1)
+        # Least share of a cell's Gaussians that remains after a round; longer chains of merges make haze
+        cell_share = 0.2
         agglomerate(
-            cloud.means, cloud.covars, cloud.masses, cloud.weights, colors, order, starts, COLOR_WEIGHT, CELL_SHARE,
+            cloud.means, cloud.covars, cloud.masses, cloud.weights, colors, order, starts, COLOR_WEIGHT, cell_share,
             begin, end, pairs, costs,
         )  # fills `pairs` and `costs`  # fmt: skip
 
@@ -130,7 +131,7 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.concatenate([below, equal[: count - len(below)]]))
 
 
-def gaussians_of(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
+def gaussians_of_cloud(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
     """Convert moments to Gaussians; Gaussians that were not merged are copied from ``source``.
 
     If a mass would need an opacity above one, scales grow instead, at most by the share ``wider`` for each doubling of

@@ -18,15 +18,11 @@ from gsmerge.runtime.record import stage
 from gsmerge.types import Cameras, Gaussians
 
 ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of the change by rounding to eight bits
-START_LIMIT = 0.02  # limit of the first trial; Gaussians are left out if their largest blending weight is below it
-TRIALS = 6  # most limits that are tried
 TARGET_CHANGE = 0.9 * ROUNDING  # change at which the next limit aims
 ENOUGH_CHANGE = 0.75 * ROUNDING  # change at which the search for a larger limit ends
-MIN_DECREASE, MAX_INCREASE = 0.8, 2.0  # bounds of the factor on a limit that is too large, and on one that is not
-MAX_COMPARED_VIEWS = 8  # most views in which pictures with and without the Gaussians are compared
 # Sizes of the pixels relative to the photos' pixels: first for the blending weights, then for the compared pictures.
 # These pixels are samples of the photo, with the same low-pass, so the root mean square is the same
-LEVELS = 2, 4
+COMPARED_LEVELS = 2, 4
 
 
 @stage("prune")
@@ -37,17 +33,19 @@ def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gau
     camera's picture changes by more than ``ROUNDING`` (root mean square) without the unseen Gaussians. Gaussians
     outside of all pictures count as seen.
     """
-    peaks, inside = peak_weights(gaussians, blank_photos(cameras, LEVELS[0]))
+    peaks, inside = peak_weights(gaussians, blank_photos(cameras, COMPARED_LEVELS[0]))
     peaks[~inside] = np.inf
-    views = pick_views(len(cameras), MAX_COMPARED_VIEWS)
-    limit = _find_limit(gaussians, peaks, blank_photos(cameras[views], LEVELS[1])) if views else 0.0
+    max_compared_views = 8  # most views in which pictures with and without the Gaussians are compared
+    views = pick_views(len(cameras), max_compared_views)
+    limit = _find_limit(gaussians, peaks, blank_photos(cameras[views], COMPARED_LEVELS[1])) if views else 0.0
     unseen = np.flatnonzero(peaks < limit)
     return gaussians[np.flatnonzero(peaks >= limit)], gaussians[unseen[np.argsort(-peaks[unseen], kind="stable")]]
 
 
 def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> float:
     """Try limits; return the largest below which all Gaussians can be left out unnoticed, or 0 if there is none."""
-    splats, low, high, limit = make_splats(gaussians), 0.0, math.inf, START_LIMIT
+    start_limit = 0.02  # limit of the first trial; Gaussians are left out if their largest blending weight is below it
+    splats, low, high, limit = make_splats(gaussians), 0.0, math.inf, start_limit
 
     def clip(_: int, image: np.ndarray, __: np.ndarray) -> np.ndarray:
         return np.clip(image, 0, 1, out=image)
@@ -63,11 +61,13 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
 
         return math.sqrt(max(photo_errors(splats, photos, compare, keep=lambda _: shown)))
 
-    for _ in range(TRIALS):
+    trials = 6  # most limits that are tried
+    min_decrease, max_increase = 0.8, 2.0  # bounds of the factor on a limit that is too large, and on one that is not
+    for _ in range(trials):
         change = measure_change(limit)
         low, high = (low, limit) if change > ROUNDING else (limit, high)
         factor = math.sqrt(TARGET_CHANGE / max(change, 1e-9))  # the change grows about with the square of the limit
-        limit *= min(factor, MIN_DECREASE if change > ROUNDING else MAX_INCREASE)
+        limit *= min(factor, min_decrease if change > ROUNDING else max_increase)
         if low and (change > ENOUGH_CHANGE or not low < limit < high):
             break
     return low

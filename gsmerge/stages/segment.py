@@ -15,7 +15,14 @@ import numpy as np
 from gsmerge.facts.counts import CountLimits
 from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels.elementary import log, log10
-from gsmerge.kernels.superpixels.merge_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
+from gsmerge.kernels.superpixels.merge_tree import (
+    OVERSIZE,
+    PLANE_ERROR,
+    TREE_COLUMNS,
+    cut_labels,
+    merge_order,
+    region_sums,
+)
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.runtime.record import stage
@@ -24,15 +31,12 @@ from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 
-DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
 DEPTH_WEIGHT = 1.0  # weight of squared relative depth errors, relative to squared colour errors (sRGB in [0, 1])
-# Weight of squared pixels, relative to squared colours; without it regions become snakes that no Gaussian fits
-COMPACTNESS = 1e-5
 # Largest side of a region, as a share of the image's longer side, because the rasterizer's affine approximation bends
 # larger Gaussians. It is exceeded only if the budget is too small for more regions.
 MAX_EXTENT = 1 / 8
-KNEE_STEP = 1.25  # the slope of the curve is measured over this factor of the count
-KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count; below it, more Gaussians gain too little
+# dB of predicted quality per relative increase of the count; below it, more Gaussians gain too little
+REGION_KNEE_SLOPE = 1.0
 KNEE_FLOOR = 3e-4  # squared error per pixel and channel that remains at every count (noise, views that disagree)
 
 
@@ -148,10 +152,12 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
         usable = _usable_depths(depths[view], valid[view])
         labels, count = pad_labels(groups.labels[view]), groups.counts[view]
         pixels = np.ascontiguousarray(images[view], np.float32)
-        rows = np.empty((2 * count, ROW))
+        rows = np.empty((2 * count, TREE_COLUMNS))
         start = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
         pairs = adjacent_pairs(labels)
-        return *merge_order(pairs, rows, DEPTH_WEIGHT, COMPACTNESS, extent), start, int((usable > 0).sum())
+        # Weight of squared pixels, relative to squared colours; without it regions become snakes that no Gaussian fits
+        compactness = 1e-5
+        return *merge_order(pairs, rows, DEPTH_WEIGHT, compactness, extent), start, int((usable > 0).sum())
 
     merged_views = parallel_map(merge_view, range(len(images)))
     parents, view_heights, growths, starts, num_pixels = zip(*merged_views, strict=True)
@@ -181,7 +187,8 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
     usable = valid & np.isfinite(depths)
     positive = usable & (depths > 0)
     median = float(np.median(depths[positive])) if positive.any() else 1.0
-    clipped = np.clip(depths / median, 1 / DEPTH_RANGE, DEPTH_RANGE)
+    depth_range = 1e3  # depths are clipped to this factor of the view's median
+    clipped = np.clip(depths / median, 1 / depth_range, depth_range)
     return np.ascontiguousarray(np.where(usable, clipped, 0), np.float32)
 
 
@@ -211,8 +218,8 @@ def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
     Predicted quality is q(N) = -10 log10(floor + D(N)) dB. Its slope at N is measured between N / 1.25 and N, in dB per
-    relative increase of N. The knee is the largest N with a slope of at least ``KNEE_SLOPE``, or the least N if there
-    is none. ``counts [m]`` are all different; ``distortions [m]`` are mean squared errors per pixel and channel.
+    relative increase of N. The knee is the largest N with a slope of at least ``REGION_KNEE_SLOPE``, or the least N if
+    there is none. ``counts [m]`` are all different; ``distortions [m]`` are mean squared errors per pixel and channel.
     """
     counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
     if len(counts) == 0 or counts.shape != distortions.shape:
@@ -220,6 +227,7 @@ def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     order = np.argsort(counts)
     log_counts, error = log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
     quality = -10 * log10(KNEE_FLOOR + np.maximum(error, 0))
-    before = np.interp(log_counts - log(KNEE_STEP), log_counts, quality)
-    steep = (quality - before) / log(KNEE_STEP) >= KNEE_SLOPE
+    knee_step = 1.25  # the slope of the curve is measured over this factor of the count
+    before = np.interp(log_counts - log(knee_step), log_counts, quality)
+    steep = (quality - before) / log(knee_step) >= REGION_KNEE_SLOPE
     return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])

@@ -20,18 +20,13 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
-SIDE = 480.0  # length in pixels of the longer side to which gradients are scaled
-SMOOTH = 0.02  # largest gradient of a colour per pixel
-# Sky is blue and brighter than DARK, or brighter than WHITE with less chroma than GREY
-DARK, WHITE, GREY = 0.35, 0.75, 0.12
-WARM = 0.03  # red exceeds blue by at most this much, in nine tenths of the region
-LEAST_AREA, LEAST_TOP = 0.02, 0.4  # least share of the picture, and of its upper border, that is sky
-PALER, PALER_RANGE = -0.12, 0.08  # largest correlation of saturation with the row; least spread of saturation
-FAR = 3.0  # the sky is more than this many times as far away as the rest
-LEAST_VIEWS, LEAST_SHARE = 2, 0.2  # fewest views that show sky, and least share of all views; fewer may be mistaken
-AGREEMENT = 0.7  # a Gaussian is sky if at least this share of its blending weights lies in the sky
-LAYERS, LAST_LAYER = 6, 0.02  # most rounds; a round that adds less than this share of the sky found so far is the last
-MAX_SAMPLE_GAUSSIANS = 200_000  # most Gaussians whose depths are compared
+GRADIENT_PIXELS = 480.0  # length in pixels of the longer side to which gradients are scaled
+# Sky is blue and brighter than DARK_SKY, or brighter than WHITE_SKY with less chroma than GREY_SKY
+DARK_SKY, WHITE_SKY, GREY_SKY = 0.35, 0.75, 0.12
+FAR_RATIO = 3.0  # the sky is more than this many times as far away as the rest
+# Fewest views that show sky, and least share of all views; fewer may be mistaken
+LEAST_SKY_VIEWS, LEAST_SKY_SHARE = 2, 0.2
+SKY_GAUSSIANS = 200_000  # most Gaussians whose depths are compared
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
@@ -39,11 +34,13 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
     regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
     if not regions:
         return mask
-    for _ in range(LAYERS):  # each round finds sky that the sky of earlier rounds has hidden
+    # Most rounds; a round that adds less than this share of the sky found so far is the last
+    max_rounds, last_share = 6, 0.02
+    for _ in range(max_rounds):  # each round finds sky that the sky of earlier rounds has hidden
         rows = np.flatnonzero(~mask)
         is_sky = _mostly_inside(gaussians[rows], cameras, regions)
         mask[rows[is_sky]] = True
-        if is_sky.sum() < LAST_LAYER * mask.sum():
+        if is_sky.sum() < last_share * mask.sum():
             break
     return mask
 
@@ -56,7 +53,7 @@ def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict
         for view, region in regions.items()
         if _pales_downwards(photos[view], region) or _is_far(means, cameras[[view]], region)
     }
-    return shown if len(shown) >= max(LEAST_VIEWS, LEAST_SHARE * len(photos)) else {}
+    return shown if len(shown) >= max(LEAST_SKY_VIEWS, LEAST_SKY_SHARE * len(photos)) else {}
 
 
 def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:
@@ -69,32 +66,35 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
         sums = apply_transposed(weights, np.stack([region, np.ones_like(region)], 2).astype(np.float32))
         inside[weights.ids] += sums[:, 0]
         total[weights.ids] += sums[:, 1]
-    return np.asarray((inside > 0) & (inside >= AGREEMENT * total))
+    min_share = 0.7  # a Gaussian is sky if at least this share of its blending weights lies in the sky
+    return np.asarray((inside > 0) & (inside >= min_share * total))
 
 
 def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
     """Return whether a region ``[h,w]`` is several times as far away as the rest of the picture."""
-    (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // MAX_SAMPLE_GAUSSIANS))], camera)
+    (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // SKY_GAUSSIANS))], camera)
     inside = (depths > 0) & is_inside(pixels, camera)
     x, y = pixels[inside].astype(int).T
     in_region, depths = region[y, x], depths[inside]
     if not in_region.any() or in_region.all():
         return False
-    return bool(np.median(depths[in_region]) > FAR * np.median(depths[~in_region]))
+    return bool(np.median(depths[in_region]) > FAR_RATIO * np.median(depths[~in_region]))
 
 
 def sky_region(photo: np.ndarray) -> np.ndarray:
     """Return a mask ``[h,w]`` of smooth blue or white regions at a photo's upper border; empty if they are small."""
     height, width = photo.shape[:2]
-    scale = max(height, width) / SIDE
+    scale = max(height, width) / GRADIENT_PIXELS
     sigma = max(1.5 * scale, 0.5)
     upper = photo[: round(4 * sigma) + 3]  # the blurred upper border depends on these rows alone
-    if _like_sky(blur(upper, sigma), scale)[0].mean() < LEAST_TOP:
+    least_area, least_top = 0.02, 0.4  # least share of the picture, and of its upper border, that is sky
+    if _like_sky(blur(upper, sigma), scale)[0].mean() < least_top:
         return np.zeros((height, width), bool)
     soft = blur(photo, sigma)
     _, labels = cv2.connectedComponents(_like_sky(soft, scale).astype(np.uint8), connectivity=4)
     region = np.isin(labels, np.setdiff1d(labels[0], 0))
-    is_no_sky = region.mean() < LEAST_AREA or np.percentile((soft[..., 2] - soft[..., 0])[region], 10) < -WARM
+    max_warmth = 0.03  # red exceeds blue by at most this much, in nine tenths of the region
+    is_no_sky = region.mean() < least_area or np.percentile((soft[..., 2] - soft[..., 0])[region], 10) < -max_warmth
     return np.zeros_like(region) if is_no_sky else region
 
 
@@ -103,9 +103,10 @@ def _like_sky(soft: np.ndarray, scale: float) -> np.ndarray:
     right, down = (reduce(np.maximum, np.moveaxis(np.abs(slope), 2, 0)) / 8 for slope in sobel(soft))
     red, green, blue = colors = np.moveaxis(soft, 2, 0)
     bright, dark = reduce(np.maximum, colors), reduce(np.minimum, colors)  # takes a tenth of the time of max(2)
-    is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK)
-    is_white = (bright > WHITE) & (bright - dark < GREY)
-    return np.asarray((np.sqrt(right * right + down * down) * scale < SMOOTH) & (is_blue | is_white))
+    is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK_SKY)
+    is_white = (bright > WHITE_SKY) & (bright - dark < GREY_SKY)
+    max_gradient = 0.02  # largest gradient of a colour per pixel
+    return np.asarray((np.sqrt(right * right + down * down) * scale < max_gradient) & (is_blue | is_white))
 
 
 def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
@@ -114,6 +115,8 @@ def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
     bright = colors.max(1)
     saturation = (bright - colors.min(1)) / np.maximum(bright, 1e-6)
     low, high = np.percentile(saturation, (10, 90))
-    if high - low < PALER_RANGE or np.ptp(rows) == 0:
+    # Largest correlation of saturation with the row; least spread of saturation
+    max_correlation, min_spread = -0.12, 0.08
+    if high - low < min_spread or np.ptp(rows) == 0:
         return False
-    return bool(correlation(rows, saturation) <= PALER)
+    return bool(correlation(rows, saturation) <= max_correlation)

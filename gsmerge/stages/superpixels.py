@@ -32,10 +32,6 @@ from gsmerge.types import Groups
 from gsmerge.values.arrays import Array, as_array, like
 
 RECTANGLES, EARLY_SWEEPS = 2.0, 0  # rectangles per superpixel that rdseg merges, and sweeps before the merges
-NUM_SWEEPS = 2
-BLOCK = 32  # side in pixels of the squares that are cut into rectangles
-PIXEL_START = 0.45  # rectangles per pixel; above this share, the pixels themselves are merged instead of rectangles
-RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
 
 
 def segment(images: np.ndarray, options: SegmentOptions, count: int | None = None) -> Groups:
@@ -152,7 +148,8 @@ def _as_pixels(array: np.ndarray) -> np.ndarray:
     if not np.issubdtype(array.dtype, np.floating):
         raise ValueError(f"image: expected uint8 or float, got {array.dtype}")
     low, high = array.min(), array.max()
-    if not (low >= -RANGE_SLACK and high <= 1 + RANGE_SLACK):  # also refuses NaN
+    range_slack = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
+    if not (low >= -range_slack and high <= 1 + range_slack):  # also refuses NaN
         raise ValueError(f"image: expected values in [0, 1], got {low:g} to {high:g}")
     return np.ascontiguousarray(array, np.float32)
 
@@ -162,14 +159,17 @@ def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int,
     height, width, _ = pixels.shape
     spread = np.float32(compactness**0.5)
     num_rectangles = int(rectangles * count)
-    if num_rectangles > PIXEL_START * height * width:
+    pixel_start = 0.45  # rectangles per pixel; above this share, the pixels themselves are merged instead of rectangles
+    if num_rectangles > pixel_start * height * width:
         num_regions = height * width  # every pixel is its own region
         labels = pad_labels(np.arange(num_regions, dtype=np.int32).reshape(height, width))
     else:
-        labels, num_regions = split_rectangles(pixels, num_rectangles, BLOCK, float(compactness))
+        block_side = 32  # side in pixels of the squares that are cut into rectangles
+        labels, num_regions = split_rectangles(pixels, num_rectangles, block_side, float(compactness))
         labels = refine(labels, pixels, num_regions, early_sweeps, spread)
     labels = merge_regions(labels, pixels, num_regions, count, spread)
-    return refine(labels, pixels, count, NUM_SWEEPS, spread)
+    num_sweeps = 2  # most sweeps over the pixels, each of which may change to a neighbouring region
+    return refine(labels, pixels, count, num_sweeps, spread)
 
 
 def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
 from gsmerge.errors import SceneError
-from gsmerge.facts.confirm_depths import CERTAIN, ENOUGH
+from gsmerge.facts.confirm_depths import CHANCE_ERRORS, NORMAL_SAMPLES
 from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.transforms import camera_centres, camera_distances
 from gsmerge.io.photo_files import photo_array
@@ -21,17 +21,15 @@ from gsmerge.photos.views import camera_kinds, concat_cameras, in_float64, resiz
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.compact import PIECE, CompactOptions
+from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
-# Earlier Gaussians that are compared with new views
-SAMPLE_GAUSSIANS = 10_000
 # A "world" is a frame of coordinates. It is another one above this ratio: the difference between the colours of the
 # foremost Gaussians and the pictures, divided by their difference from random pixels; 1 is chance. Over batches of 15
 # captures the ratio is at most .87 in the same world and .92 to 1.08 in another one. The side has to be certain.
 WORLD_RATIO = 0.9
-SAME, ANOTHER, NOT_KNOWN = "the same", "another", "not known"  # worlds
+SAME_WORLD, ANOTHER_WORLD, UNKNOWN_WORLD = "the same", "another", "not known"  # worlds
 BATCH = "batch"  # place in messages until the file is known
 NOT_COMPARED = (
     "the pictures of this batch show too little of the earlier Gaussians to say whether both are in the same world"
@@ -76,18 +74,18 @@ def extend(
     scene has the kept views at the size of the first batch's views; each has its mended photo, or what stands in for
     it. ValueError if a setting is impossible for the scene; SceneError if the scene seems to be in another world.
     """
-    options = options.with_settings(PIECE)
+    options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
-        views, world, parts = _keep_pictures(prepared), NOT_KNOWN, []
+        views, world, parts = _keep_pictures(prepared), UNKNOWN_WORLD, []
         if before is not None:
             world = compare_worlds(before.gaussians, views, prepared.input_scene.gaussians.means)
             refuse_other_world(world, extend_options)
             parts = [before.gaussians]
         result = compact_prepared(prepared, method, options)
     notes = [text for text in result.report.notes if text != result.report.worse]  # that note is for final results
-    notes += [NOT_COMPARED] if before is not None and world == NOT_KNOWN else []
+    notes += [NOT_COMPARED] if before is not None and world == UNKNOWN_WORLD else []
     parts.append(result.gaussians.numpy())
     num_higher = max(part.shN.shape[1] for part in parts)
     gaussians, names = Gaussians.concat([pad_harmonics(part, num_higher) for part in parts]), views.names
@@ -113,25 +111,26 @@ def extend(
 
 
 def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
-    """Compare the world of new views with that of earlier Gaussians: ``SAME``, ``ANOTHER`` or ``NOT_KNOWN``.
+    """Compare the world of new views with that of earlier Gaussians; return one of the three names of worlds.
 
     In the same world the pictures show the earlier Gaussians, except where the batch's Gaussians, at ``means``, hide
     them. In another world the colours differ from the pictures as much as from random pixels.
     """
     if not len(views):
-        return NOT_KNOWN
+        return UNKNOWN_WORLD
     rows, hiding = np.isfinite(np.asarray(before.means)).all(1), means[np.isfinite(means).all(1)]
     pictures = photo_array(views.images)
-    check = check_cameras(before, rows, views.cameras, pictures, SAMPLE_GAUSSIANS, foremost=True, hiding=hiding)
-    margin = CERTAIN * check.ratio_error
-    if check.num_compared < ENOUGH or not abs(check.color_ratio - WORLD_RATIO) > margin:
-        return NOT_KNOWN
-    return SAME if check.color_ratio < WORLD_RATIO else ANOTHER
+    sample_gaussians = 10_000  # earlier Gaussians that are compared with new views
+    check = check_cameras(before, rows, views.cameras, pictures, sample_gaussians, foremost=True, hiding=hiding)
+    margin = CHANCE_ERRORS * check.ratio_error
+    if check.num_compared < NORMAL_SAMPLES or not abs(check.color_ratio - WORLD_RATIO) > margin:
+        return UNKNOWN_WORLD
+    return SAME_WORLD if check.color_ratio < WORLD_RATIO else ANOTHER_WORLD
 
 
 def refuse_other_world(world: str, options: ExtendOptions) -> None:
     """Raise SceneError for a batch that seems to be in another world, unless the options allow it."""
-    if world == ANOTHER and not options.other_world:
+    if world == ANOTHER_WORLD and not options.other_world:
         problem = "expected views in the same world as earlier batches, found pictures that do not show their Gaussians"
         raise SceneError(BATCH, problem, "begin another .gsm with this batch, or add it with --set other_world=true")
 

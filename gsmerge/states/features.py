@@ -28,18 +28,23 @@ from gsmerge.photos.views import concat_cameras, resize_cameras
 from gsmerge.pipeline import encode_views
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.compact import PIECE, CompactOptions
+from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
 from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
 from gsmerge.stages.superpixels import scene_saliency
-from gsmerge.states.extend import NOT_COMPARED, NOT_KNOWN, BatchReport, compare_worlds, number_names, refuse_other_world
+from gsmerge.states.extend import (
+    NOT_COMPARED,
+    UNKNOWN_WORLD,
+    BatchReport,
+    compare_worlds,
+    number_names,
+    refuse_other_world,
+)
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
 from gsmerge.version import __version__
-
-SAMPLE_STEP = 8  # pixels between samples of a view along each axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +135,7 @@ def extend_features(
     harmonics have another degree.
     """
     _check_options(options)
-    options = options.with_settings(PIECE)
+    options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress) as record:
         prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame, outside=False)
         prepared_scene, world = prepared.scene, _check_world(state, prepared.scene, extend_options)
@@ -153,7 +158,7 @@ def extend_features(
             saliency = group_saliency(features, members, corners)
             extended = _join(state, features, saliency, context, samples, plan.match)
     numbers = {"num_views": len(prepared_scene), "num_input": scene.num_gaussians, "num_new": len(features)}
-    notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == NOT_KNOWN else [])]
+    notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == UNKNOWN_WORLD else [])]
     report = BatchReport(
         **numbers, num_gaussians=len(extended), num_kept=0, pictures=prepared.reference.name, views={},
         sh_degree=scene.gaussians.sh_degree, seconds=record.seconds,
@@ -193,7 +198,7 @@ def _view_names(state: FeatureState | None, prepared: Prepared) -> tuple[str, ..
 def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
     """Compare the world of a canonical scene with that of a state; SceneError for another one, unless allowed."""
     if state is None:
-        return NOT_KNOWN
+        return UNKNOWN_WORLD
     world = compare_worlds(feature_to_gaussians(state.refined), scene, scene.gaussians.means)
     refuse_other_world(world, options)
     return world
@@ -212,7 +217,8 @@ def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
 
 def sample_views(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
     """Sample the foremost Gaussian at the centre of each cell of a grid; with a state, use its grid."""
-    new_shape = -(-cameras.height // SAMPLE_STEP), -(-cameras.width // SAMPLE_STEP)
+    sample_step = 8  # pixels between samples of a view along each axis
+    new_shape = -(-cameras.height // sample_step), -(-cameras.width // sample_step)
     height, width = new_shape if state is None else state.samples.opacities.shape[1:]
     rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
     columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)

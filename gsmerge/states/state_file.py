@@ -24,15 +24,14 @@ from gsmerge.io.formats.gsm import (
     write_scene,
 )
 from gsmerge.networks.checkpoint import build_networks
-from gsmerge.networks.options import CORRECTED, GROUP
+from gsmerge.networks.options import CORRECTED, GROUP_COLUMNS
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.scene.read import load_scene
 from gsmerge.states.features import FeatureState, ViewSamples
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
 from gsmerge.values.words import count_words
 
-COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
-LARGEST = 1e37  # absolute value of any number; float32 ends at 3e38
+FEATURE_COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
 _MAX_MEMBERS = (1 << 40) - 1  # of a group; larger numbers are damaged
 
 
@@ -61,7 +60,7 @@ def save_state(path: StrPath, state: State, *, overwrite: bool = False, mode: in
         return
     features = state.features
     assert features is not None
-    arrays: dict[str, np.ndarray] = {f"merged.{name}": getattr(features.merged, name) for name in COLUMNS}
+    arrays: dict[str, np.ndarray] = {f"merged.{name}": getattr(features.merged, name) for name in FEATURE_COLUMNS}
     arrays |= {f"refined.{name}": getattr(features.refined, name) for name in CORRECTED}
     arrays |= {name: getattr(features, name) for name in ("views", "num_members", "saliency", "group")}
     arrays |= {f"samples.{name}": column for name, column in vars(features.samples).items()}
@@ -114,7 +113,7 @@ def _read_features(file: GsmFile) -> FeatureState:
     shapes: dict[str, tuple[int, ...]] = {
         "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (num_higher, 3), "latents": (weights.options.latent,),
     }  # fmt: skip
-    columns = {name: _numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in COLUMNS}
+    columns = {name: _numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in FEATURE_COLUMNS}
     merged = FeatureGaussians(
         **columns,
         views=_whole_numbers(file, "merged.views", g, -1, num_views),
@@ -129,7 +128,7 @@ def _read_features(file: GsmFile) -> FeatureState:
         views=_whole_numbers(file, "views", g, 0, num_views),
         num_members=_whole_numbers(file, "num_members", g, 1, _MAX_MEMBERS + 1),
         saliency=file.finite("saliency", np.float64, g),
-        group=_numbers(file, "group", g, GROUP),
+        group=_numbers(file, "group", g, GROUP_COLUMNS),
         cameras=cameras,
         frame=Frame(file.finite("origin", np.float64, 3), unit),
         networks=weights,
@@ -169,8 +168,9 @@ def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
 def _numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
     """Return a float32 array; SceneError if it has numbers that would overflow later."""
     array = file.array(name, np.float32, *shape)
-    if not (np.abs(array).max(initial=0) <= LARGEST):  # NaN fails too
-        raise file.error(f"{name}: expected finite numbers up to {LARGEST:g}, found others")
+    largest = 1e37  # absolute value of any number; float32 ends at 3e38
+    if not (np.abs(array).max(initial=0) <= largest):  # NaN fails too
+        raise file.error(f"{name}: expected finite numbers up to {largest:g}, found others")
     return array
 
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar, cast
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Name in an annotation -> its words in messages, and the test of a value; CLASSES are the other names
-KINDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
+ARGUMENT_KINDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "None": ("", lambda value: value is None),
     "StrPath": ("a path", lambda value: isinstance(value, str | os.PathLike)),
     "str": ("a text", lambda value: isinstance(value, str)),
@@ -40,8 +40,8 @@ REMEDIES = {
 def check_arguments(function: Function) -> Function:
     """Decorate a public function so that arguments of undeclared types raise TypeError, with one line.
 
-    Only parameters are checked whose annotations consist of names from :data:`KINDS` and :data:`CLASSES`, and of lists
-    and mappings of these.
+    Only parameters are checked whose annotations consist of names from :data:`ARGUMENT_KINDS` and :data:`CLASSES`, and
+    of lists and mappings of these.
     """
     signature = inspect.signature(function)
     checked = {name: str(p.annotation) for name, p in signature.parameters.items() if _is_known(str(p.annotation))}
@@ -77,7 +77,7 @@ def _split(annotation: str) -> list[tuple[str, str]]:
 def _is_known(annotation: str) -> bool:
     """Return whether an annotation consists of known names only."""
     return all(
-        (container in CONTAINERS and _is_known(name)) if container else name in KINDS or name in CLASSES
+        (container in CONTAINERS and _is_known(name)) if container else name in ARGUMENT_KINDS or name in CLASSES
         for container, name in _split(annotation)
     )
 
@@ -86,7 +86,9 @@ def _check(name: str, annotation: str, value: Any) -> None:
     """Raise TypeError, with the expected types, if a value has none of the types of an annotation."""
     if _fits(annotation, value):
         return
-    words = re.sub(r"[\w.]+", lambda match: KINDS[match[0]][0] if match[0] in KINDS else match[0], annotation)
+    words = re.sub(
+        r"[\w.]+", lambda match: ARGUMENT_KINDS[match[0]][0] if match[0] in ARGUMENT_KINDS else match[0], annotation
+    )
     words = words.removesuffix(" | ").replace(" | ", " or ")
     remedies = (f"; {remedy}" for kind, remedy in REMEDIES.items() if re.search(rf"\b{kind}\b", annotation))
     raise TypeError(f"{name}: expected {words}, got {type(value).__name__}{next(remedies, '')}")
@@ -98,8 +100,8 @@ def _fits(annotation: str, value: Any) -> bool:
         if container:
             values = value.values() if isinstance(value, Mapping) else value
             fits = isinstance(value, CONTAINERS[container]) and all(_fits(name, each) for each in values)
-        elif name in KINDS:
-            fits = KINDS[name][1](value)
+        elif name in ARGUMENT_KINDS:
+            fits = ARGUMENT_KINDS[name][1](value)
         else:
             fits = any(base.__name__ == name for base in type(value).__mro__)
         if fits:

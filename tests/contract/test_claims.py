@@ -89,7 +89,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"The first {percent(FIT.half_res_part)} of the steps draw a {part(1 / schedule.STRIDE**2)} of the pixels",
         f"After {percent(RATES.outside_from)} of the steps, every {word(RATES.outside_every, ordinal=True)} step also"
         " looks at the scene [from outside]",
-        f"{move_poses.SAMPLE_PIXELS:,} pixels of a view are looked up in {word(move_poses.NEIGHBOURS)} neighbours",
+        f"{move_poses.POSE_PIXELS:,} pixels of a view are looked up in {word(move_poses.POSE_NEIGHBOURS)} neighbours",
         f"bring the greys together at {word(len(move_poses.SIDES))} sizes",
     ),
     LARGE: (
@@ -117,7 +117,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"samples for {FIT.half_res_part:g} of the steps".replace(" 0.", " ."),
         f"a weight that grows from 0 to {RATES.edge_weight:g} over the run",
         f"(**kept**: every {word(RATES.outside_every, ordinal=True)}, {outside.PLACES})",
-        f"{fit_pairs.STEP:g} / sqrt(share that stays)",
+        f"{fit_pairs.RENDERS_STEP:g} / sqrt(share that stays)",
     ),
     COMPACT: (
         f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",
@@ -125,7 +125,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"--effort best`: {plan.EFFORTS['best'].steps} steps",
         f"An estimate needs {word(left_out.LEAST_VIEWS)} photos, a result of at most {percent(new_views.MOST_SHARE)} of"
         " the Gaussians",
-        f"If they confirm less than {part(confirm_depths.POOR)}, a note says that the result will be poor",
+        f"If they confirm less than {part(confirm_depths.POOR_SHARE)}, a note says that the result will be poor",
         f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input".replace(" 0.", " ."),
         f"They show the photos at most {plan.FIDELITY_LOSS:g} dB worse than it does",
         f"at least {plan.FIDELITY_PSNR:g} dB against the input's",
@@ -136,20 +136,21 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f" {word(views.REPORT_VIEWS)} photos (in drafts: {word(plan.EFFORTS['draft'].report_views)})",
     ),
     CONVERT: (
-        f"at the upper border of at least {word(sky.LEAST_VIEWS)} photos and a {part(sky.LEAST_SHARE)} of all",
-        f"{word(int(sky.FAR))} times as far away as the rest",
+        f"at the upper border of at least {word(sky.LEAST_SKY_VIEWS)} photos and a {part(sky.LEAST_SKY_SHARE)} of all",
+        f"{word(int(sky.FAR_RATIO))} times as far away as the rest",
         f"below 1/{1 / FIT.min_contribution:g} in every picture",
     ),
     EVALUATE: (
         f"They start from {word(fog.VIEWS)} input views",
-        f"have at most {fog.SIDE} pixels on the longer side",
-        f"its opacity is below {fog.EMPTY:g} in the whole square of {fog.MARGIN} x {fog.MARGIN} pixels around",
-        f"those whose mean depth in the result is below {fog.VEIL:g} of the input's",
-        f"with an opacity above {fog.SOLID:g} in the input: those with one below {fog.OPEN:g} in the result",
+        f"have at most {fog.FOG_PIXELS} pixels on the longer side",
+        f"its opacity is below {fog.FOG_EMPTY:g} in the whole square of {fog.EROSION_PIXELS} x {fog.EROSION_PIXELS}"
+        " pixels around",
+        f"those whose mean depth in the result is below {fog.VEIL_SHARE:g} of the input's",
+        f"with an opacity above {fog.FOG_SOLID:g} in the input: those with one below {fog.FOG_OPEN:g} in the result",
         f"Such a Gaussian is at least {word(int(fog.RATIOS[0]))} times as long as its second axis",
         f"it is longer than {percent(fog.LONG)} of the width",
         f"There are up to {outside.PLACES} of them, or as many as photos if these are more",
-        f"steps back by {outside.LOW[0]:g} d to {outside.HIGH[0]:g} d",
+        f"steps back by {outside.STEP_BACK_LOW[0]:g} d to {outside.STEP_BACK_HIGH[0]:g} d",
         f"Far fog above {fit_report.HAZE:g} and worst veils above {fog.VEILED:g} are plain to see",
     ),
     HOW_MANY: (
@@ -157,24 +158,25 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
         f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {plan.LONE_K} for a single",
         f"counts PSNR plus {curve.SSIM_DB:g} dB times SSIM",
-        f"That is {percent(confirm_depths.MOST)} of the input if other views confirm at least"
-        f" {percent(confirm_depths.SOUND)} of the depth. It falls to {percent(confirm_depths.FEWEST)} if they confirm"
-        f" {percent(confirm_depths.WRONG)} or less",
+        f"That is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views confirm at least"
+        f" {percent(confirm_depths.SOUND_SHARE)} of the depth. It falls to {percent(confirm_depths.FEWEST)} if they"
+        f" confirm {percent(confirm_depths.WRONG_SHARE)} or less",
         f"tries up to {word(search.MAX_TRIED)} numbers, or {word(search.MAX_RUNS)} where no photo is left out",
         f"With {word(left_out.LEAST_VIEWS)} views or more, both leave out some views",
     ),
     PHOTOS: (
-        f"differs by {colors.STEP:g} of the range, averaged over {len(compare.WINDOW)} x {len(compare.WINDOW)} pixels",
+        f"differs by {colors.EXPOSURE_STEP:g} of the range, averaged over"
+        f" {len(compare.MEAN_WINDOW)} x {len(compare.MEAN_WINDOW)} pixels",
         f"at least {photo_sizes.MIN_AUTO_SCALE:g} times as many pixels a side",
-        f"wider than a {part(holes.LARGE)} of the picture",
-        f"cover at least {percent(holes.PART)} of it",
+        f"wider than a {part(holes.LARGE_SIDE)} of the picture",
+        f"cover at least {percent(holes.LARGE_AREA)} of it",
         f"exposures differ by more than {percent(exposure.DIFFERENT)} at random",
         f"A white pixel counts as {word(int(types.PROTECTED))}",
     ),
     STATES: (f"those of at most {ExtendOptions().max_views} views",),
     VIEW: (
         f"more than {splats.MAX_GAUSSIANS:,} Gaussians",
-        f"Of more than {data.MAX_VIEWS} views",
+        f"Of more than {data.MAX_SHOWN_VIEWS} views",
         f"or {' x '.join(map(str, drawings.PLACED_SIZE))} without cameras",
         f"at most {drawings.GIF_SIDE} pixels a side",
         f"a second shows {drawings.FPS:g} of them, or {drawings.GIF_FPS:g} of a GIF",
@@ -184,8 +186,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"a low-pass of {tiled_view.EPS2D:g} square pixels on every footprint",
         f"none is above {blend.MAX_ALPHA:g}",
         f"a Gaussian window of {metrics.WINDOW} x {metrics.WINDOW} pixels, sigma {metrics.SIGMA:g}",
-        f"larger than a {part(scene_size.LARGE)} of the scene",
-        f"base colours are beyond {scene_size.BRIGHT:g}",
+        f"larger than a {part(scene_size.LARGE_SCALE)} of the scene",
+        f"base colours are beyond {scene_size.BRIGHT_COLOR:g}",
         f"logits of opacities (within +-{ply.MAX_LOGIT:g})",
     ),
     EXPORTERS: (
@@ -201,8 +203,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
     ),
     REPORT: (
         f"of up to {views.MAX_SCORED_VIEWS} views with `--quality`",
-        f"null if it covers {percent(photos.WHOLE)} or more",
-        f"less than {metrics.POOR:g} dB from its input",
+        f"null if it covers {percent(photos.WHOLE_SHARE)} or more",
+        f"less than {metrics.POOR_PSNR:g} dB from its input",
         f"(at most {metrics.MAX_PSNR:g}, for equal pictures)",
         f"`psnr_kept` ({plan.FIDELITY_PSNR:g}) or `loss_kept` ({plan.FIDELITY_LOSS:g})",
     ),

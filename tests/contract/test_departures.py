@@ -14,7 +14,7 @@ from network_fixtures import made, noisy, untrained
 from gsmerge.networks.apply import encode_features
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.corrections import residual_limits
-from gsmerge.networks.options import GROUP, WIDE, NetworkOptions, weight_shapes
+from gsmerge.networks.options import ABSOLUTE_BOUNDS, GROUP_COLUMNS, NetworkOptions, weight_shapes
 from gsmerge.settings.compact import RECIPES
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 from gsmerge.stages.decode import decode
@@ -45,7 +45,7 @@ def heads() -> None:
     np.testing.assert_allclose(still.scales, np.repeat(sizes, 2)[:, None].repeat(3, 1), rtol=1e-5)
     assert (still.opacities == 0.5).all()
     moved = decode(features, scene.members, ALL, networks=scene.networks(noisy(SMALL, 100.0)))
-    limit = residual_limits(WIDE)[3]
+    limit = residual_limits(ABSOLUTE_BOUNDS)[3]
     assert 0.9 * limit < np.abs(np.log(as_array(moved.scales) / still.scales)).max() <= limit * 1.001
 
 
@@ -53,7 +53,7 @@ def group_numbers() -> None:
     """What is read besides tokens and latents."""
     shapes, width, latent = weight_shapes(OPTIONS), OPTIONS.width, OPTIONS.latent
     joined = {name: shapes[f"{name}.join.0.weight"][1] - width for name in ("encoder.set", "merger.set", "refiner")}
-    assert joined == dict.fromkeys(joined, 22 + 4) == dict.fromkeys(joined, GROUP)
+    assert joined == dict.fromkeys(joined, 22 + 4) == dict.fromkeys(joined, GROUP_COLUMNS)
     assert [shapes[f"heads.{k}.seeds.0.weight"][1] - latent for k in (1, 2, 4)] == [4, 4, 4]  # mass and base colour
 
 

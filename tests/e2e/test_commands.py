@@ -14,7 +14,7 @@ from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.measure.preview import BAND, GAP
+from gsmerge.measure.preview import GAP_PIXELS, LABEL_HEIGHT
 
 from .conftest import Run, listing
 
@@ -153,8 +153,11 @@ def test_a_panel_of_a_size_cuts_photos_as_it_cuts_views(small_copy: Path, run: R
     run(*call, "-o", out, code=0)
     assert out.read_bytes()[:2] == b"\xff\xd8"
     sheet = cv2.imread(str(out)).astype(float)
-    assert sheet.shape == (2 * (160 + BAND) + GAP, 2 * 480 + GAP, 3)
-    photo, view = sheet[BAND : BAND + 160, :480], sheet[BAND : BAND + 160, 480 + GAP :]
+    assert sheet.shape == (2 * (160 + LABEL_HEIGHT) + GAP_PIXELS, 2 * 480 + GAP_PIXELS, 3)
+    photo, view = (
+        sheet[LABEL_HEIGHT : LABEL_HEIGHT + 160, :480],
+        sheet[LABEL_HEIGHT : LABEL_HEIGHT + 160, 480 + GAP_PIXELS :],
+    )
     whole = cv2.imread(str(small_copy / "images" / "view_002.png"))
     whole = cv2.resize(whole, (480, 320), interpolation=cv2.INTER_CUBIC)
     run(*call, "-o", small_copy / "views", code=0)

@@ -14,7 +14,7 @@ from typing import Any
 
 from gsmerge.batch import BatchOptions, Job, find_jobs
 from gsmerge.batch.records import RECORDS
-from gsmerge.batch.run import Run, read_index
+from gsmerge.batch.run import Run, read_run_index
 from gsmerge.runtime.work import Call, WorkerPool
 from gsmerge.settings.compact import CompactOptions
 
@@ -80,7 +80,7 @@ class InlinePool(WorkerPool):
     capacity = 1
 
     def __init__(self, *_: object) -> None:
-        read_index.cache_clear()  # as in a new process
+        read_run_index.cache_clear()  # as in a new process
         self.ended: list[tuple[Any, Any]] = []
 
     def submit(self, function: Callable[..., Any], call: Call) -> None:
@@ -98,7 +98,7 @@ class InlinePool(WorkerPool):
 def one_job(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Job, Run]:
     """What :func:`make_result` takes for a single scene, as a run would have it that begins now."""
     out.mkdir(exist_ok=True)
-    read_index.cache_clear()
+    read_run_index.cache_clear()
     (job,) = find_jobs([str(scene)], out, options)
     return job, Run(out, 1, options.overwrite)
 

@@ -121,7 +121,7 @@ def views_of(
     """The lens; for every view its camera to world, what its rays meet, and the colours ``[h,w,3]`` of that."""
     lens = photograph.Pinhole(cameras.width, cameras.height, float(cameras.Ks[0, 0, 0]))
     assert np.allclose(cameras.Ks, lens.intrinsics)
-    packed, actual = shapes.pack([surface.shape for surface in surfaces]), []
+    packed, actual = shapes.pack_shapes([surface.shape for surface in surfaces]), []
     for viewmat in cameras.viewmats.astype(np.float64):
         c2w = invert(viewmat)
         hits = photograph.trace(packed, c2w, lens, 1)

@@ -58,6 +58,6 @@ def differentiate_rows(
 ) -> None:  # fmt: skip
     """Call the loss kernel on a range of rows of ``[h,3w]`` images, with buffers of its own."""
     room, weights = image_loss.room_of(weight.shape[1]), (np.float32(ssim_lambda), np.float32(edge_weight))
-    terms = np.empty((image_loss.ROWS, image_loss.TERMS, room), np.float32)
+    terms = np.empty((image_loss.DERIVATIVE_ROWS, image_loss.TERMS, room), np.float32)
     rows = np.empty((image_loss.EDGE_ROWS, room), np.float32)
     image_loss.loss_gradient(image, photo, weight, *weights, first, last, gradient, errors, terms, rows)

@@ -9,7 +9,7 @@ from sweeps import sweep
 
 from gsmerge.kernels import elementary
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, add_light, cast
-from gsmerge.research.generate.shapes import NO_WAVES, Material, Shape, ShapeArrays, pack
+from gsmerge.research.generate.shapes import NO_WAVES, Material, Shape, ShapeArrays, pack_shapes
 
 FAR, STEPS, EXACT = 12.0, 6_000, 1e-7
 KINDS = {"quad": QUAD, "box": BOX, "ellipsoid": ELLIPSOID, "cone": CONE, "leaf": LEAF, "blob": BLOB}
@@ -91,7 +91,7 @@ def ray(i: int, j: int, width: int, height: int, focal: float) -> np.ndarray:
 @sweep("seed", range(3))
 def test_depth_is_where_the_side_changes(name: str, seed: int) -> None:
     shape, (w, h, f) = random_shape(KINDS[name], np.random.default_rng([seed, KINDS[name]])), (11, 9, 18.0)
-    depth, ids, points, _ = run(pack([shape]), w, h, f)
+    depth, ids, points, _ = run(pack_shapes([shape]), w, h, f)
     slow = np.array([[slow_depth(shape, ray(i, j, w, h, f)) for j in range(w)] for i in range(h)])
     hit = np.isfinite(slow)
     assert hit.sum() >= 8
@@ -108,7 +108,7 @@ def test_depth_is_where_the_side_changes(name: str, seed: int) -> None:
 def test_normals_are_those_of_the_depth(name: str) -> None:
     """A step along the surface is at right angles to the normal, which looks at the camera."""
     shape, (w, h, f) = random_shape(KINDS[name], np.random.default_rng(KINDS[name])), (120, 90, 120.0)
-    depth, ids, _, normals = run(pack([shape]), w, h, f)
+    depth, ids, _, normals = run(pack_shapes([shape]), w, h, f)
     rays = np.stack([[ray(i, j, w, h, f) for j in range(w)] for i in range(h)])
     world = rays * np.where(ids == 0, depth, np.nan)[..., None]
     seen = ids == 0
@@ -126,8 +126,8 @@ def test_normals_are_those_of_the_depth(name: str) -> None:
 def test_the_nearest_of_several_shapes_is_seen() -> None:
     rng = np.random.default_rng(3)
     shapes = [random_shape(kind, rng) for kind in (BOX, ELLIPSOID, CONE, BLOB, QUAD)]
-    alone = np.stack([run(pack([shape]), 24, 18, 20.0)[0] for shape in shapes])
-    depth, ids, _, _ = run(pack(shapes), 24, 18, 20.0)
+    alone = np.stack([run(pack_shapes([shape]), 24, 18, 20.0)[0] for shape in shapes])
+    depth, ids, _, _ = run(pack_shapes(shapes), 24, 18, 20.0)
     np.testing.assert_allclose(
         depth, alone.min(0), rtol=1e-4
     )  # where a blob's search ends depends on what is before it
@@ -157,7 +157,7 @@ def test_light_reaches_what_nothing_is_before() -> None:
 
 def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(3)
-    shapes = pack([random_shape(kind, rng) for kind in (BOX, ELLIPSOID, CONE, BLOB, BLOB, LEAF, QUAD)])
+    shapes = pack_shapes([random_shape(kind, rng) for kind in (BOX, ELLIPSOID, CONE, BLOB, BLOB, LEAF, QUAD)])
     shapes.centres[1, 0], shapes.sizes[2, 1], shapes.waves[4, 0, 0] = np.nan, np.inf, np.nan
     axes, maps = np.stack([rotation(rng) for _ in range(3)]), rng.normal(size=(3, 8, 8)).astype(np.float32)
 
@@ -174,7 +174,7 @@ def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type:
 
 
 def test_no_shapes_and_no_points() -> None:
-    shapes = pack([random_shape(BOX, np.random.default_rng(0))])
+    shapes = pack_shapes([random_shape(BOX, np.random.default_rng(0))])
     assert run(shapes, 0, 0, 1.0)[0].shape == (0, 0)
     empty = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32), np.empty((0, 3, 3)), np.zeros(3), 1.0
     add_light(*empty, np.empty((0, 0, 0), np.float32), 0.1, np.empty(0), np.empty(0, np.float32))
@@ -182,7 +182,7 @@ def test_no_shapes_and_no_points() -> None:
 
 @pytest.mark.parametrize("rect", [(-1, 0, 2, 2), (0, -1, 2, 2), (0, 0, 4, 2), (0, 0, 2, 3)])
 def test_samples_outside_the_picture_are_refused(rect: tuple[int, ...]) -> None:
-    shapes = pack([random_shape(BOX, np.random.default_rng(0))])
+    shapes = pack_shapes([random_shape(BOX, np.random.default_rng(0))])
     table = shapes.kinds, shapes.rotations, shapes.centres, shapes.sizes, shapes.waves
     pictures = np.full((2, 3), 1e6), np.full((2, 3), -1, np.int32), *np.zeros((2, 2, 3, 3), np.float32)
     with refuses(ValueError, "cast", "indices"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsmerge.geometry.transforms import camera_depths, motion_matrices, project_points
-from gsmerge.kernels.compare_views import COLUMNS, add_differences, compare_views, find_surfaces
+from gsmerge.kernels.compare_views import SCRATCH_COLUMNS, add_differences, compare_views, find_surfaces
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import sample_bilinear
@@ -73,8 +73,8 @@ class Views:
         for first, last in ((0, 2), (2, count)):
             compare_views(
                 self.points, greys, self.starts, pairs, self.viewmats, self.given, self.Ks, self.pictures,
-                self.depths, NEAR, BORDER, SCALE, first, last, np.empty((COLUMNS, room)), np.empty(room, np.int64),
-                *out,
+                self.depths, NEAR, BORDER, SCALE, first, last, np.empty((SCRATCH_COLUMNS, room)),
+                np.empty(room, np.int64), *out,
             )  # fmt: skip
         return out
 

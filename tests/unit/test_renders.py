@@ -13,11 +13,18 @@ import unaligned_scenes
 from gsmerge import Cameras, CompactOptions, Scene, compact, render
 from gsmerge.compaction.estimate import estimate
 from gsmerge.compaction.make_plan import make_plan
-from gsmerge.facts.place_cameras import FEW_VIEWS, MOST_OUTSIDE, OUTSIDE, between_cameras, draw_around, draw_pictures
+from gsmerge.facts.place_cameras import (
+    FEW_RENDERED_VIEWS,
+    MOST_OUTSIDE,
+    OUTSIDE_SHARE,
+    between_cameras,
+    draw_around,
+    draw_pictures,
+)
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
-from gsmerge.fit.outside import HIGH, LOW, outside_cameras
+from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
 from gsmerge.fit.report import FitReport
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.pipeline import build
@@ -43,7 +50,7 @@ def test_nearer_to_the_input_than_superpixels(scene: Scene) -> None:
     pairs, superpixels = (compact(scene, budget="4%", **more).gaussians for more in ({}, {"max_color": 0.11}))
     for cameras, gain in (
         (between_cameras(scene.cameras, 0.25, 0.75), 0.7),
-        (outside_cameras(scene.gaussians.means, scene.cameras, 8, LOW, HIGH), 4),
+        (outside_cameras(scene.gaussians.means, scene.cameras, 8, STEP_BACK_LOW, STEP_BACK_HIGH), 4),
     ):
         ours, theirs = (distance(each, scene, cameras) for each in (pairs, superpixels))
         assert ours.mean() > theirs.mean() + gain
@@ -145,13 +152,13 @@ def test_a_fit_sees_what_lies_around_its_views(scene: Scene) -> None:
     drawn = draw_pictures(replace(scene, region=region))
     more = draw_around(drawn)
     assert more.region is region
-    assert len(more) > len(scene) + int(OUTSIDE * len(scene))
+    assert len(more) > len(scene) + int(OUTSIDE_SHARE * len(scene))
     assert len(more.images) == len(more.cameras) == len(more.names) == len(set(more.names))
     np.testing.assert_array_equal(more.images[: len(scene)], drawn.images)
     assert np.abs(more.images - render(scene.gaussians, more.cameras).images.clip(0, 1)).mean() < 1e-4
 
 
-@pytest.mark.parametrize(("count", "outside"), [(1, 0), (FEW_VIEWS + 1, 12), (4 * MOST_OUTSIDE, MOST_OUTSIDE)])
+@pytest.mark.parametrize(("count", "outside"), [(1, 0), (FEW_RENDERED_VIEWS + 1, 12), (4 * MOST_OUTSIDE, MOST_OUTSIDE)])
 def test_of_many_views_nothing_between_is_drawn(scene: Scene, count: int, outside: int) -> None:
     drawn, views = draw_pictures(scene), [0] * count
     several = replace(drawn, cameras=drawn.cameras[views], images=drawn.images[views], names=("",) * count)

@@ -14,14 +14,9 @@ from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.raster.photos import row_pictures
 from gsmerge.types import Scene
 
-SIDE = 1600  # longest side of a photo in which keypoints are searched, pixels
-MIN_SIDE = 8  # least side of such a photo, pixels
-KEYPOINTS = 4000  # most keypoints of a photo
-CONTRAST = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
-GREY = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
-RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
-SAME_DEPTH = 0.15  # largest relative difference of depths around a keypoint on one surface
-PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, divided by the diagonal of the picture
+KEYPOINT_PIXELS = 1600  # longest side of a photo in which keypoints are searched, pixels
+GREY_WEIGHTS = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
+MATCH_RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +81,13 @@ def find_keypoints(scene: Scene) -> list[Photo]:
 def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a picture ``[h,w,3]`` uint8 of a view, and its intrinsics.
 
-    The picture is the largest photo, reduced to SIDE pixels. Without photos it has the base colours of the Gaussians.
+    The picture is the largest photo, reduced to KEYPOINT_PIXELS pixels. Without photos it has the base colours of the
+    Gaussians.
     """
     if scene.large_photos is not None:
         large = scene.large_photos
         photo = large.read(large.ids[view])
-        share = min(1.0, SIDE / max(large.width, large.height))
+        share = min(1.0, KEYPOINT_PIXELS / max(large.width, large.height))
         size = max(1, round(large.width * share)), max(1, round(large.height * share))
         scale = np.array([[size[0] / large.width], [size[1] / large.height], [1.0]])
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if share < 1 else photo
@@ -106,10 +102,13 @@ def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarr
     ``stretch`` is the width of a pixel's footprint over its height. The picture is resized to square pixels.
     """
     height, width = picture.shape[:2]
-    wide = max(MIN_SIDE, round(width * max(stretch, 1)))
-    high = max(MIN_SIDE, round(height / min(stretch, 1)))
-    grey = ((picture.astype(np.int32) * GREY).sum(-1) >> 8).astype(np.uint8)
-    finder = cv2.SIFT.create(KEYPOINTS, contrastThreshold=CONTRAST)
+    min_side = 8  # least side of a photo in which keypoints are searched, pixels
+    wide = max(min_side, round(width * max(stretch, 1)))
+    high = max(min_side, round(height / min(stretch, 1)))
+    grey = ((picture.astype(np.int32) * GREY_WEIGHTS).sum(-1) >> 8).astype(np.uint8)
+    max_keypoints = 4000  # most keypoints of a photo
+    contrast = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
+    finder = cv2.SIFT.create(max_keypoints, contrastThreshold=contrast)
     with _any_processor():
         square = cv2.resize(grey, (wide, high), interpolation=cv2.INTER_LINEAR)
         keypoints, descriptors = finder.detectAndCompute(square, None)
@@ -144,7 +143,8 @@ def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.n
     x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)
     y = np.floor(pixels[:, 1]).astype(int).clip(0, height - 1)
     window = np.array([padded[y + down, x + right] for down in range(3) for right in range(3)])
-    is_surface = np.isfinite(window).all(0) & (window.max(0) < window.min(0) * (1 + SAME_DEPTH))
+    same_depth = 0.15  # largest relative difference of depths around a keypoint on one surface
+    is_surface = np.isfinite(window).all(0) & (window.max(0) < window.min(0) * (1 + same_depth))
     return lower_median(window), is_surface
 
 
@@ -157,7 +157,8 @@ def match_photos(
     first = _make_end([a for a, _ in pairs], [ids for ids, _ in rows])
     second = _make_end([b for _, b in pairs], [ids for _, ids in rows])
     diagonal = float(np.sqrt(size[0] ** 2 + size[1] ** 2))
-    return KeypointMatches(scenes, (first, second), PIXEL_SPREAD * diagonal)
+    pixel_spread = 0.003  # standard deviation of a keypoint, divided by the diagonal of the picture
+    return KeypointMatches(scenes, (first, second), pixel_spread * diagonal)
 
 
 def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
@@ -180,6 +181,6 @@ def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
     best = distances.argmin(1)
     two_best = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
-    is_clear = two_best[:, 0] < RATIO**2 * two_best[:, 1]
+    is_clear = two_best[:, 0] < MATCH_RATIO**2 * two_best[:, 1]
     matched = is_clear & (distances.argmin(0)[best] == np.arange(len(a)))
     return np.flatnonzero(matched), best[matched]

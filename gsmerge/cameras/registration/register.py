@@ -18,6 +18,7 @@ from gsmerge.cameras.registration.keypoints import End, KeypointMatches, Photo, 
 from gsmerge.cameras.registration.similarities import compose, fit_similarities, invert_similarity, round_similarity
 from gsmerge.geometry.transforms import (
     IDENTITY,
+    NORMAL_SPREAD,
     Damping,
     Similarity,
     camera_depths,
@@ -30,23 +31,13 @@ from gsmerge.kernels.matrices import matmul, solve, transform
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
-SAMPLE_TRIPLES = 2000  # random triples of matches
-TRIALS = 60  # best similarities of triples that are tested in the photos
-CLOSE = 0.25  # distance of matched points, divided by their depth, up to which a match supports a triple
 DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
-MIN_DEPTH_SPREAD = 0.01  # least measured standard deviation of the logarithm of a depth
-MIN_PIXELS = 0.2  # least measured standard deviation of a keypoint, pixels
-NORMAL = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
 NORMAL_2D = 1 / 1.1774  # standard deviation of two normal components, divided by the median length of their vector
 AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
 LOOSE = (100.0, 10.0, 2.0, 2.0)  # multiples of AGREE in each round; the first are large because chains of scenes drift
-BEHIND = 1e3  # replaces the logarithm of the depth ratio of points behind the camera
-CAUCHY = 4.0  # squared residual at which the weight of a match halves
 MIN_MATCHES = 16  # agreeing matches of two connected scenes; unrelated photos have up to 5
-MIN_SHARE = 0.15  # least share of agreeing matches
-ROUNDS = 3  # of selecting the agreeing matches of a pair and refining its similarity
 DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
-SIZE = 7  # parameters of a step: rotation, shift, logarithm of the scale
+NUM_PARAMETERS = 7  # parameters of a step: rotation, shift, logarithm of the scale
 
 Similarities = Sequence[Similarity | None]
 _Fit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]  # similarities; their cost, its curvature and slope
@@ -101,13 +92,15 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
     scores = [(1 - squares / AGREE).clip(0).sum() for squares in misses]
     similarities: Similarities = (trials[int(np.argmax(scores))], IDENTITY)
     agree = misses[int(np.argmax(scores))] < AGREE
-    for _ in range(ROUNDS):
+    rounds = 3  # of selecting the agreeing matches of a pair and refining its similarity
+    for _ in range(rounds):
         if agree.sum() < MIN_MATCHES // 2:
             return None
         similarities = _refine(similarities, [pair.select(agree)], DEPTH_SPREAD, fixed=1)
         agree = _squares(similarities, pair, DEPTH_SPREAD) < AGREE
     similarity = similarities[0]
-    if similarity is None or agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(matches)):
+    min_share = 0.15  # least share of agreeing matches
+    if similarity is None or agree.sum() < max(MIN_MATCHES, min_share * len(matches)):
         return None
     return similarity, matches.select(agree)
 
@@ -117,13 +110,16 @@ def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
     rng = np.random.default_rng(0)
     p, q = (end.points for end in matches.ends)
     first_depths, second_depths = (camera_depths(end.points, end.viewmats) for end in matches.ends)
-    rows = rng.integers(0, len(matches), (SAMPLE_TRIPLES, 3))
+    num_triples = 2000  # random triples of matches
+    rows = rng.integers(0, len(matches), (num_triples, 3))
     weights = (1 / (first_depths * second_depths))[rows]
     rotations, scales, shifts = fit_similarities(p[rows], q[rows], weights)
     moved = scales[:, None, None] * matmul(p, rotations.swapaxes(1, 2)) + shifts[:, None]
     squares = ((moved - q) ** 2).sum(2) / np.minimum(second_depths, scales[:, None] * first_depths) ** 2
-    closeness = (1 - squares / CLOSE**2).clip(0).sum(1)
-    best = np.argsort(-closeness, kind="stable")[:TRIALS]
+    max_distance = 0.25  # distance of matched points, divided by their depth, up to which a match supports a triple
+    closeness = (1 - squares / max_distance**2).clip(0).sum(1)
+    num_trials = 60  # best similarities of triples that are tested in the photos
+    best = np.argsort(-closeness, kind="stable")[:num_trials]
     return [Similarity(rotations[i], float(scales[i]), shifts[i]) for i in best]
 
 
@@ -175,7 +171,8 @@ def _residuals(similarity: Similarity, end: End, other: End, pixels: float, spre
     ratios = log(z / camera_depths(other.points, other.viewmats))
     values = np.empty((len(moved), 3))
     values[:, :2] = transform(whiten, projected - other.pixels)
-    values[:, 2] = np.where(camera[:, 2] > 0, ratios, BEHIND) / depth_share
+    behind = 1e3  # replaces the logarithm of the depth ratio of points behind the camera
+    values[:, 2] = np.where(camera[:, 2] > 0, ratios, behind) / depth_share
     return _Residuals(moved, values, matmul(by_camera, rotmats))
 
 
@@ -206,10 +203,12 @@ def _measure_spreads(
     values = [_both_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
     lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
     ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
-    spread = NORMAL * float(lower_median(ratios))
-    pixels = max(NORMAL_2D * float(lower_median(np.concatenate(lengths))), MIN_PIXELS)
+    spread = NORMAL_SPREAD * float(lower_median(ratios))
+    min_pixels = 0.2  # least measured standard deviation of a keypoint, pixels
+    pixels = max(NORMAL_2D * float(lower_median(np.concatenate(lengths))), min_pixels)
     measured = [replace(pair, spread=min(pixels, pair.spread)) for pair in matches]
-    return measured, min(max(spread, MIN_DEPTH_SPREAD), DEPTH_SPREAD)
+    min_depth_spread = 0.01  # least measured standard deviation of the logarithm of a depth
+    return measured, min(max(spread, min_depth_spread), DEPTH_SPREAD)
 
 
 # All scenes
@@ -274,7 +273,7 @@ def _refine(
     def step(state: _Fit, damping: float) -> _Fit | None:
         current, (_, curvature, slope) = state
         scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
-        steps = -solve(curvature + np.diag(scale), slope).reshape(-1, SIZE)
+        steps = -solve(curvature + np.diag(scale), slope).reshape(-1, NUM_PARAMETERS)
         if not np.isfinite(steps).all():
             return None
         moved = list(current)
@@ -296,27 +295,28 @@ def _normal_equations(
     similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, free: Sequence[int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return Cauchy's cost of the residuals, its curvature and its slope with respect to steps of the free scenes."""
-    size = len(free) * SIZE
+    size = len(free) * NUM_PARAMETERS
     curvature = np.zeros((size, size))
     slope = np.zeros(size)
     cost = 0.0
-    columns = {scene: slice(i * SIZE, (i + 1) * SIZE) for i, scene in enumerate(free)}
+    columns = {scene: slice(i * NUM_PARAMETERS, (i + 1) * NUM_PARAMETERS) for i, scene in enumerate(free)}
+    half_weight = 4.0  # squared residual at which the weight of a match halves
     for pair in matches:
         forward = _between(similarities, pair.scenes)
         both = _both_residuals(similarities, pair, spread)
         for source, similarity, residuals in zip((0, 1), (forward, invert_similarity(forward)), both, strict=True):
             squares = (residuals.values**2).sum(1)
-            weights = 1 / (1 + squares / CAUCHY)
-            cost += CAUCHY * float(log1p(squares / CAUCHY).sum())
+            weights = 1 / (1 + squares / half_weight)
+            cost += half_weight * float(log1p(squares / half_weight).sum())
             source_jacobian = _by_step(residuals.slopes, pair.ends[source].points, similarity)
             target_jacobian = -_by_step(residuals.slopes, residuals.moved, IDENTITY)
             jacobians = {pair.scenes[source]: source_jacobian, pair.scenes[1 - source]: target_jacobian}
             jacobians = {scene: jacobian for scene, jacobian in jacobians.items() if scene in columns}
             for scene, jacobian in jacobians.items():
-                weighted = (weights[:, None, None] * jacobian).reshape(-1, SIZE).T
+                weighted = (weights[:, None, None] * jacobian).reshape(-1, NUM_PARAMETERS).T
                 slope[columns[scene]] += matmul(weighted, residuals.values.reshape(-1))
                 for second, second_jacobian in jacobians.items():
-                    block = matmul(weighted, second_jacobian.reshape(-1, SIZE))
+                    block = matmul(weighted, second_jacobian.reshape(-1, NUM_PARAMETERS))
                     curvature[columns[scene], columns[second]] += block
     return cost, curvature, slope
 

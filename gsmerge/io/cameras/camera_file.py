@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import Similarity, pose_changes
-from gsmerge.io.bounds import MAX_VIEWS, check_pixels
+from gsmerge.io.bounds import MAX_VIEWS, check_image_size
 from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, change_photos, photo_size, same_shape
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.settings.reading import Order
@@ -22,15 +22,11 @@ from gsmerge.values.arguments import check_arguments
 # Limits of numbers in poses and intrinsics, sides and focal lengths. No camera exceeds them, and larger numbers would
 # overflow in later steps
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6
-_MAX_COEFFICIENT = 1e6  # of a lens; undistorting photos checks the effect of smaller coefficients
-_MAX_FOCAL_SIDES, _MAX_CENTRE_SIDES = 1e5, 1e3  # largest focal length and principal point, in longer sides of the image
-_MAX_ROTATION_ERROR = 0.02  # of the entries of R R^T
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
 
 # A principal point is in the middle if twice it differs by at most these pixels from the image's size
 CENTRED_PX = 1e-3
-PATCH = 14  # sides of vision transformers' inputs are multiples of it
-_OTHER_SIZE = 0.1  # sizes are different if their sides differ by at least this share
+PATCH_SIDE = 14  # sides of vision transformers' inputs are multiples of it
 _WHOLE = 1e-3  # pixels; tolerance of a side that is a whole number
 MAX_NORMALISED_FOCAL = 10.0  # a longer focal length is in pixels, and no image is that small
 
@@ -51,7 +47,6 @@ COEFFICIENTS = {  # names of a lens's coefficients, in order
 # Smallest share of an undistorted photo's pixels that lie within the photo. A lens with k1 = 1 / r^2, where r is half
 # of the image's diagonal, is stronger than any real lens and still has a third
 _MIN_SHARE = 0.25
-_GRID = 32  # pixels on each side of the grid on which this share is measured
 
 
 @dataclass(frozen=True)
@@ -150,7 +145,7 @@ def make_camera_file(
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
-    check_count(path, len(views))
+    check_camera_count(path, len(views))
     lacks_intrinsics = all(view.K is None for view in views)
     if lacks_intrinsics:  # placeholders, which the checks accept
         sides = [float(max(view.size)) or 1.0 for view in views]
@@ -196,14 +191,15 @@ def _check_lens(path: StrPath, view: StoredView) -> None:
     """Raise SceneError if a coefficient of a view's lens is too large."""
     if view.lens is None:
         return
+    max_coefficient = 1e6  # of a lens; undistorting photos checks the effect of smaller coefficients
     for name, coefficient in zip(COEFFICIENTS[view.lens.model], view.lens.coefficients, strict=False):
-        if not abs(coefficient) <= _MAX_COEFFICIENT:  # also for NaN
-            problem = f"expected a lens coefficient {name} within +-{_MAX_COEFFICIENT:g}, found {coefficient:g}"
+        if not abs(coefficient) <= max_coefficient:  # also for NaN
+            problem = f"expected a lens coefficient {name} within +-{max_coefficient:g}, found {coefficient:g}"
             text = f"view {view.name}: {problem} ({view.lens.name})"
             raise SceneError(path, text, "correct it, or undistort the images first")
 
 
-def check_count(path: StrPath, count: int) -> None:
+def check_camera_count(path: StrPath, count: int) -> None:
     """Raise SceneError if a file has more cameras than the limit, before anything is allocated for each."""
     if count > MAX_VIEWS:
         raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found more")
@@ -246,16 +242,19 @@ def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> N
 
 def is_orthonormal(axes: np.ndarray) -> bool:
     """Return whether axes ``[3,3]`` are orthonormal up to rounding, mirrored or not."""
-    return bool(np.abs(matmul(axes, axes.T) - np.eye(3)).max() <= _MAX_ROTATION_ERROR)
+    max_rotation_error = 0.02  # of the entries of R R^T
+    return bool(np.abs(matmul(axes, axes.T) - np.eye(3)).max() <= max_rotation_error)
 
 
 def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -> None:
     """Raise SceneError if intrinsics ``[3,3]`` in pixels do not fit an image of (width, height)."""
     if min(size) <= 1:  # not known
         return
+    # Largest focal length and principal point, in longer sides of the image
+    max_focal_sides, max_centre_sides = 1e5, 1e3
     for quantity, pixels, max_sides in (
-        ("a focal length", max(K[0, 0], K[1, 1]), _MAX_FOCAL_SIDES),
-        ("a principal point", np.abs(K[:2, 2]).max(), _MAX_CENTRE_SIDES),
+        ("a focal length", max(K[0, 0], K[1, 1]), max_focal_sides),
+        ("a principal point", np.abs(K[:2, 2]).max(), max_centre_sides),
     ):
         if pixels > max_sides * max(size):
             problem = f"expected {quantity} that fits an image of {size[0]} x {size[1]}, found {pixels:g} pixels"
@@ -306,16 +305,17 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     """Set the size of cameras without a size to twice their principal point, if photos have clearly another size.
 
     ``size`` is (width, height) of the photos. The new size must have the shape of the photos. Fractional sides are
-    rounded to multiples of ``PATCH``, since the inputs of networks have such sides.
+    rounded to multiples of ``PATCH_SIDE``, since the inputs of networks have such sides.
     """
     if size is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file
     sides = 2 * np.median(camera_file.Ks[:, :2, 2], 0)
     ratios = sides / size
-    has_photo_shape = float(ratios.max()) < (1 + _OTHER_SIZE) * float(ratios.min())
-    if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > _OTHER_SIZE).all():
+    min_difference = 0.1  # sizes are different if their sides differ by at least this share
+    has_photo_shape = float(ratios.max()) < (1 + min_difference) * float(ratios.min())
+    if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > min_difference).all():
         return camera_file
-    step = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH
+    step = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH_SIDE
     widths, heights = (np.full(len(camera_file), step * round(side / step)) for side in sides.tolist())
     return replace(camera_file, widths=widths, heights=heights)
 
@@ -347,7 +347,7 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
         if 0 in size or size == (1, 1):
             remedy = "add it, or give one photo for each camera, with its name or in the same order"
             raise SceneError(path, "expected the image size (w, h) of the cameras, found none", remedy)
-    check_pixels(path, *size)
+    check_image_size(path, *size)
     sides = np.stack([camera_file.widths, camera_file.heights], 1)
     has_size = (sides > 0).all(1, keepdims=True)
     Ks = camera_file.Ks.copy()
@@ -388,9 +388,10 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
 
 def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
     """Return the share of an undistorted photo's pixels that lie within the photo, measured on a grid."""
-    grid_K = K * np.array([_GRID / size[0], _GRID / size[1], 1.0])[:, None]
-    maps = _rectify_maps(grid_K, lens, (_GRID, _GRID))
-    return float(np.all([(axis >= -0.5) & (axis <= _GRID - 0.5) for axis in maps], 0).mean())
+    grid = 32  # pixels on each side of the grid on which the share is measured
+    grid_K = K * np.array([grid / size[0], grid / size[1], 1.0])[:, None]
+    maps = _rectify_maps(grid_K, lens, (grid, grid))
+    return float(np.all([(axis >= -0.5) & (axis <= grid - 0.5) for axis in maps], 0).mean())
 
 
 def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> PhotoArrays:

@@ -90,7 +90,7 @@ def to_array(values: Any) -> np.ndarray:
     return array
 
 
-def convert(function: Callable[[Any], Any], key: str, value: Any) -> Any:
+def convert_value(function: Callable[[Any], Any], key: str, value: Any) -> Any:
     """Convert the value of a key; ValueError that begins with the key if the value is wrong."""
     try:
         return function(value)

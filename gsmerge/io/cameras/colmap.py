@@ -15,7 +15,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rotation_entries
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, read_lines
-from gsmerge.io.cameras.camera_file import StoredView, check_count, make_lens, make_pinhole
+from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.first_bytes import read_start
 
@@ -27,17 +27,13 @@ _NUM_PARAMS = {
 _NAMES = dict(enumerate(_NUM_PARAMS))
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
-_SAME_SHAPE = 0.01  # images have one shape if the ratios of both sides differ relatively by at most this
-_SMALLER = 0.9  # an image is the model's smaller input if the ratio of the sides is below this
 _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 
 MAX_NAME = 1 << 16  # bytes of an image's name
-_NAME_PART = 64  # bytes of a name that are read at a time
 
 _MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # in a camera's line
 _MAX_DIGITS = 18  # in a whole number
 _WHOLE = re.compile(rf"[+-]?[0-9]{{1,{_MAX_DIGITS}}}([.]0*)?")
-_NOT_UNIT = 0.05  # four numbers are no quaternion if their length differs from 1 by more than this
 
 _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
@@ -85,8 +81,9 @@ def _numbers(file: BinaryIO, form: str) -> tuple[Any, ...]:
 def _name(file: BinaryIO) -> str:
     """Read text up to its zero byte."""
     name = b""
+    name_part = 64  # bytes of a name that are read at a time
     while b"\0" not in name:
-        part = file.read(_NAME_PART)
+        part = file.read(name_part)
         if not part or len(name) > MAX_NAME:
             raise ValueError("a name without an end")
         name += part
@@ -124,14 +121,16 @@ def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
     """
     sides = 2 * K[:2, 2]
     ratio_x, ratio_y = sides / np.maximum(size, 1)
-    has_photo_shape = abs(ratio_x - ratio_y) <= _SAME_SHAPE * abs(ratio_x)
-    is_input = has_photo_shape and ratio_x < _SMALLER and (sides == np.rint(sides)).all()
+    max_difference = 0.01  # images have one shape if the ratios of both sides differ relatively by at most this
+    has_photo_shape = abs(ratio_x - ratio_y) <= max_difference * abs(ratio_x)
+    smaller_ratio = 0.9  # an image is the model's smaller input if the ratio of the sides is below this
+    is_input = has_photo_shape and ratio_x < smaller_ratio and (sides == np.rint(sides)).all()
     return (int(sides[0]), int(sides[1])) if is_input else size
 
 
 def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
     (count,) = _numbers(file, "<Q")
-    check_count(path, count)
+    check_camera_count(path, count)
     cameras = {}
     for _ in range(count):
         camera_id, model_id, width, height = _numbers(file, "<iiQQ")
@@ -143,7 +142,7 @@ def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
 
 def _binary_images(path: Path, file: BinaryIO) -> list[_Image]:
     (count,) = _numbers(file, "<Q")
-    check_count(path, count)
+    check_camera_count(path, count)
     images = []
     for _ in range(count):
         _, *numbers, camera = _numbers(file, "<i7di")
@@ -163,7 +162,7 @@ def _has_content(line: str) -> bool:
 def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
     cameras: dict[int, StoredView] = {}
     for line in filter(_has_content, lines):
-        check_count(path, len(cameras) + 1)
+        check_camera_count(path, len(cameras) + 1)
         camera_id, model, width, height, *params = line.split(maxsplit=_MAX_WORDS)
         if len(params) != _NUM_PARAMS.get(model, len(params)) or max(len(width), len(height)) > _MAX_DIGITS:
             raise ValueError("wrong number of parameters, or digits")
@@ -183,7 +182,7 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredV
         if after_image and _lists_points(line, cameras):
             after_image = False
             continue
-        check_count(path, len(images) + 1)
+        check_camera_count(path, len(images) + 1)
         _, *numbers, camera, name = line.split(maxsplit=9)
         if len(numbers) != 7:
             raise ValueError("expected a rotation and a position")
@@ -200,4 +199,5 @@ def _lists_points(line: str, cameras: Mapping[int, StoredView]) -> bool:
     if len(start) < 10 or not _WHOLE.fullmatch(start[0]) or int(float(start[8])) not in cameras:
         return True
     quat = np.array(start[1:5], np.float64)
-    return bool(abs(np.sqrt((quat * quat).sum()) - 1) > _NOT_UNIT)
+    not_unit = 0.05  # four numbers are no quaternion if their length differs from 1 by more than this
+    return bool(abs(np.sqrt((quat * quat).sum()) - 1) > not_unit)

@@ -17,7 +17,6 @@ from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number
 from gsmerge.kernels.matrices import invert, matmul
 
 DATAPARSER = "dataparser_transforms.json"
-_OFFSET_ENDINGS, _MAX_OFFSETS = (".txt", ".xml", ".xyz"), 8  # of files that may have an offset, and how many are read
 _OFFSET = re.compile(r"(?:^|[>:=(])\s*N[\s,;]+N[\s,;]+N\s*(?:$|[<)])".replace("N", r"([-+]?\d+\.?\d*)"), re.MULTILINE)
 
 
@@ -53,9 +52,10 @@ def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
     Metashape and CloudCompare have them in text files, and DJI Terra in metadata.xml. The cameras are moved by each
     offset in both directions, since either side may be without it.
     """
-    paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in _OFFSET_ENDINGS})
+    offset_endings, max_offsets = (".txt", ".xml", ".xyz"), 8  # of files that may have an offset, and how many are read
+    paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in offset_endings})
     small = [path for path in paths if path.is_file() and os.access(path, os.R_OK) and path.stat().st_size <= 1 << 12]
-    found = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:_MAX_OFFSETS]]
+    found = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:max_offsets]]
     offsets = {tuple(map(float, numbers.groups())): name for name, numbers in found if numbers is not None}
     return [
         Similarity(

@@ -12,7 +12,6 @@ from gsmerge.io.formats.table import PLY, find_format
 
 SHARP = "SHARP"  # ``source`` of these cameras
 _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first versions lack the last
-SHARP_LAYERS = 2  # Gaussians in each cell of the grid: a front and a back layer
 
 
 def read_sharp(source: CameraSource) -> StoredCameras | None:
@@ -35,8 +34,9 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
     if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions: focal lengths and size
         focal_lengths, size = intrinsic[:2], intrinsic[2:]
         intrinsic = make_pinhole(*focal_lengths, *(size / 2)).reshape(-1)
-    side = round((data["vertex"].count / SHARP_LAYERS) ** 0.5)
-    if SHARP_LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
+    sharp_layers = 2  # Gaussians in each cell of the grid: a front and a back layer
+    side = round((data["vertex"].count / sharp_layers) ** 0.5)
+    if sharp_layers * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
         return None
     if len(extrinsic) not in (12, 16) or len(intrinsic) != 9:
         problem = f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}"

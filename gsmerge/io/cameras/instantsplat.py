@@ -10,8 +10,6 @@ from gsmerge.io.cameras.npz_files import read_matrices
 from gsmerge.io.image_names import natural_key
 from gsmerge.kernels.matrices import invert
 
-_SAME_POSE = 1e-4  # tolerance of numbers in two files with the same poses
-
 
 def take_optimised_poses(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
     """Replace poses by the optimised poses of InstantSplat's last iteration.
@@ -29,6 +27,7 @@ def take_optimised_poses(source: CameraSource, views: list[StoredView]) -> list[
         first_poses, poses = invert(original)[:, :3], invert(optimised)[:, :3]
     except np.linalg.LinAlgError:
         return views
-    if not np.allclose([view.pose for view in views], first_poses, rtol=_SAME_POSE, atol=_SAME_POSE):
+    same_pose = 1e-4  # tolerance of numbers in two files with the same poses
+    if not np.allclose([view.pose for view in views], first_poses, rtol=same_pose, atol=same_pose):
         return views
     return [view._replace(pose=pose) for view, pose in zip(views, poses, strict=True)]

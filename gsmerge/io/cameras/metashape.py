@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import check_count
+from gsmerge.io.cameras.camera_file import check_camera_count
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors
 from gsmerge.io.cameras.view_layout import Entry
 from gsmerge.io.xml_files import read_xml
@@ -18,7 +18,7 @@ from gsmerge.io.xml_files import read_xml
 _ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component_id", "label"}
 
 
-def list_cameras(source: CameraSource) -> list[Entry]:
+def list_metashape_cameras(source: CameraSource) -> list[Entry]:
     """List the cameras of the largest component, each with its sensor."""
     path = source.path
     root, cameras = _largest_component(path)
@@ -62,6 +62,6 @@ def _largest_component(path: Path) -> tuple[Element, list[Element]]:
     """Parse a file, and list the cameras with a pose of the component with most of these cameras."""
     root = read_xml(path, _ATTRIBUTES)
     cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
-    check_count(path, len(cameras))
+    check_camera_count(path, len(cameras))
     largest = dict(Counter(camera.get("component_id") for camera in cameras).most_common(1))
     return root, [camera for camera in cameras if camera.get("component_id") in largest]

@@ -21,8 +21,8 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.archives import open_archive
-from gsmerge.io.bounds import check_file, check_pixels, read_budget
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, MAX_NORMALISED_FOCAL, ORDERS, StoredView, check_count
+from gsmerge.io.bounds import check_file, check_image_size, read_budget
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, MAX_NORMALISED_FOCAL, ORDERS, StoredView, check_camera_count
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.photo_files import PhotoArrays
 from gsmerge.runtime.threads import quiet_warnings
@@ -31,10 +31,7 @@ _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of the arrays' names in ``c
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
-_MAX_INTRINSIC = 1e12
-_SMALL = 1e-9  # smaller principal points are raised to this, because they are divisors
 _EQUAL_INTRINSICS = 1e-5  # relative tolerance
-_MAX_RATIO_DIFFERENCE, _MIN_SIZE_DIFFERENCE = 0.03, 0.1  # relative: of two axes' ratios, and of two sizes
 _MAX_HEADER = 1 << 16  # bytes of an array's header
 _KINDS = "biufU"  # NumPy's kinds of arrays that are read: numbers and text
 
@@ -124,8 +121,9 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tu
     is_list = poses.ndim == 3 and len(poses) > 0 and poses.shape[1:] in ((3, 4), (4, 4))
     if not is_list or Ks.shape != (len(poses), 3, 3):
         raise SceneError(path, f"expected {names[0]} and {names[1]}, found {poses.shape} and {Ks.shape}")
-    check_count(path, len(poses))
-    if not (np.isfinite(poses).all() and np.all(np.abs(Ks.astype(np.float64)) < _MAX_INTRINSIC)):
+    check_camera_count(path, len(poses))
+    max_intrinsic = 1e12  # pixels; this refuses NaN and infinity, too
+    if not (np.isfinite(poses).all() and np.all(np.abs(Ks.astype(np.float64)) < max_intrinsic)):
         raise SceneError(path, f"expected finite numbers in {names[0]} and {names[1]}, found NaN or inf")
 
 
@@ -137,7 +135,7 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
         raise SceneError(path, f"expected images [{count},h,w,3], found {list(images.shape)}")
     if images.dtype.kind not in "fiu":
         raise SceneError(path, f"expected images of numbers, found {images.dtype}")
-    check_pixels(path, images.shape[2], images.shape[1])
+    check_image_size(path, images.shape[2], images.shape[1])
     if images.dtype == np.uint8:
         return np.ascontiguousarray(images)
     read_budget(path).check_memory(images.nbytes + images.size, "images")
@@ -150,11 +148,13 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
     """Scale intrinsics to an image size. These networks assume that the principal point is in the middle."""
     size = np.array([width, height])
-    ratio = 2 * np.maximum(Ks[:, :2, 2], _SMALL) / size
+    least_centre = 1e-9  # smaller principal points are raised to this, because they are divisors
+    ratio = 2 * np.maximum(Ks[:, :2, 2], least_centre) / size
     normalised = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 0, 2] < 2) & (width > 10)
+    max_ratio_difference, min_size_difference = 0.03, 0.1  # relative: of two axes' ratios, and of two sizes
     # If the ratios of both axes are equal and not 1, intrinsics are for another size; else the principal point is off
-    are_equal = np.abs(ratio[:, 0] / ratio[:, 1] - 1) < _MAX_RATIO_DIFFERENCE
-    other_size = are_equal & (np.abs(ratio[:, 0] - 1) > _MIN_SIZE_DIFFERENCE)
+    are_equal = np.abs(ratio[:, 0] / ratio[:, 1] - 1) < max_ratio_difference
+    other_size = are_equal & (np.abs(ratio[:, 0] - 1) > min_size_difference)
     scaled = Ks.copy()
     scaled[normalised, :2] *= size[:, None]
     other_size &= ~normalised

@@ -11,12 +11,11 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_lines
-from gsmerge.io.cameras.camera_file import StoredView, check_count, make_pinhole
+from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.foreign import INTRINSICS
 
 _POSE_COLUMNS = (12, 16)  # numbers in a line that is a pose
-_INTRINSIC_COLUMNS = (4,)  # fx, fy, cx, cy, pixels
 
 
 def lists_poses(path: Path) -> bool:
@@ -37,7 +36,8 @@ def read_poses(source: CameraSource) -> StoredCameras:
     poses = _parse(path, read_lines(path), _POSE_COLUMNS)
     Ks: list[np.ndarray | None] = [None]
     if intrinsics.is_file():
-        Ks = [make_pinhole(*row) for row in _parse(intrinsics, read_lines(intrinsics), _INTRINSIC_COLUMNS)]
+        intrinsic_columns = (4,)  # fx, fy, cx, cy, pixels
+        Ks = [make_pinhole(*row) for row in _parse(intrinsics, read_lines(intrinsics), intrinsic_columns)]
     if len(Ks) not in (1, len(poses)):
         raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(Ks)}")
     pairs = zip(poses, repeat(Ks[0]) if len(Ks) == 1 else Ks, strict=False)
@@ -57,7 +57,7 @@ def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[n
             rows += [np.array(words, np.float64)] if words else []
         except ValueError as error:
             raise SceneError(path, f"line {number}: expected numbers ({error})") from error
-        check_count(path, len(rows))
+        check_camera_count(path, len(rows))
     return rows
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_json
-from gsmerge.io.cameras.camera_file import CENTRED_PX, MAX_NORMALISED_FOCAL, MAX_NUMBER, StoredView, check_count
+from gsmerge.io.cameras.camera_file import CENTRED_PX, MAX_NORMALISED_FOCAL, MAX_NUMBER, StoredView, check_camera_count
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors
 from gsmerge.io.cameras.view_layout import Entry
 from gsmerge.io.image_names import natural_key, natural_order
@@ -20,7 +20,7 @@ def list_shots(source: CameraSource) -> list[Entry]:
     with number_errors(source.path, "expected reconstructions of 'cameras' and 'shots'"):
         largest = max(source.json, key=lambda entry: len(entry["shots"]))
         shots, cameras = dict(largest["shots"]), largest["cameras"]
-        check_count(source.path, len(shots))
+        check_camera_count(source.path, len(shots))
         for name, shot in shots.items():
             if shot["camera"] not in cameras:
                 problem = f"view {name}: expected one of the 'cameras' in 'camera', found {shot['camera']!r}"
@@ -34,7 +34,7 @@ def list_shots(source: CameraSource) -> list[Entry]:
 def list_keyframes(source: CameraSource) -> list[Entry]:
     """List the views of a folder of Polycam, which has a file for each, with a key for each number of its pose."""
     paths, entries = natural_order(source.path.glob("*.json")), list[Entry]()
-    check_count(source.path, len(paths))
+    check_camera_count(source.path, len(paths))
     for path in paths:
         with number_errors(path, f"view {path.stem}: expected an object with t_00 to t_23, among others"):
             values = read_json(path)
@@ -63,7 +63,7 @@ def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
     entries: Sequence[Mapping[str, Any]] = source.object[key]
     if not isinstance(entries, list):
         raise SceneError(source.path, f"expected {key!r} to be a list, found something else")
-    check_count(source.path, len(entries))
+    check_camera_count(source.path, len(entries))
     with number_errors(source.path, f"{key}: expected entries of 'camera_id' and 'matrix'"):
         return {str(entry["camera_id"]): entry["matrix"] for entry in entries}
 

@@ -22,7 +22,6 @@ _lazy = lazy_functions(__package__)
 holds_images = _lazy("npz_files.holds_images")
 _holds_poses = _lazy("npz_files.holds_poses")
 count_images = _lazy("colmap.count_images")
-_MAX_CANDIDATES = 16  # files in a folder that are searched for cameras
 _CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt")
 
 
@@ -53,7 +52,8 @@ def find_other_cameras(folder: Path) -> Path | None:
     """
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _CANDIDATE_ENDINGS)
     files = [path for path in files if path.name != INTRINSICS and not path.name.endswith(ENDING)]
-    files = [path for path in files if path.is_file()][:_MAX_CANDIDATES]
+    max_candidates = 16  # files in a folder that are searched for cameras
+    files = [path for path in files if path.is_file()][:max_candidates]
     files = [path for path in files if holds_cameras(path)]
     return files[0] if len(files) == 1 else None
 

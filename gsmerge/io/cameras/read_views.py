@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import Lens, StoredView, check_count, make_lens, make_pinhole
+from gsmerge.io.cameras.camera_file import Lens, StoredView, check_camera_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_source import (
     CameraSource,
     StoredCameras,
     check_objects,
-    convert,
+    convert_value,
     number_errors,
     to_number,
 )
@@ -29,7 +29,6 @@ _COEFFICIENTS = (*_DISTORTION, "k5", "k6")
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
 _FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length follows
-_MAX_MODEL = 40  # letters of a camera model's name
 
 
 def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
@@ -68,7 +67,7 @@ def _list_entries(source: CameraSource, key: str) -> list[Entry]:
     if not isinstance(views, list):
         raise SceneError(source.path, f"expected {place} to be a list of objects, found something else")
     check_objects(source.path, views, place)
-    check_count(source.path, len(views))
+    check_camera_count(source.path, len(views))
     return [Entry(view, source.object) for view in views]
 
 
@@ -96,16 +95,16 @@ def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, A
     """Convert the intrinsics, size and lens in the values of a view, or of the object that views share.
 
     The result has the keys of ``number_keys``, "K" for a matrix, "mask", and for a lens "model", "is_fisheye",
-    "distortion_params" and the coefficients, as far as the file has them. Errors as in :func:`convert`.
+    "distortion_params" and the coefficients, as far as the file has them. Errors as in :func:`convert_value`.
     """
     keys = layout.number_keys | ({name: name for name in _COEFFICIENTS} if layout.lens else {})
     camera: dict[str, Any] = {}
     for name, key in keys.items():
         value = _find_value(values, key)
         if value is not None:
-            camera[name] = convert(to_number, " or ".join(_alternatives(key)), value)
+            camera[name] = convert_value(to_number, " or ".join(_alternatives(key)), value)
     if isinstance(layout.size, str) and values.get(layout.size) is not None:
-        camera["h"], camera["w"] = convert(_two_numbers, layout.size, values[layout.size])
+        camera["h"], camera["w"] = convert_value(_two_numbers, layout.size, values[layout.size])
     if isinstance(layout.K, Matrix) and values.get(layout.K.key) is not None:
         camera["K"] = layout.K.read(values)
     if values.get(layout.mask):
@@ -114,12 +113,13 @@ def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, A
         return camera
     if values.get(layout.lens) is not None:
         model = values[layout.lens]
-        camera["model"] = str(layout.models.get(model, model)).upper()[:_MAX_MODEL]
+        max_model = 40  # letters of a camera model's name
+        camera["model"] = str(layout.models.get(model, model)).upper()[:max_model]
     if values.get("is_fisheye") is not None:
         camera["is_fisheye"] = values["is_fisheye"]
     if values.get("distortion_params") is not None:
         numbers = values["distortion_params"][: len(_DISTORTION)]
-        camera["distortion_params"] = [convert(to_number, "distortion_params", number) for number in numbers]
+        camera["distortion_params"] = [convert_value(to_number, "distortion_params", number) for number in numbers]
     return camera
 
 

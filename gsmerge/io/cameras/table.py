@@ -16,7 +16,7 @@ from gsmerge.io.cameras.embedded import SHARP, read_sharp
 from gsmerge.io.cameras.long_lrm import is_long_lrm, move_to_gaussians
 from gsmerge.io.cameras.programs import join_matrices, list_keyframes, list_shots, set_centred_size
 from gsmerge.io.cameras.read_views import read_views
-from gsmerge.io.cameras.view_layout import Matrix, Pinhole, RotationAndShift, ViewLayout, rotation_of_vector
+from gsmerge.io.cameras.view_layout import Matrix, PinholeKeys, RotationAndShift, ViewLayout, rotation_of_vector
 from gsmerge.io.first_bytes import read_start
 from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
@@ -76,7 +76,7 @@ _TRANSFORMS = ViewLayout(
     views="frames",
     name=("file_path", "image_path", "name"),
     pose=Matrix("transform_matrix"),  # applied_transform is not applied: poses are in the Gaussians' world
-    K=Pinhole("fl_x", "fl_y", "cx", "cy", angle_x="camera_angle_x", angle_y="camera_angle_y"),
+    K=PinholeKeys("fl_x", "fl_y", "cx", "cy", angle_x="camera_angle_x", angle_y="camera_angle_y"),
     size=("w", "h"),
     mask="mask_path",
     lens="camera_model",
@@ -86,14 +86,14 @@ _LONG_LRM = ViewLayout(
     views="frames",
     name=("file_path", "image_path"),
     pose=Matrix("w2c", (4, 4)),
-    K=Pinhole("fx", "fy", "cx", "cy"),
+    K=PinholeKeys("fx", "fy", "cx", "cy"),
     size=("w", "h"),
     finish=move_to_gaussians,
 )
 _INRIA = ViewLayout(
     name="img_name",
     pose=RotationAndShift("rotation", "position"),
-    K=Pinhole("fx", "fy", "cx", "cy"),
+    K=PinholeKeys("fx", "fy", "cx", "cy"),
     size=("width", "height"),
     optional=("cx", "cy"),
     finish=_lazy("instantsplat.take_optimised_poses"),
@@ -108,7 +108,7 @@ _WORLD_MIRROR = ViewLayout(
 _OPENSFM = ViewLayout(
     views=list_shots,
     pose=RotationAndShift("rotation", "translation", rotation_of_vector),
-    K=Pinhole(("focal_x", "focal"), "focal_y", "c_x", "c_y"),
+    K=PinholeKeys(("focal_x", "focal"), "focal_y", "c_x", "c_y"),
     size=("width", "height"),
     unit="larger side",
     origin="middle",
@@ -124,12 +124,12 @@ _OPENSFM = ViewLayout(
     optional=("focal_y", "c_x", "c_y"),
 )
 _POLYCAM = ViewLayout(
-    views=list_keyframes, pose=Matrix("transform"), K=Pinhole("fx", "fy", "cx", "cy"), size=("width", "height")
+    views=list_keyframes, pose=Matrix("transform"), K=PinholeKeys("fx", "fy", "cx", "cy"), size=("width", "height")
 )
 _METASHAPE = ViewLayout(
-    views=_lazy("metashape.list_cameras"),
+    views=_lazy("metashape.list_metashape_cameras"),
     pose=Matrix("transform"),
-    K=Pinhole("fx", "fy", "cx", "cy"),
+    K=PinholeKeys("fx", "fy", "cx", "cy"),
     size=("width", "height"),
     origin="middle",
     lens="type",

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.io.cameras.camera_file import StoredView
-from gsmerge.io.cameras.camera_source import CameraSource, convert, to_array
+from gsmerge.io.cameras.camera_source import CameraSource, convert_value, to_array
 
 Key = str | tuple[str, ...]  # a key, or several keys; the first key with a value counts
 
@@ -46,8 +46,8 @@ class Matrix:
         return (self.key,)
 
     def read(self, values: Mapping[str, Any]) -> np.ndarray:
-        """Read the matrix; errors as in :func:`convert`."""
-        return np.asarray(convert(self._to_matrix, self.key, values[self.key]))
+        """Read the matrix; errors as in :func:`convert_value`."""
+        return np.asarray(convert_value(self._to_matrix, self.key, values[self.key]))
 
     def _to_matrix(self, value: Any) -> np.ndarray:
         array = to_array(value)
@@ -86,14 +86,14 @@ class RotationAndShift:
         return self.rotation, self.shift
 
     def read(self, values: Mapping[str, Any]) -> np.ndarray:
-        """Read the pose; errors as in :func:`convert`."""
-        rotation = convert(lambda value: self.to_matrix(to_array(value)), self.rotation, values[self.rotation])
-        shift = convert(lambda value: to_array(value).reshape(3, 1), self.shift, values[self.shift])
+        """Read the pose; errors as in :func:`convert_value`."""
+        rotation = convert_value(lambda value: self.to_matrix(to_array(value)), self.rotation, values[self.rotation])
+        shift = convert_value(lambda value: to_array(value).reshape(3, 1), self.shift, values[self.shift])
         return np.concatenate([rotation, shift], 1)
 
 
 @dataclass(frozen=True)
-class Pinhole:
+class PinholeKeys:
     """Intrinsics with a key for each number. If the layout makes a key optional, the defaults below apply.
 
     Args:
@@ -138,7 +138,7 @@ class ViewLayout:
     """
 
     pose: Matrix | RotationAndShift
-    K: Pinhole | Matrix
+    K: PinholeKeys | Matrix
     views: str | Callable[[CameraSource], Sequence[Entry]] = ""
     name: Key = ()
     size: tuple[str, str] | str = ""
@@ -152,8 +152,8 @@ class ViewLayout:
 
     @property
     def number_keys(self) -> dict[str, Key]:
-        """Keys of single numbers: of the fields of :class:`Pinhole`, and of the width "w" and height "h"."""
-        keys: dict[str, Key] = dict(vars(self.K)) if isinstance(self.K, Pinhole) else {}
+        """Keys of single numbers: of the fields of :class:`PinholeKeys`, and of the width "w" and height "h"."""
+        keys: dict[str, Key] = dict(vars(self.K)) if isinstance(self.K, PinholeKeys) else {}
         keys |= dict(zip(("w", "h"), self.size, strict=True)) if isinstance(self.size, tuple) else {}
         return {name: key for name, key in keys.items() if key}
 

@@ -17,20 +17,19 @@ from gsmerge.types import Cameras
 
 ENDING = ".cameras.json"
 TRACK = "gsmerge"  # name of the track of our settings
-_SAMPLE = 10_000  # Gaussians from which a depth is estimated
 _EFFECTS: dict[str, dict[str, Any]] = {
     "sharpness": {"amount": 0}, "bloom": {"intensity": 1, "blurLevel": 2},
     "grading": {"brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
     "vignette": {"intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1}, "fringing": {"intensity": 0.5},
 }  # fmt: skip
-_MAX_NAME = 255  # bytes of a file's name
 
 
 def viewer_cameras_path(output: Path) -> Path:
     """Return the path of the camera file for viewers: ``out.ply`` -> ``out.cameras.json``."""
     name = output.name
     stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
-    stem = os.fsencode(stem)[: _MAX_NAME - len(ENDING)].decode("utf-8", "ignore")
+    max_name = 255  # bytes of a file's name
+    stem = os.fsencode(stem)[: max_name - len(ENDING)].decode("utf-8", "ignore")
     return output.with_name(stem + ENDING)
 
 
@@ -86,7 +85,8 @@ def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
     """
     view = order_views(cameras)[0]
     forward, centre = cameras.viewmats[view, 2, :3].astype(np.float64), cameras.centres[view].astype(np.float64)
-    depths = ((means[:: max(1, len(means) // _SAMPLE)] - centre) * forward).sum(1)
+    num_sampled = 10_000  # Gaussians from which a depth is estimated
+    depths = ((means[:: max(1, len(means) // num_sampled)] - centre) * forward).sum(1)
     depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
     position, target = (np.array([-1.0, -1.0, 1.0]) * point for point in (centre, centre + depth * forward))
     longer = max(cameras.width / float(cameras.Ks[view, 0, 0]), cameras.height / float(cameras.Ks[view, 1, 1]))

@@ -30,7 +30,6 @@ LOGIT_COMMENT = "opacity: logit"  # states the encoding in files of gsmerge, so 
 RESULT_COMMENT = "gsmerge result"  # replaces LOGIT_COMMENT in results of commands, and has the same length
 RENDER_COMMENT = "SplatRenderMode"  # written by Brush, with the mode of rendering
 NEW_VIEWS_COMMENT = "gsmerge new views"  # followed by the PSNR (dB) of new views of the input and of the result
-MAX_COPIED = 100  # characters of a comment that is copied to other files
 MIP, FLAT = "mip", "2dgs"  # special modes of rendering: antialiased; 2D Gaussians
 MIP_COMMENT, FLAT_COMMENT = f"{RENDER_COMMENT}: {MIP}", f"{RENDER_COMMENT}: {FLAT}"
 _MODE = re.compile(rf"{RENDER_COMMENT}: (\w+)|antialiased ([01])")  # Brush's and Postshot's comments
@@ -42,12 +41,11 @@ PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of SH0, in
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of compressed PLYs
-REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+REQUIRED_COLUMNS = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
 SHARE_ROUNDING = 0.01  # by which shares that were rounded to half floats may exceed [0, 1]
 MAX_STRAY = 0.01  # share of a column's values that may contradict the rest, because of roundings and damage
 _EXACT = 1e-5  # largest rounding error of a whole number in a matrix that rotates harmonics
-_UNPACKING = 16_000_000  # bytes of all blocks that are unpacked at the same time
-GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, with its flag of validity
+GAUSSIAN_BYTES = 4 * len(REQUIRED_COLUMNS) + 1  # in memory, without higher harmonics, with its flag of validity
 
 
 def sh_degree(num_higher: int) -> int:
@@ -81,7 +79,8 @@ def upward_axis(comments: Sequence[object]) -> str | None:
 
 def render_mode(comments: Sequence[object]) -> str | None:
     """Return the mode of rendering that header comments ask for, ``MIP`` or ``FLAT``; None for the plain mode."""
-    lines = (line for line in comments if isinstance(line, str) and len(line) <= MAX_COPIED)
+    max_copied = 100  # characters of a comment that is copied to other files
+    lines = (line for line in comments if isinstance(line, str) and len(line) <= max_copied)
     matches = [match for match in map(_MODE.fullmatch, lines) if match is not None]
     if not matches:
         return None
@@ -248,7 +247,7 @@ def _to_table(columns: Columns) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class StoredRows:
-    """Gaussians as a file stores them; after ``adapt``, ``rows`` have at least the PLY columns ``REQUIRED``."""
+    """Gaussians as a file stores them; after ``adapt``, ``rows`` have at least the PLY columns ``REQUIRED_COLUMNS``."""
 
     rows: np.ndarray | PackedRows
     layout: str  # the name of the layout for people
@@ -290,10 +289,11 @@ def max_array_bytes(file_bytes: int) -> int:
     return max(1 << 25, 8 * file_bytes)
 
 
-def check_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
+def check_gaussian_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
     """Raise SceneError if the file is too small for ``count`` Gaussians of ``packed_bytes`` each."""
     harmonics = min(12 * num_higher * count, max_array_bytes(budget.file_bytes))  # bytes in memory
-    num_bytes = count * (packed_bytes + GAUSSIAN_BYTES) + harmonics + _UNPACKING
+    unpacked_bytes = 16_000_000  # bytes of all blocks that are unpacked at the same time
+    num_bytes = count * (packed_bytes + GAUSSIAN_BYTES) + harmonics + unpacked_bytes
     budget.check_memory(num_bytes, f"{count:,} Gaussians")
 
 

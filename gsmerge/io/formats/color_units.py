@@ -10,7 +10,6 @@ from gsmerge.io.formats import arrays
 from gsmerge.io.formats.scale_units import MIN_JUDGED
 
 RGB_NOTE = "f_dc_0 to f_dc_2 are read as {}, since {}; if they are harmonics, use --hint colors=sh"
-_MIN_SPREAD = 0.5  # of the range from black to white, least part that RGB covers; faint scenes as harmonics cover less
 _ROUNDING = 1.5 / 255  # difference of two columns of one colour, of which one is a byte
 
 
@@ -40,11 +39,13 @@ def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUni
     ``plain [n,3]`` are the bytes of the file's columns red, green and blue. Harmonics of a scene go far below zero,
     where colours are darker than grey. RGB ends at black and at white.
     """
+    # Least part of the range from black to white that RGB covers. Faint scenes as harmonics cover less
+    min_spread = 0.5
     for units in _UNITS if len(stored) >= MIN_JUDGED else ():
         rgb = units.rgb(stored)
         if plain is not None and (np.abs(rgb - plain / np.float32(255)) <= _ROUNDING).mean() > 1 - arrays.MAX_STRAY:
             return units, "the columns red, green and blue are the same"
-        if arrays.are_shares(rgb) and np.ptp(np.quantile(rgb, (arrays.MAX_STRAY, 1 - arrays.MAX_STRAY))) > _MIN_SPREAD:
+        if arrays.are_shares(rgb) and np.ptp(np.quantile(rgb, (arrays.MAX_STRAY, 1 - arrays.MAX_STRAY))) > min_spread:
             return units, f"all lie in [{units.black:g}, {units.white:g}]"
     return None
 

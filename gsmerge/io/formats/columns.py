@@ -13,7 +13,6 @@ from gsmerge.errors import SceneError
 from gsmerge.io.formats import arrays
 
 UNUSED = "not used: "  # start of the note
-_MAX_NAMES, _MAX_CHARACTERS = 6, 60  # names in a list of columns, and characters of each
 _MOMENT = "save one moment as a .ply, with positions, rotations and opacities of that time"
 
 
@@ -95,7 +94,7 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
     _check_types(path, row)
     by_kind: dict[ColumnKind | None, list[str]] = {}
     for name in row.names or ():
-        if name in arrays.REQUIRED or name.startswith("f_rest_"):
+        if name in arrays.REQUIRED_COLUMNS or name.startswith("f_rest_"):
             continue
         kind = _find_kind(name)
         if kind is not None or row[name].kind == "f":
@@ -115,7 +114,7 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
     """Raise SceneError if columns of Gaussians are whole numbers; plain colours may be bytes."""
     colors = arrays.color_columns(row.names)
     for name in row.names or ():
-        dtype, is_used = row[name], name in (*arrays.REQUIRED, *colors) or name.startswith("f_rest_")
+        dtype, is_used = row[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
         is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
         if is_used and dtype.kind != "f" and not is_color_byte:
             type_name = _NUMBERS[dtype.kind][dtype.itemsize // 2]
@@ -132,6 +131,7 @@ def describes_places(name: str) -> bool:
 
 def list_names(names: Sequence[str]) -> str:
     """List the names of columns for a message: the first six names, and the number of further names."""
-    num_unlisted = len(names) - _MAX_NAMES
-    listed = ", ".join(name[:_MAX_CHARACTERS] for name in names[:_MAX_NAMES])
+    max_names, max_characters = 6, 60  # names in a list of columns, and characters of each
+    num_unlisted = len(names) - max_names
+    listed = ", ".join(name[:max_characters] for name in names[:max_names])
     return listed + (f" and {num_unlisted} more" if num_unlisted > 0 else "")

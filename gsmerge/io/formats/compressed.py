@@ -23,7 +23,7 @@ from gsmerge.kernels.elementary import log, log1p
 CHUNK = 256  # Gaussians that share a range
 _POSITION_RANGES = tuple(f"{bound}_{axis}" for bound in ("min", "max") for axis in "xyz")
 _SCALE_RANGES = tuple(f"{bound}_scale_{axis}" for bound in ("min", "max") for axis in "xyz")
-RANGES = (*_POSITION_RANGES, *_SCALE_RANGES)
+RANGE_COLUMNS = (*_POSITION_RANGES, *_SCALE_RANGES)
 COLORS = tuple(f"{bound}_{channel}" for bound in ("min", "max") for channel in "rgb")
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
 _HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE  # by stored byte
@@ -33,7 +33,7 @@ def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
     """Return the rows of a compressed PLY as rows of an ordinary PLY, with opacities as logits."""
     vertex, chunk = data["vertex"], data["chunk"]
     _check_types(path, vertex, PACKED, ("u4", "i4"))
-    _check_types(path, chunk, RANGES, ("f4", "f8"))
+    _check_types(path, chunk, RANGE_COLUMNS, ("f4", "f8"))
     count, num_chunks = vertex.count, -(-vertex.count // CHUNK)
     if count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")

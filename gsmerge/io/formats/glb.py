@@ -41,7 +41,7 @@ from gsmerge.types import NO_CAMERAS, Gaussians, number_views
 if TYPE_CHECKING:
     from gsmerge.io.formats.table import Contents
 
-MAX_DEGREE = 3
+MAX_DEGREE = 3  # of harmonics, the highest of the extension
 NAME = "KHR_gaussian_splatting"
 HARMONICS = [f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for degree in range(MAX_DEGREE + 1) for i in range(2 * degree + 1)]
 _OPACITY = f"{NAME}:OPACITY"
@@ -55,11 +55,8 @@ _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # between the axes of a ``.ply`` and of glTF
-_NEAR = 0.01  # near plane of camera nodes, world units, as of `render`
-_MAX_STRIDE = 252  # bytes from a value to the next, the limit of glTF
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
 _TRANSFORMS = {"matrix", "rotation", "scale", "translation"}  # keys of a node with a transform of its own
-_TOLERANCE = 1e-3  # largest difference of the scales of a node's axes, and largest cosine between two axes
 
 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
@@ -70,13 +67,14 @@ def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
     cameras = contents.cameras if contents.options.viewer_cameras else NO_CAMERAS
     names = contents.names or number_views(len(cameras))
     nodes, lenses, ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
+    near = 0.01  # near plane of camera nodes, world units, as of `render`
     for i, view in enumerate(ids):
         pose = np.eye(4)  # of glTF's cameras, which look along -z with y up
         pose[:3, :3], pose[:3, 3] = cameras.viewmats[view, :3, :3].T * (1, -1, -1), cameras.centres[view]
         pose = matmul(HALF_TURN, pose)
         nodes.append({"name": names[view], "camera": i, "matrix": pose.T.reshape(-1).tolist()})
         ratio = float(cameras.width * cameras.Ks[view, 1, 1] / (cameras.height * cameras.Ks[view, 0, 0]))
-        lens = {"yfov": vertical_field(cameras, view), "aspectRatio": ratio, "znear": _NEAR}
+        lens = {"yfov": vertical_field(cameras, view), "aspectRatio": ratio, "znear": near}
         lenses.append({"name": names[view], "type": "perspective", "perspective": lens})
     return glb_bytes(gaussians, nodes=nodes, cameras=lenses)
 
@@ -263,7 +261,8 @@ class _Content:
         self.num_read[0] += count * row_bytes
         in_view = offset >= 0 and offset + span <= view["byteLength"]
         in_chunk = self.start <= at and at + span <= self.end
-        if not row_bytes <= stride <= _MAX_STRIDE or not (in_view and in_chunk):
+        max_stride = 252  # bytes from a value to the next, the limit of glTF
+        if not row_bytes <= stride <= max_stride or not (in_view and in_chunk):
             raise _ForeignError(f"a truncated one, of {self.end} bytes without {count} values of {row_bytes} bytes")
         if self.num_read[0] > self.end - self.start:
             raise _ForeignError("one that uses the same values several times")
@@ -388,7 +387,8 @@ def _transformer(transform: np.ndarray, num_higher: int) -> Callable[[Columns], 
     rotation, translation = transform[:3, :3] / scale, transform[:3, 3]
     deviation = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
     is_mirror = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
-    if is_mirror or not (np.isfinite(transform).all() and deviation < _TOLERANCE):
+    tolerance = 1e-3  # largest difference of the scales of a node's axes, and largest cosine between two axes
+    if is_mirror or not (np.isfinite(transform).all() and deviation < tolerance):
         raise _ForeignError("one with a node that stretches or mirrors its Gaussians")
     rotate = turner(rotation, num_higher)
 

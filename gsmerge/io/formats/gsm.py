@@ -19,10 +19,10 @@ from safetensors.numpy import save
 
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.bounds import check_pixels, parse_json, read_budget
+from gsmerge.io.bounds import check_image_size, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
-from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, copied_comments, to_stored
+from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_gaussian_count, copied_comments, to_stored
 from gsmerge.io.tensor_file import read_tensors
 from gsmerge.kernels.elementary import log
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath
@@ -34,11 +34,10 @@ HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata en
 SCENE, FEATURES = "scene", "features"  # kinds
 REMEDY = "run extend again with all batches"
 # Each entry of the header, with its type
-ENTRIES: Mapping[str, type] = {
+HEADER_ENTRIES: Mapping[str, type] = {
     "schema": int, "gsmerge": str, "kind": str, "width": int, "height": int, "names": list, "about": dict,
 }  # fmt: skip
 NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0, by the degree
-_LEAST_SCALE = 1e-30  # scale that replaces 0, so that its logarithm is finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +132,7 @@ def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         writer = f" of gsmerge {version!s:.20}" if version else ""
         problem = f"expected a .gsm of schema {SCHEMA}, which gsmerge {__version__} reads, found schema {schema!r:.40}"
         raise SceneError(path, f"{problem}{writer}", remedy)
-    for name, entry_type in ENTRIES.items():
+    for name, entry_type in HEADER_ENTRIES.items():
         if type(header.get(name)) is not entry_type:
             raise SceneError(path, f"expected {name} in the header, found {header.get(name)!r:.40}", REMEDY)
     if header["kind"] not in (SCENE, FEATURES):
@@ -163,11 +162,12 @@ def read_rows(path: Path) -> StoredRows:
         raise file.error(f"shN: expected {NUM_HIGHER} harmonics, found {num_higher}")
     columns = {"quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (num_higher, 3)}
     rows = Gaussians(means, *(file.array(name, np.float32, n, *shape) for name, shape in columns.items()))
-    check_count(read_budget(path), n, num_higher, 0)
+    check_gaussian_count(read_budget(path), n, num_higher, 0)
 
     def unpack(block: slice) -> Columns:
         part = rows[block]
-        log_scales = log(np.maximum(part.scales, _LEAST_SCALE))
+        least_scale = 1e-30  # scale that replaces 0, so that its logarithm is finite
+        log_scales = log(np.maximum(part.scales, least_scale))
         return Columns(part.means, part.quats, log_scales, part.opacities, part.sh0[:, 0], part.shN)
 
     sizes = {name: as_array(column).nbytes for name, column in vars(rows).items()}
@@ -230,5 +230,5 @@ def stored_cameras(file: GsmFile) -> Cameras:
     """Return the cameras of a file."""
     viewmats = file.finite("viewmats", np.float64, None, 4, 4)
     width, height = file.header["width"], file.header["height"]
-    check_pixels(file.path, width, height)
+    check_image_size(file.path, width, height)
     return Cameras(viewmats, file.finite("Ks", np.float64, len(viewmats), 3, 3), width, height)

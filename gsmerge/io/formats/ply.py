@@ -34,7 +34,7 @@ _HOLDS_CAMERAS = LazyFunction("gsmerge.io.cameras.read", "holds_cameras")
 MAX_DEGREE = 3  # of the harmonics in results; splat-transform 3.7 and gsply refuse a .ply with more
 # Size of the longest comment on new views
 COMMENT_BYTES = len(f"comment {arrays.new_views_comment(arrays.ExpectedScores(-100, -100, -100, -100))}\n")
-MAX_READ_DEGREE = 4
+MAX_READ_DEGREE = 4  # of harmonics in files of other programs
 THIN = 1e-3  # third scale of a 2D Gaussian, relative to its smaller scale
 MAX_LOGIT = 16.0  # from 16.6 on, the sigmoid rounds to 1 in float32, whose logit is infinite
 BLOCK_BYTES = 1 << 19  # rows converted at a time; they stay in the processor's cache for all columns
@@ -43,9 +43,6 @@ _PREFIXED = "the prefix {!r} of the columns' names, as CloudCompare writes it, i
 _AGAIN = "copy or export it again"
 MAX_HEADER_BYTES = 1 << 20
 MAX_LINE = 1 << 20  # characters of a row of text; its words take many times as much memory
-MAX_LIST_VALUES = 1_000_000  # lists of an element; they are read one value at a time
-_LIST_BYTES = 140  # memory of each list
-_STEPS_PER_ELEMENT = 50  # steps of 20 microseconds in a ReadBudget; several readers open a file in turn
 _TYPES = {  # PLY's names of types by NumPy's
     "i1": "char", "i2": "short", "i4": "int", "f4": "float", "u1": "uchar", "u2": "ushort", "u4": "uint", "f8": "double"
 }  # fmt: skip
@@ -143,16 +140,16 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
     rows, prefix = _without_prefix(vertex.data)
     columns = set(rows.dtype.names or ())
     optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
-    missing = [name for name in arrays.REQUIRED if name not in columns | optional]
+    missing = [name for name in arrays.REQUIRED_COLUMNS if name not in columns | optional]
     if missing:
         check_columns(path, rows.dtype, ())  # other columns may give the reason
         remedy = "name a .ply of Gaussians, since this one has none"
         if any(name.startswith("packed_") for name in columns):
             remedy = "export it again, since it is compressed but lacks its element 'chunk'"
-        elif len(missing) < len(arrays.REQUIRED) // 2:
+        elif len(missing) < len(arrays.REQUIRED_COLUMNS) // 2:
             remedy = "export it again with them"
         if arrays.SCALES[0] in missing:  # without any scale, a third one is expected, too
-            missing = [name for name in arrays.REQUIRED if name in {*missing, arrays.SCALES[2]} - columns]
+            missing = [name for name in arrays.REQUIRED_COLUMNS if name in {*missing, arrays.SCALES[2]} - columns]
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")
@@ -389,7 +386,8 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
     is_text = ["format", "ascii", "1.0"] in words
     elements = _parse_elements(words)
-    budget.check_steps(_STEPS_PER_ELEMENT * len(elements), "steps for elements")
+    steps_per_element = 50  # steps of 20 microseconds in a ReadBudget; several readers open a file in turn
+    budget.check_steps(steps_per_element * len(elements), "steps for elements")
     bytes_left = size - end - len(last_line)
     for element in elements:
         _check_element(budget, element)
@@ -439,11 +437,13 @@ def _check_element(budget: ReadBudget, element: _Element) -> None:
         raise SceneError(path, problem, "export it again with columns of float")
     if has_lists and name == "vertex":
         raise SceneError(path, "expected one number per column and vertex, found a list property", _AGAIN)
-    if has_lists and count * num_columns > MAX_LIST_VALUES:
-        problem = f"expected at most {MAX_LIST_VALUES:,} lists, found element '{name}' with lists in {count:,} rows"
+    max_list_values = 1_000_000  # lists of an element; they are read one value at a time
+    if has_lists and count * num_columns > max_list_values:
+        problem = f"expected at most {max_list_values:,} lists, found element '{name}' with lists in {count:,} rows"
         raise SceneError(path, problem, "export it without this element")
     if has_lists:
-        budget.check_memory(_LIST_BYTES * count * num_columns, f"lists in {count:,} rows")
+        list_bytes = 140  # memory of each list
+        budget.check_memory(list_bytes * count * num_columns, f"lists in {count:,} rows")
 
 
 def _truncated(path: Path, expected: str, num_whole: int, reason: str) -> SceneError:

@@ -25,11 +25,8 @@ from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
-MIN_PADDING = 16  # number of equal rows at the origin that are padding; fewer may be Gaussians
-MIN_FINITE = 0.002  # least share of finite rows; a file with fewer is refused
 MAX_HARMONIC = 1e6  # no scene has larger harmonics; float32 can square and sum rendered values below
 FREED_ROWS = 1 << 17  # rows after which the memory of large columns is freed
-_MIN_JUDGED = 100  # least number of values for a judgement of encodings
 
 
 @dataclass(frozen=True)
@@ -218,7 +215,7 @@ def convert_files(
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
-    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS}
+    used = {*arrays.REQUIRED_COLUMNS, *arrays.color_columns(names), *arrays.NORMALS}
     part_notes = dict.fromkeys(note for part in parts for note in part.notes)
     info = FileInfo(
         path=str(path),
@@ -455,10 +452,11 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
     values, unless they are too few.
     """
     start, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
+    min_judged = 100  # least number of values for a judgement of encodings
     for path, part in zip(paths, parts, strict=True):
         values = opacities[start : start + len(part.rows)]
         start += len(values)
-        is_clear = len(parts) > 1 and np.isfinite(values).sum() >= _MIN_JUDGED
+        is_clear = len(parts) > 1 and np.isfinite(values).sum() >= min_judged
         encoding = part.encoding or (("raw" if arrays.are_shares(values) else "logit") if is_clear else None)
         if encoding is not None:
             part_names.setdefault(encoding, path.name)
@@ -512,7 +510,8 @@ def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
     valid = out["valid"]
     invalid = np.flatnonzero(~valid)
     num_valid = len(valid) - len(invalid)
-    if len(invalid) and num_valid < MIN_FINITE * len(valid):
+    min_finite = 0.002  # least share of finite rows; a file with fewer is refused
+    if len(invalid) and num_valid < min_finite * len(valid):
         number = f"{len(invalid):,} of" if num_valid else "all"
         rows = f"{number} {len(valid):,} rows"
         problem = f"expected finite Gaussians, found NaN, inf or numbers that no scene has in {rows}"
@@ -534,12 +533,13 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
         return rows
     scales, sh0 = out["scales"][rows], out["sh0"][rows, 0]
     empty = (out["quats"][rows] == (1, 0, 0, 0)).all(1) & (scales == scales[:, :1]).all(1) & (sh0 == 0).all(1)
-    if len(rows) >= MIN_PADDING:
+    min_padding = 16  # number of equal rows at the origin that are padding; fewer may be Gaussians
+    if len(rows) >= min_padding:
         attributes = np.concatenate([scales, out["opacities"][rows, None], sh0], 1)
         empty |= (attributes == lower_median(attributes)).all(1)
     rows = rows[empty]
     if len(rows) == np.count_nonzero(out["valid"]):
-        if len(rows) < MIN_PADDING:
+        if len(rows) < min_padding:
             return rows[:0]
         problem = f"expected Gaussians, found only {len(rows):,} rows at the origin that are empty or equal"
         raise SceneError(path, problem, "export it again, since the export may have been interrupted")

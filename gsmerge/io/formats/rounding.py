@@ -17,8 +17,8 @@ from gsmerge.values.arrays import distinct
 
 # Renders change above this mean square of the moves of Gaussians: by .05 dB of 27. A move is in units of the Gaussian's
 # size and at most 1. Scenes around their origin have at most a tenth of this.
-SHOWN = 0.005
-SAMPLE = 1 << 17  # number of Gaussians from which the mean is estimated
+SHOWN_MOVE = 0.005
+ROUNDING_GAUSSIANS = 1 << 17  # number of Gaussians from which the mean is estimated
 
 
 def format_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
@@ -32,14 +32,14 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
         return []
     format_, columns = output_format(path, levels=True, cameras=True), gaussians.numpy()
     extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # from them formats choose their steps
-    rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // SAMPLE + 1), *extremes]))
+    rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // ROUNDING_GAUSSIANS + 1), *extremes]))
     means, (x, y, z) = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0).T
     sizes = np.maximum(np.minimum(x, y), np.minimum(np.maximum(x, y), z))  # the second largest
     with np.errstate(over="ignore"):
         x, y, z = np.abs(format_.round_means(means) - means).T
     moves = np.maximum(np.maximum(x, y), z)
     mean_square = float(np.square(np.minimum(moves / np.maximum(sizes, 1e-30), 1)).mean())
-    if mean_square <= SHOWN:
+    if mean_square <= SHOWN_MOVE:
         return []
     center = medians(means)
     shift = ",".join(f"{-float(f'{coordinate:.3g}'):.0f}" for coordinate in center)

@@ -15,13 +15,6 @@ from gsmerge.runtime.memory import gather
 MIN_JUDGED = 100  # least number of Gaussians for a judgement
 LINEAR_NOTE = "scales are read as linear, since {}; if they are logarithms, use --hint scales=log"
 SAMPLES = 20_000  # Gaussians whose scales and colours are judged
-_MAX_WIDTH = 0.25  # scales are wrong if half of the standard deviations exceed this share of the scene's width
-# Bounds on half of the standard deviations, in units of the scene's width divided by the square root of the number of
-# Gaussians. Sound files have 0.3 to 2. Files with linear scales, read as logarithms, have 10 to 1,000.
-_MIN_SPACINGS, _MAX_SPACINGS = 0.01, 6.0
-# Natural logarithm of large sizes divided by small ones, at least, in units of 1 and of the difference of the stored
-# values. Sizes in a file vary by 1.5:1 and more; linear scales that are read as logarithms are all close to 1
-_MIN_VARIATION, _LESS = 0.4, 4.0
 
 
 @dataclass(frozen=True)
@@ -49,8 +42,12 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
     width, size = float((high - low).max()), median(sizes.max(1))
     text = f"half of the Gaussians have a standard deviation above {size:.3g} in a scene of width {width:.3g}"
     spacing, stored = width / float(np.sqrt(len(rows))), log(sizes)
-    typical, is_vast = float(log(size)), size > _MAX_WIDTH * width
-    is_likely = _MIN_SPACINGS * spacing <= typical <= _MAX_SPACINGS * spacing < size
+    max_width = 0.25  # scales are wrong if half of the standard deviations exceed this share of the scene's width
+    typical, is_vast = float(log(size)), size > max_width * width
+    # Bounds on half of the standard deviations, in units of the scene's width divided by the square root of the number
+    # of Gaussians. Sound files have 0.3 to 2. Files with linear scales, read as logarithms, have 10 to 1,000.
+    min_spacings, max_spacings = 0.01, 6.0
+    is_likely = min_spacings * spacing <= typical <= max_spacings * spacing < size
     if is_likely and not arrays.are_logarithms(stored):
         if is_vast or _vary_little_as_logs(stored.max(1)):
             signs = f"they are hardly ever negative (median {typical:.3g})"
@@ -63,7 +60,11 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
 def _vary_little_as_logs(stored: np.ndarray) -> bool:
     """Return whether positive ``stored [s]`` vary much as sizes, but hardly as logarithms of sizes."""
     low, high = (float(value) for value in quantiles(stored.astype(np.float64), (0.1, 0.9)))
-    return low > 0 and float(log(high / low)) > max(_MIN_VARIATION, _LESS * (high - low))
+    # Natural logarithm of large sizes divided by small ones, at least: as a number, and for each unit of the difference
+    # of the stored values. Sizes in a file vary by 1.5:1 and more. Linear scales that are read as logarithms are all
+    # close to 1
+    min_variation, min_slope = 0.4, 4.0
+    return low > 0 and float(log(high / low)) > max(min_variation, min_slope * (high - low))
 
 
 def log_of_scales(rows: np.ndarray) -> np.ndarray:

@@ -41,23 +41,21 @@ from gsmerge.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
 from gsmerge.values.arrays import to_float32
 
-MAX_DEGREE = 3
-VERSION = 2
+MAX_DEGREE = 3  # of harmonics, the highest of the format
+VERSION = 2  # of the format, in its metadata
 MODELS = {arrays.MIP: "antialiased", arrays.FLAT: "2dgs"}  # splat-transform's names of the modes of rendering
 GENERATOR = "gsmerge"
 # All files that writers make
-FILES = (
+SOG_FILES = (
     "means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_centroids.webp", "shN_labels.webp",
     META,
 )  # fmt: skip
 FIRST_MODE = 252  # alpha of a rotation with w as the largest component; 253 to 255 stand for x, y and z
-PALETTE_BITS = 16
+PALETTE_BITS = 16  # of the number of a set of harmonics
 PALETTE_COLUMNS = 64  # sets of harmonics side by side in the texture of the palette
-_LOSSLESS = 101  # OpenCV's WebP quality
 PACKED_BYTES = 19  # bytes of a Gaussian in the decoded textures
 CODES = 256  # number of values in a codebook
 _CELLS = 1 << 11  # number of cells of equal width, and of cells with equal counts of values, before mergers
-_MAX_STEPS = 200  # steps of Lloyd's algorithm
 
 
 @dataclass(frozen=True)
@@ -171,7 +169,7 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
         raise SceneError(budget.path, problem, f"export it as version {VERSION}")
     count = check_whole(meta["count"], "count", 1)
     bands = check_whole(meta["shN"]["bands"], "bands", 1, MAX_DEGREE) if meta.get("shN") else 0
-    arrays.check_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)
+    arrays.check_gaussian_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)
     models = {model: mode for mode, model in MODELS.items()}
     mode = models.get(str(meta.get("model")), arrays.MIP if meta.get("antialias") is True else None)
     packed = _read_packed(files, meta, count, budget)
@@ -353,7 +351,8 @@ def _texture(values: np.ndarray) -> bytes:
 def _webp(image: np.ndarray) -> bytes:
     """Encode a lossless WebP image; only the colours of pixels whose alpha is 0 may change."""
     bgra = [2, 1, 0, 3][: image.shape[2]]  # OpenCV's order of channels
-    _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., bgra]), [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS])
+    lossless = 101  # OpenCV's WebP quality
+    _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., bgra]), [cv2.IMWRITE_WEBP_QUALITY, lossless])
     return data.tobytes()
 
 
@@ -373,7 +372,8 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
     equal_count = np.linspace(0, len(ordered), _CELLS).astype(int)
     ends = np.unique([*equal_width, *equal_count])
     codes = _merge_cells(np.diff(ends).astype(float), np.diff(sums[ends]) / np.diff(ends))
-    for _ in range(_MAX_STEPS):
+    max_steps = 200  # steps of Lloyd's algorithm
+    for _ in range(max_steps):
         ends = np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2)
         ends = np.concatenate([[0], ends, [len(ordered)]])
         numbers, totals = np.diff(ends), np.diff(sums[ends])

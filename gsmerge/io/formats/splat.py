@@ -17,7 +17,7 @@ from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, column_blocks
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 
-MAX_DEGREE = 0
+MAX_DEGREE = 0  # of harmonics; the format has colours alone
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 

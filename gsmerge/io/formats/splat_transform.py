@@ -10,21 +10,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gsmerge.errors import GsmergeError, SceneError, UsageError
-from gsmerge.io.first_bytes import PACKAGE
+from gsmerge.io.first_bytes import CONVERTER_PACKAGE
 
-PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
+SPLAT_TRANSFORM_PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
 TIME_LIMIT = 1800  # seconds
-MAX_OUTPUT = 300  # characters of the program's own output in an error
 
 
 def find_program() -> str:
     """Find the path of the program; UsageError, which says how to install it, if there is none."""
     named = os.environ.get(VARIABLE)
-    program = shutil.which(named or PROGRAM)
+    program = shutil.which(named or SPLAT_TRANSFORM_PROGRAM)
     if program is None:
         place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
-        problem = f"expected the program {place}, found none; install it with npm install -g {PACKAGE}"
-        raise UsageError(f"{PROGRAM}: {problem}")
+        problem = f"expected the program {place}, found none; install it with npm install -g {CONVERTER_PACKAGE}"
+        raise UsageError(f"{SPLAT_TRANSFORM_PROGRAM}: {problem}")
     return program
 
 
@@ -43,7 +42,8 @@ def run_program(*words: object) -> None:
         lines = (ended.stderr or ended.stdout).decode(errors="replace").strip().splitlines() or ["without output"]
         reason = next((line for line in lines if "Error: " in line), lines[-1]).rpartition("Error: ")[2]
         problem = f"expected {Path(str(words[-1])).name}, it ended with code {ended.returncode}"
-        raise GsmergeError(f"{program}: {problem}: {' '.join(reason.split())[:MAX_OUTPUT]}")
+        max_output = 300  # characters of the program's own output in an error
+        raise GsmergeError(f"{program}: {problem}: {' '.join(reason.split())[:max_output]}")
 
 
 @contextmanager
@@ -52,4 +52,6 @@ def name_file(path: Path) -> Iterator[None]:
     try:
         yield
     except SceneError as error:
-        raise SceneError(path, f"{PROGRAM} wrote a file that cannot be used: {error.problem}") from error
+        raise SceneError(
+            path, f"{SPLAT_TRANSFORM_PROGRAM} wrote a file that cannot be used: {error.problem}"
+        ) from error

@@ -34,15 +34,13 @@ from gsmerge.types import SH_C0, Gaussians, StrPath
 from gsmerge.values.arrays import as_array, to_float32
 
 VERSION, MAX_DEGREE = 3, 3  # of written files; Spark 2.2 does not read version 4, and old readers only read 2
-MAGIC = 0x5053474E
+MAGIC = 0x5053474E  # "NGSP", the first bytes of the content
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, number of streams or zero
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
 MIP_FLAG = 1  # render the Gaussians antialiased
-EXTENSIONS_FLAG = 2  # records of extensions are before the table in version 4, and after the columns in older versions
-RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
-AXES_KIND = 0xADBE0003  # of SPZ_ADOBE_coordinate_system; its content is 1 for the first of AXES, or 0 for unknown
-AXES = (
+EXTENSION_RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
+AXIS_SYSTEMS = (
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
 )  # fmt: skip
@@ -53,12 +51,10 @@ _MAX_EXTENSIONS = 1 << 20  # bytes of all extension records
 GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # first bytes of versions 1 to 3, and of 4
 SYSTEM, UNIX = 9, b"\3"  # byte of a gzip header that names the operating system, and the value that is always written
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel if the scene fills 1,000 pixels
-MAX_FRACTION = 23
-LARGEST = 2**23 - 1
+LARGEST_POSITION = 2**23 - 1
 _SHIFTS = (20, 10, 0)  # of the three smaller components of a rotation in its word
 COLOR_SCALE = 0.15  # factor of sh0, so that colours slightly outside [0, 1] can be stored
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
-MAX_READ_DEGREE = 4  # some programs write degree 4 in version 3
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
 AGAIN = "copy or export it again"
 
@@ -104,7 +100,9 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
     read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
     header, parts, extensions, num_left = read(ReadBudget(path, len(packed)), packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
-    axes = _stored_axes(path, extensions) if header.flags & EXTENSIONS_FLAG else PLY_AXES
+    # Records of extensions are before the table in version 4, and after the columns in older versions
+    extensions_flag = 2
+    axes = _stored_axes(path, extensions) if header.flags & extensions_flag else PLY_AXES
     # from these axes to those of a .ply; it mirrors if the handedness differs
     rotation = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
     rotate = arrays.turner(rotation * (1, -1, -1) if axes in _REVERSED else rotation, header.num_higher)
@@ -119,17 +117,19 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
 def _stored_axes(path: StrPath, extensions: bytes) -> str:
     """Return the axes that the extensions name, by default those of a ``.ply``; SceneError if they are unknown."""
     at = 0
-    while at + RECORD.size <= len(extensions):
-        kind, size = RECORD.unpack_from(extensions, at)
-        at += RECORD.size + size
-        if kind == AXES_KIND:
+    # Kind of SPZ_ADOBE_coordinate_system. Its content is 1 for the first of AXIS_SYSTEMS, or 0 for unknown
+    axes_kind = 0xADBE0003
+    while at + EXTENSION_RECORD.size <= len(extensions):
+        kind, size = EXTENSION_RECORD.unpack_from(extensions, at)
+        at += EXTENSION_RECORD.size + size
+        if kind == axes_kind:
             content = extensions[at - size : at]
             number = int.from_bytes(content, "little") if len(content) == size == 4 else -1
-            if not 0 <= number <= len(AXES):
+            if not 0 <= number <= len(AXIS_SYSTEMS):
                 found = f"number {number}" if number > 0 else "a damaged record"
-                problem = f"expected axes 0 to {len(AXES)} in SPZ_ADOBE_coordinate_system, found {found}"
+                problem = f"expected axes 0 to {len(AXIS_SYSTEMS)} in SPZ_ADOBE_coordinate_system, found {found}"
                 raise SceneError(path, problem, "export it again without this extension")
-            return AXES[number - 1] if number else PLY_AXES
+            return AXIS_SYSTEMS[number - 1] if number else PLY_AXES
     return PLY_AXES
 
 
@@ -140,13 +140,14 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
         raise SceneError(path, FOUND_EARLY_END, AGAIN)
     magic, *numbers = HEADER.unpack(start)
     header = Header(*numbers)
-    if magic != MAGIC or header.version not in versions or header.degree > MAX_READ_DEGREE or header.fraction > 30:
+    max_read_degree = 4  # some programs write degree 4 in version 3
+    if magic != MAGIC or header.version not in versions or header.degree > max_read_degree or header.fraction > 30:
         found = f"version {header.version}, SH degree {header.degree}" if magic == MAGIC else "another file"
-        problem = f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}"
+        problem = f"expected .spz of version 1 to 4 and SH degree 0 to {max_read_degree}, found {found}"
         raise SceneError(path, problem, "export it again")
     if header.count == 0:
         raise SceneError(path, f"expected at least one Gaussian in {len(packed)} bytes, found a count of 0", AGAIN)
-    arrays.check_count(budget, header.count, header.num_higher, sum(header.widths))
+    arrays.check_gaussian_count(budget, header.count, header.num_higher, sum(header.widths))
     return header
 
 
@@ -270,13 +271,14 @@ def choose_fraction(means: np.ndarray, fine: int) -> int:
         return 0
     size = np.median(reduce(np.maximum, (np.abs(axis - np.median(axis)) for axis in means.T)))
     fine_enough = fine - _octave(max(size, 1e-6))
-    no_overflow = _octave(LARGEST / max(np.abs(means).max(), 1e-6))
-    return int(np.clip(min(fine_enough, no_overflow), 0, MAX_FRACTION))
+    no_overflow = _octave(LARGEST_POSITION / max(np.abs(means).max(), 1e-6))
+    max_fraction = 23  # bits; a position has 24, one of them for its sign
+    return int(np.clip(min(fine_enough, no_overflow), 0, max_fraction))
 
 
 def fix_means(means: np.ndarray, fraction: int) -> np.ndarray:
     """Quantise means to ``fraction`` bits after the binary point."""
-    return np.clip(np.round(means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
+    return np.clip(np.round(means * 2.0**fraction), -LARGEST_POSITION, LARGEST_POSITION).astype("<i4")
 
 
 def spz_columns(

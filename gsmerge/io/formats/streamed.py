@@ -32,13 +32,11 @@ from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
-VERSION = 1
+VERSION = 1  # of the index
 MAX_DEGREE = sog.MAX_DEGREE
 # Thousands of Gaussians in a region for which a viewer chooses one level. A room of a few hundred thousand Gaussians
 # has about twenty regions.
 CHUNK_THOUSANDS = 16
-ITERATIONS = 1  # for the program's palettes; ten take four times as long, and renders are not better
-MAX_LEVELS = 64  # no real file has more than a dozen
 _CHUNK = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # name of a chunk's folder: level, number, hash
 
 
@@ -86,7 +84,8 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
             words += [ply := Path(folder) / f"{level}.ply", "-l", level]
             write_ply(ply, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=contents.comments)
         program_index = Path(folder) / "made" / INDEX
-        run_program(*words, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", ITERATIONS, program_index)
+        iterations = 1  # for the program's palettes; ten take four times as long, and renders are not better
+        run_program(*words, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", iterations, program_index)
         with name_file(path):
             _name_by_content(program_index)
             levels = read_index(program_index).levels
@@ -163,7 +162,8 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
 def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int], ...]:
     """Return the chunks of each level with their numbers of Gaussians; errors as in :func:`_check_index`."""
     names = document["filenames"]
-    num_levels = check_whole(document["lodLevels"], "lodLevels", 1, MAX_LEVELS)
+    max_levels = 64  # no real file has more than a dozen
+    num_levels = check_whole(document["lodLevels"], "lodLevels", 1, max_levels)
     if not isinstance(names, list) or not names:
         raise ValueError("filenames: expected a list of paths")
     chunks = [_inside(path, name) for name in names]
@@ -261,7 +261,7 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
             raise SceneError(chunk, problem, "export it again")
         num_bytes, total = num_bytes + contents[-1].num_bytes, total + packed.count
         num_higher = max(num_higher, packed.num_higher)
-        arrays.check_count(ReadBudget(path, num_bytes), total, num_higher, sog.PACKED_BYTES)
+        arrays.check_gaussian_count(ReadBudget(path, num_bytes), total, num_higher, sog.PACKED_BYTES)
     return contents
 
 
@@ -274,6 +274,6 @@ def remove_unused_chunks(path: Path) -> None:
     for folder in path.parent.iterdir():
         if _CHUNK.fullmatch(folder.name) and folder.name not in used and folder.is_dir() and not folder.is_symlink():
             with suppress(OSError):
-                for name in sog.FILES:
+                for name in sog.SOG_FILES:
                     (folder / name).unlink(missing_ok=True)
                 folder.rmdir()

@@ -95,6 +95,7 @@ class Format:
 
 
 _page = lazy_functions("gsmerge.pages")
+# Bytes of a Gaussian, for harmonics of degree 0 to 3
 _SPZ = 17.0, 18.5, 18.9, 19.2
 _SOG = 13.0, 22.0, 36.5, 56.5
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64

@@ -28,8 +28,6 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.settings.files import parse_place
 from gsmerge.types import Cameras, Gaussians
 
-FRAMED = 1, 99  # percentiles of the means that the bounds include; a few far Gaussians would make a scene small
-AXIS, SQUARED_ECCENTRICITY = 6378137.0, 0.0066943799901413165  # metres; of the ellipsoid WGS 84
 REST = 3000  # most bytes of the index, and of numbers of bounds in the tile
 PLACED = "the place on the globe is not kept: --set place=LON,LAT,HEIGHT states it again"
 _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # from y up
@@ -38,7 +36,9 @@ _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  #
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of a tileset, as :data:`gsmerge.io.formats.table.WriteOutput`; the ``.glb`` has its stem."""
     tile = path.with_suffix(".glb")
-    file, low, high = add(tile), *np.percentile(contents.levels[0].means.astype(np.float64), FRAMED, axis=0)
+    # Percentiles of the means that the bounds include; a few far Gaussians would make a scene small
+    percentiles = 1, 99
+    file, low, high = add(tile), *np.percentile(contents.levels[0].means.astype(np.float64), percentiles, axis=0)
     file.write_bytes(_tile_bytes(contents, low, high))
     turn = matmul(_Z_UP, HALF_TURN)[:3, :3]
     halves = np.diag(np.abs(matmul(turn, (high - low)[:, None] / 2))[:, 0])
@@ -118,8 +118,9 @@ def globe_matrix(place: str) -> np.ndarray:
     (sin_lon, sin_lat), (cos_lon, cos_lat) = sin(angles), cos(angles)
     up = np.array([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat])
     east, north = np.array([-sin_lon, cos_lon, 0]), np.array([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat])
-    radius = AXIS / np.sqrt(1 - SQUARED_ECCENTRICITY * sin_lat**2)  # of curvature in the prime vertical
+    semi_major_axis, squared_eccentricity = 6378137.0, 0.0066943799901413165  # metres; of the ellipsoid WGS 84
+    radius = semi_major_axis / np.sqrt(1 - squared_eccentricity * sin_lat**2)  # of curvature in the prime vertical
     matrix = np.eye(4)
     matrix[:3] = np.stack([east, north, up, radius * up + height * up], 1)
-    matrix[2, 3] -= SQUARED_ECCENTRICITY * radius * sin_lat
+    matrix[2, 3] -= squared_eccentricity * radius * sin_lat
     return matrix

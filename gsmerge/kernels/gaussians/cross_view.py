@@ -11,8 +11,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i1, i4, i8, native
 
-LEAF = 16  # runs of at most so many points are not divided
-COLUMNS = 6  # of the sums of :func:`sum_cross_view`
+SUM_COLUMNS = 6  # of the sums of :func:`sum_cross_view`
 
 
 @native(
@@ -31,7 +30,8 @@ def build_tree(points, order, axes, splits):
 
 def make_tree(points):
     """Return order, axes and splits of the tree of finite points ``[n,3]`` in C order."""
-    nodes = 4 << (len(points) // LEAF).bit_length()
+    leaf = 16  # runs of at most so many points are not divided
+    nodes = 4 << (len(points) // leaf).bit_length()
     order, axes, splits = np.arange(len(points)), np.zeros(nodes, np.int8), np.zeros(nodes)
     build_tree(points, order, axes, splits)
     return order, axes, splits
@@ -77,7 +77,7 @@ def partition(values, order, low, high, place):
     width=i8(least=0, below=1 << 31), height=i8(least=0, below=1 << 31),
     fronts=i4("views", "height", "width"), means=f4("n", 3), opacities=f4("n"), sh0=f4("n", 1, 3),
     color_scale=f8(), near=f8(), far=f8(), min_opacity=f8(), first=i8(least=0), last=i8(),
-    out=f8("g", COLUMNS, out=True),
+    out=f8("g", SUM_COLUMNS, out=True),
 )  # fmt: skip
 def sum_cross_view(
     points, colors, own, asked, viewmats, Ks, width, height, fronts, means, opacities, sh0, color_scale, near,

@@ -8,7 +8,7 @@ from gsmerge.kernels.signature import STATUS, f4, i4, i8, native, u1
 
 # columns of the state: mean 3, log scale 3, quaternion 4, opacity logit 1, colour 3
 MEAN, SIZE, QUAT, LOGIT, COLOR, COLUMNS = 0, 3, 6, 10, 11, 14
-MAX_LOGIT, MIN_LOGIT = np.float32(6.9), np.float32(-5.5)
+MAX_FIT_LOGIT, MIN_FIT_LOGIT = np.float32(6.9), np.float32(-5.5)
 
 
 @native(

@@ -6,16 +6,16 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, f4, i8, native, u1
 
-LANES = 16  # floats of a vector; weights are padded to whole vectors
+VECTOR_LANES = 16  # floats of a vector; weights are padded to whole vectors
 PLAIN, GELU, TANH = range(3)  # activations of dense layers
 
 
 @native(
-    STATUS, x=f4("rows", "inputs"), weight=f4("blocks", "inputs", LANES), bias=f4("blocks", LANES),
+    STATUS, x=f4("rows", "inputs"), weight=f4("blocks", "inputs", VECTOR_LANES), bias=f4("blocks", VECTOR_LANES),
     residual=f4("rows", "outputs", optional=True), activation=i8(least=0, most=2), out=f4("rows", "outputs", out=True),
 )  # fmt: skip
 def dense(x, weight, bias, residual, activation, out):
-    """Write ``activation(x W + b + residual)`` with weights and bias from :func:`pack`.
+    """Write ``activation(x W + b + residual)`` with weights and bias from :func:`pack_weights`.
 
     ``activation`` is PLAIN, GELU, or TANH, which is 0 for NaN. A ``residual`` of None is zero.
     """
@@ -46,7 +46,7 @@ def attend(query, pairs, mask, heads, scratch, out):
 
 def padded(count: int) -> int:
     """Return a number of columns rounded up to whole vectors."""
-    return -(-count // LANES) * LANES
+    return -(-count // VECTOR_LANES) * VECTOR_LANES
 
 
 def scratch_size(tokens: int, width: int) -> int:
@@ -54,11 +54,10 @@ def scratch_size(tokens: int, width: int) -> int:
     return (width + 2) * padded(tokens)
 
 
-def pack(weight: np.ndarray, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pack_weights(weight: np.ndarray, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Arrange weights ``[outputs,inputs]`` and bias ``[outputs]`` in blocks of sixteen outputs, padded with zeros."""
     outputs, inputs = weight.shape
     full, shift = np.zeros((padded(outputs), inputs), np.float32), np.zeros(padded(outputs), np.float32)
     full[:outputs], shift[:outputs] = weight, bias
-    return np.ascontiguousarray(full.reshape(-(-outputs // LANES), LANES, inputs).swapaxes(1, 2)), shift.reshape(
-        -1, LANES
-    )
+    blocks = full.reshape(-(-outputs // VECTOR_LANES), VECTOR_LANES, inputs).swapaxes(1, 2)
+    return np.ascontiguousarray(blocks), shift.reshape(-1, VECTOR_LANES)

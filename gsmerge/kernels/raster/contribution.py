@@ -18,13 +18,13 @@ from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
 
 FIRST_PAIRS = 1 << 16  # initial room for pairs of Gaussian and superpixel
 PAIR = 3  # numbers of a pair: label, sum, and the next pair of the same Gaussian or -1
-NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS = 0, 1, 2, 3  # numbers of pairs and active Gaussians, and the next tile
+NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, PAIR_COUNTS = 0, 1, 2, 3  # numbers of pairs and active Gaussians, and the next tile
 
 
 @native(
     STATUS, **LISTS, line=i8(least=0, most=MOST_TILES), labels=i4("h", "w", least=0, below="num_labels"),
     heads=i4("m", out=True), pairs=f8("room", PAIR, out=True), active=i4("slots", out=True),
-    stamps=i4("num_labels", most=-1, out=True), counts=i8(COUNTS, out=True),
+    stamps=i4("num_labels", most=-1, out=True), counts=i8(PAIR_COUNTS, out=True),
 )  # fmt: skip
 def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads, pairs, active, stamps, counts):
     """Append the pairs of a row of tiles, from tile ``counts[NEXT_TILE]`` to the last tile that fits in the buffers."""
@@ -34,7 +34,7 @@ def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads,
     STATUS, bottom=i8(), conics=f4("m", CONIC), heads=i4("m", out=True), pairs=f8("room", PAIR),
     carried=f8("room", PAIR, out=True), active=i4("slots", out=True), totals=f8("num_labels", out=True),
     seen=i4("num_labels", out=True), out_values=f4("m", out=True), out_labels=i4("m", out=True),
-    counts=i8(COUNTS, out=True),
+    counts=i8(PAIR_COUNTS, out=True),
 )  # fmt: skip
 def settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, out_values, out_labels, counts):
     """Sum the pairs of every Gaussian; finish Gaussians that end above ``bottom``, and carry over all other sums."""
@@ -52,7 +52,7 @@ def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, coun
     num, last = len(conics), -(-labels.shape[0] // TILE) - 1
     values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
     stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
-    heads, active, counts = np.full(num, -1, np.int32), np.empty(num + 1, np.int32), np.zeros(COUNTS, np.int64)
+    heads, active, counts = np.full(num, -1, np.int32), np.empty(num + 1, np.int32), np.zeros(PAIR_COUNTS, np.int64)
     pairs = np.empty((FIRST_PAIRS, PAIR))
     for line in range(last + 1):
         while counts[NEXT_TILE] < (line + 1) * tile_width:

@@ -11,24 +11,24 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, f4, i8, native
 
-SIDE = 7  # of the windows, pixels
+WINDOW_SIDE = 7  # of the windows, pixels
 C1, C2 = np.float32(1e-4), np.float32(9e-4)  # SSIM's constants for a data range of 1
 
-ROWS, TERMS = 12, 3  # rows of derivatives that are kept at a time, and numbers of each of their values
+DERIVATIVE_ROWS, TERMS = 12, 3  # rows of derivatives that are kept at a time, and numbers of each of their values
 EDGE_ROWS = 7  # of differences, weights and what they give
-CHUNK, PAD = 96, 9  # values that are summed at a time, and beside a row
+SUM_CHUNK, PAD = 96, 9  # values that are summed at a time, and beside a row
 
 
 def room_of(width):
     """Return the length of a buffer for a row of ``width`` pixels."""
-    return -(-3 * width // CHUNK) * CHUNK + PAD
+    return -(-3 * width // SUM_CHUNK) * SUM_CHUNK + PAD
 
 
 @native(
     STATUS, image=f4("height", "width"), photo=f4("height", "width"), weight=f4("height", "pixels"),
     ssim_lambda=f4(), edge_weight=f4(), first=i8(least=0, most="height"), last=i8(least="first", most="height"),
-    gradient=f4("height", "width", out=True), errors=f4("height", out=True), terms=f4(ROWS, TERMS, "room", out=True),
-    rows=f4(EDGE_ROWS, "room", out=True),
+    gradient=f4("height", "width", out=True), errors=f4("height", out=True),
+    terms=f4(DERIVATIVE_ROWS, TERMS, "room", out=True), rows=f4(EDGE_ROWS, "room", out=True),
 )  # fmt: skip
 def loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows):
     """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.

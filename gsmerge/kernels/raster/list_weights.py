@@ -8,7 +8,6 @@ from gsmerge.kernels.raster import blend
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native, u1
 
 LANES = 4  # channels of an image row
-FIRST_ENTRIES = 40  # initial room for entries, per pixel
 BATCH_ENTRIES = 32 * 256  # most entries of a batch of Gaussians in a tile
 
 ENTRIES = {
@@ -35,8 +34,9 @@ def list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width):
         ``starts [intersections + 1]`` int64, ``lanes`` uint8 (pixel within its tile, row-major), ``weights`` float32.
     """
     starts, progress = np.zeros(len(flatten_ids) + 1, np.int64), np.zeros(2, np.int64)
+    first_entries = 40  # initial room for entries, per pixel
     lanes, weights = (
-        np.empty(max(BATCH_ENTRIES, FIRST_ENTRIES * height * width), dtype) for dtype in (np.uint8, np.float32)
+        np.empty(max(BATCH_ENTRIES, first_entries * height * width), dtype) for dtype in (np.uint8, np.float32)
     )
     while True:
         _list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width, starts, lanes, weights, progress)

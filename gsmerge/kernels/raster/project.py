@@ -23,8 +23,8 @@ SUMS = 9  # sums per Gaussian: w g (3), v = d loss / d exponent, and v times x, 
 
 # Positions in the camera's array of numbers.
 ROTATION, SHIFT, FX, FY, CX, CY, WIDTH, HEIGHT, NEAR, FAR, EPS2D = 0, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20
-LIMIT_X, LIMIT_Y, ANTIALIASED = 21, 23, 25
-CAMERA = 26
+LIMIT_X, LIMIT_Y, ANTIALIASED = 21, 23, 25  # further positions; a limit has two numbers
+CAMERA = 26  # length of this array
 BLOCK = 128  # Gaussians whose gradients of the pose are summed in one row
 POSE = 12  # numbers of a world-to-camera matrix: rotation (9, row by row), shift (3)
 

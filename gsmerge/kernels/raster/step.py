@@ -7,14 +7,14 @@ Then a phase is one call without arguments on every thread, see ``gsmerge/kernel
 from __future__ import annotations
 
 from gsmerge.kernels.gaussians.optimise import COLUMNS
-from gsmerge.kernels.raster.image_loss import EDGE_ROWS, ROWS, TERMS
+from gsmerge.kernels.raster.image_loss import DERIVATIVE_ROWS, EDGE_ROWS, TERMS
 from gsmerge.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
 from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
 
 # Where most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces "deal". The list of
 # a tile then ends where no light passes the Gaussians in front
 PHASES = ("cull", "project", "count", "count_open", "deal", "deal_open", "blend", "loss", "backward", "update")
-PIECE = 1 << 13  # Gaussians that are culled or projected by one thread at a time
+THREAD_GAUSSIANS = 1 << 13  # Gaussians that are culled or projected by one thread at a time
 
 # State of the fit, buffers over its n Gaussians, over tiles, over intersections and over pixels, then what a step sets
 STEP = Table(
@@ -33,7 +33,7 @@ STEP = Table(
     offsets=i8("ends", out=True), light=f4("tiles", out=True), flatten_ids=i4("room", out=True),
     slots=f4("room", SUMS, out=True), image=f4("height", "width", 3, out=True),
     transmittance=f4("height", "width", out=True), gradient=f4("height", "width", 3, out=True),
-    errors=f4("height", out=True), terms=f4("threads", ROWS, TERMS, "line", out=True),
+    errors=f4("height", out=True), terms=f4("threads", DERIVATIVE_ROWS, TERMS, "line", out=True),
     rows=f4("threads", EDGE_ROWS, "line", out=True), photo=f4("height", "width", 3), weight=f4("height", "width"),
     camera=f4(CAMERA), eye=f4(3), background=f4(3), loss_weights=f4(2), rates=f4(COLUMNS), limits=f4(5), betas=f4(2),
     regs=f4(2),

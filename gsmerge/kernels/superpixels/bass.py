@@ -12,8 +12,7 @@ import numpy as np
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, native, u1
 
 COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
-NUM_PASSES = 4  # label passes per update of the parameters
-ROW = 9  # columns of a region's parameters
+REGION_COLUMNS = 9  # columns of a region's parameters
 
 
 def simple_point_table():
@@ -31,7 +30,7 @@ def simple_point_table():
 # sums are zero before
 _fit_regions = declare(
     "fit_regions", STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3),
-    areas=f8("count"), sums=f8("count", 9, out=True), rows=f4("count", ROW, out=True),
+    areas=f8("count"), sums=f8("count", 9, out=True), rows=f4("count", REGION_COLUMNS, out=True),
 )  # fmt: skip
 
 
@@ -41,14 +40,14 @@ def fit_regions(labels, colours, areas):
     The covariance is ``(A² I + S) / (n + 50 A - 3)`` with the scatter S of n positions and the expected area A of the
     region, pixels, from ``areas [count]`` float64.
     """
-    rows = np.empty((len(areas), ROW), np.float32)
+    rows = np.empty((len(areas), REGION_COLUMNS), np.float32)
     _fit_regions(labels, colours, areas, np.zeros((len(areas), 9)), rows)
     return rows
 
 
 @native(
     COUNT, labels=i4("padded_height", "padded_width", out=True), colours=f4("height", "width", 3),
-    rows=f4("count", ROW), table=u1(256), foreign=f4(256), precision=f4(),
+    rows=f4("count", REGION_COLUMNS), table=u1(256), foreign=f4(256), precision=f4(),
 )  # fmt: skip
 def label_pass(labels, colours, rows, table, foreign, precision):
     """Pass over all border pixels once, in four grids of pixels that do not touch; return how many pixels changed.
@@ -75,6 +74,7 @@ def improve_labels(labels, colours, areas):
     foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
     precision = np.float32(1 / COLOUR_DEVIATION**2)
     rows = fit_regions(labels, colours, areas)
-    for _ in range(NUM_PASSES):
+    num_passes = 4  # label passes per update of the parameters
+    for _ in range(num_passes):
         if label_pass(labels, colours, rows, table, foreign, precision) == 0:
             break

@@ -11,13 +11,13 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
-NUM_PIXELS, PLANE_ERROR, ROW = 5, 15, 20  # columns of a row after the mean, and its length
+TREE_PIXELS, PLANE_ERROR, TREE_COLUMNS = 5, 15, 20  # columns of a row after the mean, and its length
 OVERSIZE = 1e9  # added to the cost of a merge beyond the largest extent, so that such merges come last
 
 
 _region_sums = declare(
     "region_sums", STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3),
-    depths=f4("height", "width"), rows=f8("capacity", ROW, out=True), boxes=i4("count", 4, out=True),
+    depths=f4("height", "width"), rows=f8("capacity", TREE_COLUMNS, out=True), boxes=i4("count", 4, out=True),
     squares=f8(1, out=True),
 )  # fmt: skip
 
@@ -34,14 +34,14 @@ def region_sums(labels, pixels, depths, count, rows):
 
 # Writes the growth of the error if u and v merge: of colour and depth, and of position times the compactness.
 merge_growth = declare(
-    "merge_growth", rows=f8("capacity", ROW), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"),
+    "merge_growth", rows=f8("capacity", TREE_COLUMNS), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"),
     depth_weight=f8(), compactness=f8(), growth=f8(2, out=True),
 )  # fmt: skip
 
 
 _merge_order = declare(
     "merge_order", STATUS, num_leaves=i8(least=0), pairs=i4("num_pairs", 2, least=0, below="num_leaves"),
-    rows=f8("num_nodes", ROW, out=True), depth_weight=f8(), compactness=f8(), max_extent=f8(),
+    rows=f8("num_nodes", TREE_COLUMNS, out=True), depth_weight=f8(), compactness=f8(), max_extent=f8(),
     parents=i4("num_nodes", out=True), heights=f8("num_nodes", out=True), growths=f8("num_nodes", out=True),
     heads=i4("num_nodes", out=True), marks=i4("num_nodes", out=True), nexts=i4("num_halves", out=True),
     ends=i4("num_halves", out=True), heap=i4("num_pairs", out=True), places=i4("num_pairs", out=True),

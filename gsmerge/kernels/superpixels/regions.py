@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8, native, u1
 
-NUM_PIXELS, ROW = 5, 8  # column after the five of the mean, and the length of a row
+NUM_PIXELS, ROW_COLUMNS = 5, 8  # column after the five of the mean, and the length of a row
 LEAVE, JOIN = 6, 7  # columns of a region's row: n / (n - 1) for removing a pixel, n / (n + 1) for adding one
 
 
@@ -25,7 +25,7 @@ def pad_labels(labels):
 # sums are zero before; the first ``count`` rows are written
 _region_rows = declare(
     "region_rows", STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3), spread=f4(),
-    sums=f8("count", 6, out=True), rows=f4("capacity", ROW, out=True),
+    sums=f8("count", 6, out=True), rows=f4("capacity", ROW_COLUMNS, out=True),
 )  # fmt: skip
 
 
@@ -34,7 +34,7 @@ def region_rows(labels, pixels, count, capacity, spread):
 
     Raises ValueError if padded labels are not from 0 to ``count - 1``.
     """
-    rows = np.zeros((capacity, ROW), np.float32)
+    rows = np.zeros((capacity, ROW_COLUMNS), np.float32)
     _region_rows(labels, pixels, spread, np.zeros((count, 6)), rows)
     return rows
 
@@ -60,7 +60,7 @@ def ring_mask(labels, y, x, label):
 
 @native(
     COUNT, labels=i4("padded_height", "padded_width", out=True), pixels=f4("height", "width", 3),
-    rows=f4("count", ROW, out=True), table=u1(256), spread=f4(), backward=i4(),
+    rows=f4("count", ROW_COLUMNS, out=True), table=u1(256), spread=f4(), backward=i4(),
 )  # fmt: skip
 def sweep(labels, pixels, rows, table, spread, backward):
     """Sweep once over the border pixels; each move lowers the total squared error, and updates the means at once.

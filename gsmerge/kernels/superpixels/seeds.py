@@ -8,7 +8,6 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
-DENSITY_FLOOR = 0.3  # share of the seeds that are spread evenly
 JITTER = 0.3  # width of the noise on the dithering threshold, which prevents worm patterns
 
 
@@ -48,7 +47,8 @@ def seed_density(saliency, count):
     The density is uniform if nothing is salient.
     """
     density = np.sqrt(saliency, dtype=np.float64)
-    density = DENSITY_FLOOR + (1 - DENSITY_FLOOR) * density / max(density.mean(), 1e-12)
+    density_floor = 0.3  # share of the seeds that are spread evenly
+    density = density_floor + (1 - density_floor) * density / max(density.mean(), 1e-12)
     density *= count / density.sum()
     while (density > 1).any():
         full = density >= 1

@@ -11,11 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, i4, i8, u1
-from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW, region_rows
+from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW_COLUMNS, region_rows
 
-INVERSE, HEIGHT = 6, 7  # columns of a region's row: 1 / n, and the cost of the merge that made it
-SAMPLE_EDGES = 4096  # edges whose costs the first ceiling is estimated from
-TIE_BREAK = 1e-7  # squared colour that the kernel adds to equal costs, so that flat pictures merge many pairs per round
+INVERSE, MERGE_HEIGHT = 6, 7  # columns of a region's row: 1 / n, and the cost of the merge that made it
 
 
 # returns the number of pairs
@@ -33,7 +31,7 @@ def adjacent_pairs(labels):
 
 # Writes the growth of the squared error if two regions merge: n_u n_v / (n_u + n_v) |mean_u - mean_v|².
 merge_costs = declare(
-    "merge_costs", rows=f4("capacity", ROW), pairs=i4("count", 2, least=0, below="capacity"),
+    "merge_costs", rows=f4("capacity", ROW_COLUMNS), pairs=i4("count", 2, least=0, below="capacity"),
     costs=f4("count", out=True),
 )  # fmt: skip
 
@@ -44,11 +42,14 @@ def _first_ceiling(pairs, rows, share):
     On photos with 1.5 to 3 times too many regions, the share of edges that are cheaper than that merge at the start is
     close to the share of regions that disappear.
     """
-    step = max(1, len(pairs) // SAMPLE_EDGES)
+    sample_edges = 4096  # edges whose costs the first ceiling is estimated from
+    step = max(1, len(pairs) // sample_edges)
     costs = np.empty(len(pairs) // step, np.float32)
     merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
     rank = min(int(share * len(costs)), len(costs) - 1)
-    return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * TIE_BREAK))
+    # Squared colour that the kernel adds to equal costs, so that flat pictures merge many pairs per round
+    tie_break = 1e-7
+    return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * tie_break))
 
 
 # returns the number of nodes
@@ -56,7 +57,8 @@ _merge_tree = declare(
     "merge_tree", COUNT, num_leaves=i8(least=0), num_merges=i8(), ceiling=f4(),
     pairs=i4("num_pairs", 2, least=0, below="num_leaves", out=True), costs=f4("num_pairs", out=True),
     parked_pairs=i4("capacity", 2, out=True), parked_costs=f4("capacity", out=True),
-    rows=f4("num_nodes", ROW, out=True), parents=i4("num_nodes", out=True), best_costs=f4("num_nodes", out=True),
+    rows=f4("num_nodes", ROW_COLUMNS, out=True), parents=i4("num_nodes", out=True),
+    best_costs=f4("num_nodes", out=True),
 )  # fmt: skip
 
 
@@ -113,7 +115,7 @@ def merge_regions(labels, pixels, num_regions, count, spread):
     parents, num_nodes = merge_tree(pairs, rows, num_regions, num_merges, ceiling)
     if num_nodes - num_regions < num_merges:
         raise ValueError(f"expected finite colours of regions that touch, to merge {num_regions} down to {count}")
-    heights = rows[:num_nodes, HEIGHT]
+    heights = rows[:num_nodes, MERGE_HEIGHT]
     merges = heights[num_regions:]
     cut = np.partition(merges, num_merges - 1)[num_merges - 1]
     keep = heights < cut

@@ -20,23 +20,22 @@ from gsmerge.kernels.elementary import log, power
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map, use_threads
-from gsmerge.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of, merge_rows
+from gsmerge.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of_cloud, merge_rows
 from gsmerge.types import Gaussians
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-NEIGHBORS = 10  # with 16 a real capture gains 0.03 dB, in 1.5 times the time
-COLOR_WEIGHT = 1.0  # weight of squared distances of harmonics against nats
-AREA_EXPONENT = 1.6075  # of Thomsen's formula for the area of an ellipsoid
-CHUNK = 65536  # Gaussians per piece of work
+GREEDY_NEIGHBORS = 10  # with 16 a real capture gains 0.03 dB, in 1.5 times the time
+CHUNK_GAUSSIANS = 65536  # Gaussians per piece of work
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # rows and columns of the upper triangle of a covariance
 
 
 def areas(scales: np.ndarray) -> Floats:
     """Compute the surface areas ``[n]`` of ellipsoids with half axes ``[n,3]``, within 1 % (Knud Thomsen's formula)."""
-    a, b, c = power(np.maximum(scales, FLATNESS * scales.max(1, keepdims=True)).astype(np.float64), AREA_EXPONENT).T
-    return np.asarray(4 * np.pi * power((a * b + a * c + b * c) / 3, 1 / AREA_EXPONENT))
+    area_exponent = 1.6075  # of Thomsen's formula for the area of an ellipsoid
+    a, b, c = power(np.maximum(scales, FLATNESS * scales.max(1, keepdims=True)).astype(np.float64), area_exponent).T
+    return np.asarray(4 * np.pi * power((a * b + a * c + b * c) / 3, 1 / area_exponent))
 
 
 def log_determinants(covars: Floats) -> Floats:
@@ -54,7 +53,8 @@ def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
     outer = np.stack([offsets[:, i] * offsets[:, j] for i, j in UPPER], 1)
     merged = share * covars[left] + (1 - share) * covars[right] + share * (1 - share) * outer
     before = share[:, 0] * log_determinants(covars[left]) + (1 - share[:, 0]) * log_determinants(covars[right])
-    return 0.5 * (log_determinants(merged) - before) + COLOR_WEIGHT * ((cloud.sh[left] - cloud.sh[right]) ** 2).sum(1)
+    color_weight = 1.0  # weight of squared distances of harmonics against nats
+    return 0.5 * (log_determinants(merged) - before) + color_weight * ((cloud.sh[left] - cloud.sh[right]) ** 2).sum(1)
 
 
 def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
@@ -63,11 +63,11 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 
     with use_threads() as threads:
         tree = cKDTree(cloud.means, balanced_tree=False, compact_nodes=False)
-        _, nearest = tree.query(cloud.means, min(NEIGHBORS + 1, len(cloud)), workers=threads)
+        _, nearest = tree.query(cloud.means, min(GREEDY_NEIGHBORS + 1, len(cloud)), workers=threads)
     nearest = nearest.astype(np.int32)
 
     def chunk_pairs(start: int) -> tuple[Ints, Ints, Floats]:
-        chunk = nearest[start : start + CHUNK]
+        chunk = nearest[start : start + CHUNK_GAUSSIANS]
         rows = np.repeat(np.arange(start, start + len(chunk)), chunk.shape[1])
         neighbors = chunk.reshape(-1).astype(np.int64)
         candidates = (neighbors <= rows).nonzero()[0]  # the row itself, or pairs that the lower row may list too
@@ -77,7 +77,7 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
         left, right = np.minimum(rows, neighbors)[keep], np.maximum(rows, neighbors)[keep]
         return left, right, pair_costs(cloud, left, right)
 
-    chunks = parallel_map(chunk_pairs, range(0, len(cloud), CHUNK))
+    chunks = parallel_map(chunk_pairs, range(0, len(cloud), CHUNK_GAUSSIANS))
     left, right, costs = (np.concatenate(column) for column in zip(*chunks, strict=True))
     return left, right, costs
 
@@ -119,12 +119,12 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
     return cloud
 
 
-def merge(gaussians: Gaussians, count: int) -> Gaussians:
+def merge_greedily(gaussians: Gaussians, count: int) -> Gaussians:
     """Merge pairs in rounds until at most ``count`` Gaussians are left."""
     cloud = cloud_of(gaussians)
     cloud.masses[:] = gaussians.opacities.clip(MIN_OPACITY, 1) * areas(gaussians.scales)
     cloud = reduce_to(cloud, count)
-    merged = gaussians_of(cloud, gaussians)
+    merged = gaussians_of_cloud(cloud, gaussians)
     opacities = np.minimum(cloud.masses / areas(merged.scales), MAX_OPACITY).astype(np.float32)
     return replace(merged, opacities=opacities)
 
@@ -135,4 +135,4 @@ def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     if len(gaussians) <= count:
         return gaussians
     with stage("reduce"):
-        return merge(gaussians, count)
+        return merge_greedily(gaussians, count)

@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 from gsmerge.measure.documents import csv_text
-from gsmerge.pages.page import PICTURES, data_uri, render_template
-from gsmerge.research.charts.figures import Figure
-from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Results, size_label
-from gsmerge.research.charts.measure_run import HELD_OUT, RunRecord
+from gsmerge.pages.page import PICTURES_POLICY, data_uri, render_template
+from gsmerge.research.charts.figures import Chart
+from gsmerge.research.charts.lines import CHART_METRICS, MIN_SCENES, PARTS, Results, size_label
+from gsmerge.research.charts.measure_run import HELD_OUT_NOTE, RunRecord
 
 COSTS = ("Gaussians", "Kept", "Bytes", "Seconds")
-Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
+ChartTable = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
 
 
-def make_page(
-    records: Sequence[RunRecord], figures: Sequence[Figure], drawings: Mapping[str, bytes], command: str
+def make_chart_page(
+    records: Sequence[RunRecord], figures: Sequence[Chart], drawings: Mapping[str, bytes], command: str
 ) -> str:
     """Make the HTML page of charts, which loads nothing from the network.
 
@@ -30,7 +30,7 @@ def make_page(
     words = "; ".join([words, *list_held_out_notes(records)])
     return render_template(
         "charts.html",
-        policy=PICTURES,
+        policy=PICTURES_POLICY,
         names=names,
         words=words + (f"; {len(failed)} failed" if failed else ""),
         part=PARTS[results.part],
@@ -44,11 +44,11 @@ def make_page(
 
 def list_held_out_notes(records: Sequence[RunRecord]) -> list[str]:
     """List a note for each scene without targets; it names the held-out photos on which the scene's runs are scored."""
-    notes = (f"{record.scene}: {note}" for record in records for note in record.notes if note.startswith(HELD_OUT))
+    notes = (f"{record.scene}: {note}" for record in records for note in record.notes if note.startswith(HELD_OUT_NOTE))
     return list(dict.fromkeys(notes))
 
 
-def _mean_table(results: Results) -> Table:
+def _mean_table(results: Results) -> ChartTable:
     """Make the table of means over the scenes, with a row for each method, settings and size."""
     points = {
         (metric, line.name, point.label): point.y
@@ -67,14 +67,14 @@ def _mean_table(results: Results) -> Table:
         )
         row = [name, size, str(len(group)), f"{count:,.0f}", f"{kept:.3g} %", f"{num_bytes:,.0f}", f"{seconds:.2f}"]
         for metric in results.metrics:
-            digits, values = METRICS[metric].digits, [r.value(f"{metric}_{results.part}") for r in group]
+            digits, values = CHART_METRICS[metric].digits, [r.value(f"{metric}_{results.part}") for r in group]
             known = [value for value in values if value is not None]
             cell = f"{sum(known) / len(known):.{digits}f}" if known else ""
             if (point := points.get((metric, name, size))) and point.count >= MIN_SCENES:
                 cell = f"{point.mean:.{digits}f} \N{PLUS-MINUS SIGN} {point.high - point.mean:.{digits}f}"
             row.append(cell)
         rows.append(row)
-    return ("Method", "Size", "Scenes", *COSTS, *(METRICS[metric].label for metric in results.metrics)), rows
+    return ("Method", "Size", "Scenes", *COSTS, *(CHART_METRICS[metric].label for metric in results.metrics)), rows
 
 
 def make_table(records: Sequence[RunRecord]) -> str:

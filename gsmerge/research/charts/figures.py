@@ -17,14 +17,20 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from gsmerge.io import atomic_output
-from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
+from gsmerge.research.charts.lines import CHART_METRICS, MIN_SCENES, PARTS, Interval, Line, Results
 from gsmerge.research.charts.measure_run import INPUT
 
-MAX_NAMED = 8  # most scenes that a caption names
-
-PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
-KEY_WIDTH, KEY_LINE = 2.3, 0.135  # width of the legend, and height of its lines, inches
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7B4173", "#8C6D31")  # Okabe, Ito 2008
+PANEL_WIDTH, SINGLE_WIDTH, PANEL_HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
+LINE_COLORS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#7B4173",
+    "#8C6D31",
+)  # Okabe, Ito 2008
 MARKERS = "osD^vPX"  # their number is coprime to the number of colours
 DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # each cycle through the colours takes the next dash
 RC: dict[Any, Any] = {
@@ -60,7 +66,7 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Figure:
+class Chart:
     """A chart and its table: lines over a common x."""
 
     name: str  # name of its files
@@ -72,7 +78,7 @@ class Figure:
     panels: tuple[Panel, ...]  # side by side
 
 
-def make_figures(results: Results) -> list[Figure]:
+def make_figures(results: Results) -> list[Chart]:
     """Make the figures for which there are data: quality against time, and against size."""
     time = "Quality against time", "the wall time of the merge (reading and writing not counted)", "Seconds"
     size = "Quality against size", "the share of the input's Gaussians that is kept", "Gaussians kept (%)"
@@ -83,14 +89,14 @@ def make_figures(results: Results) -> list[Figure]:
     return [figure for figure in figures if figure is not None]
 
 
-def _against(results: Results, cost: str, name: str, title: str, described: str, label: str) -> Figure | None:
+def _against(results: Results, cost: str, name: str, title: str, described: str, label: str) -> Chart | None:
     """Plot quality against a cost, with a panel for each metric and a table of all points; None without lines."""
     panels = []
     for metric in results.metrics:
         score = f"{metric}_{results.part}"
         lines = results.by_size(cost, score)
         scenes = {scene for line in lines for point in line.points for scene in point.by_scene}
-        shape = METRICS[metric]
+        shape = CHART_METRICS[metric]
         if lines:
             panels.append(Panel(shape.label, shape.higher, tuple(lines), results.input_mean(score, scenes)))
     if not panels:
@@ -103,13 +109,14 @@ def _against(results: Results, cost: str, name: str, title: str, described: str,
     ]
     head = ("Panel", "Line", "Point", label, "Mean", "Low", "High")
     caption = f"{results.caveat}Quality against {described}. Measured on {PARTS[results.part]}."
-    return Figure(name, title, f"{caption} {_describe_scenes(panels[0])}", label, head, tuple(rows), tuple(panels))
+    return Chart(name, title, f"{caption} {_describe_scenes(panels[0])}", label, head, tuple(rows), tuple(panels))
 
 
 def _describe_scenes(panel: Panel) -> str:
     """Describe the scenes and the intervals of a panel for the caption."""
     scenes = sorted({scene for line in panel.lines for point in line.points for scene in point.by_scene})
-    listed = f"{', '.join(scenes[:MAX_NAMED])}{', ...' if len(scenes) > MAX_NAMED else ''}"
+    max_named = 8  # most scenes that a caption names
+    listed = f"{', '.join(scenes[:max_named])}{', ...' if len(scenes) > max_named else ''}"
     if len(scenes) <= 1:
         return f"Scene: {listed}; one scene has no intervals."
     return (
@@ -124,7 +131,7 @@ def _numbers(interval: Interval) -> list[str]:
     return [f"{value:.5g}" for value in (interval.mean, *ends)] + [""] * (2 - len(ends))
 
 
-def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, bytes]:
+def draw_figures(figures: Sequence[Chart], folder: Path) -> dict[str, bytes]:
     """Draw figures as ``NAME.png`` and ``NAME.svg``; equal numbers give equal bytes. Return the SVG by name."""
     folder.mkdir(parents=True, exist_ok=True)
     names = dict.fromkeys((line.name, line.is_own) for f in figures for panel in f.panels for line in panel.lines)
@@ -150,19 +157,20 @@ def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
     """Make a style for each line by name; gsmerge's own lines are broader and in front."""
     styles: dict[str, Style] = {INPUT: {"color": "#555555", "ls": (0, (2, 2)), "marker": "s", "lw": 1.0, "zorder": 2}}
     for i, (name, is_own) in enumerate(line for line in names if line[0] != INPUT):
-        dash = DASHES[i // len(COLORS) % len(DASHES)]
-        marks = {"color": COLORS[i % len(COLORS)], "ls": dash, "marker": MARKERS[i % len(MARKERS)]}
+        dash = DASHES[i // len(LINE_COLORS) % len(DASHES)]
+        marks = {"color": LINE_COLORS[i % len(LINE_COLORS)], "ls": dash, "marker": MARKERS[i % len(MARKERS)]}
         styles[name] = {**marks, "lw": 1.5 if is_own else 1.1, "zorder": 4 + is_own}
     return styles
 
 
-def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
+def draw_curves(figure: Chart, styles: Mapping[str, Style]) -> Drawing:
     """Draw a figure's panels side by side, with one legend beside them."""
     num_panels = len(figure.panels)
-    width = (SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels) + KEY_WIDTH
+    key_width, key_line = 2.3, 0.135  # width of the legend, and height of its lines, inches
+    width = (SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels) + key_width
     names = list(dict.fromkeys(line.name for panel in figure.panels for line in panel.lines))
     names += [INPUT] * (INPUT not in names and any(panel.reference is not None for panel in figure.panels))
-    size = width, max(HEIGHT, KEY_LINE * len(names))
+    size = width, max(PANEL_HEIGHT, key_line * len(names))
     drawing = Drawing(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.08))
     all_axes = np.atleast_1d(drawing.subplots(1, num_panels))
     for axes, panel in zip(all_axes, figure.panels, strict=True):

@@ -14,7 +14,7 @@ from gsmerge.compaction.methods import find_method
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions
-from gsmerge.research.charts.lines import SIZES
+from gsmerge.research.charts.lines import SIZE_SETTINGS
 from gsmerge.research.charts.measure_run import ChartScene, RunRecord, describe
 from gsmerge.scene.content_hash import content_hash, digest, fill_template, list_files, list_photos, scene_name
 from gsmerge.settings.compact import OURS, CompactOptions
@@ -22,23 +22,23 @@ from gsmerge.settings.setting import flat_settings
 from gsmerge.version import __version__
 
 OF_ALL = ("seed", "threads")  # settings that all methods use
-Grid = Mapping[str, Sequence[Any]]  # values by the name of a setting
-Run = tuple[ChartScene, RunRecord, CompactOptions]
+SettingGrid = Mapping[str, Sequence[Any]]  # values by the name of a setting
+GridRun = tuple[ChartScene, RunRecord, CompactOptions]
 
 
-def parse_grid(pairs: Sequence[str]) -> Grid:
+def parse_grid(pairs: Sequence[str]) -> SettingGrid:
     """Make a grid from pairs NAME=A,B with names of settings of compact; UsageError for other names or no values."""
     grid: dict[str, list[Any]] = {}
     for pair in pairs:
         name, _, text = pair.partition("=")
-        values = [parse_value(part.strip()) for part in text.split(",") if part.strip()]
+        values = [parse_cell(part.strip()) for part in text.split(",") if part.strip()]
         if name not in flat_settings(CompactOptions) or name in grid or not values:
             raise UsageError(f"--grid {pair}: expected a setting of compact, each once, with values: NAME=A,B")
         grid[name] = values
     return grid
 
 
-def parse_value(text: str) -> Any:
+def parse_cell(text: str) -> Any:
     """Parse a number, true or false; other text stays."""
     try:
         return json.loads(text)
@@ -46,15 +46,15 @@ def parse_value(text: str) -> Any:
         return text
 
 
-def list_settings(grid: Grid, fixed: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+def list_settings(grid: SettingGrid, fixed: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     """List (method, settings) of every run on one scene, the unmerged input first.
 
     Budgets and superpixels stand next to each other; other lists are multiplied. ``fixed`` settings hold for all runs.
     Baselines get the settings that they use. Raises UsageError if a method or setting is unknown or impossible, or if
     a program is missing.
     """
-    sizes = [{name: value} for name in SIZES for value in grid.get(name, ())] or [{}]
-    others = {name: values for name, values in grid.items() if name not in (*SIZES, "method")}
+    sizes = [{name: value} for name in SIZE_SETTINGS for value in grid.get(name, ())] or [{}]
+    others = {name: values for name, values in grid.items() if name not in (*SIZE_SETTINGS, "method")}
     runs: dict[str, tuple[str, dict[str, Any]]] = {INPUT: (INPUT, {})}
     for method in grid.get("method", (OURS,)):
         uses = None if method == OURS else find_method(options_of(method, {})).uses
@@ -105,8 +105,8 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
 
 
 def make_runs(
-    sources: Sequence[ChartScene], grid: Grid, fixed: Mapping[str, Any], measured: EvaluateOptions
-) -> list[Run]:
+    sources: Sequence[ChartScene], grid: SettingGrid, fixed: Mapping[str, Any], measured: EvaluateOptions
+) -> list[GridRun]:
     """Make the runs of a grid, scene by scene; UsageError if a setting is invalid."""
     asked = [(method, settings, options_of(method, settings)) for method, settings in list_settings(grid, fixed)]
     runs = []

@@ -14,10 +14,10 @@ from scipy.special import stdtrit
 from gsmerge.research.charts.measure_run import INPUT, RunRecord
 from gsmerge.settings.compact import OURS
 
-LEVEL = 0.95  # confidence of the intervals
+CONFIDENCE = 0.95  # confidence of the intervals
 MIN_SCENES = 3  # least number of scenes of an interval; with two scenes an interval is too wide to be useful
 MIN_SHARE = 0.5  # share of the scenes that every point of a line must have
-SIZES = ("budget", "superpixels")  # settings that define the number of Gaussians
+SIZE_SETTINGS = ("budget", "superpixels")  # settings that define the number of Gaussians
 PARTS = {  # views and pixels over which scores are averaged; the most meaningful first
     "target_visible": "held-out views, pixels that the input views see",
     "target": "held-out views",
@@ -38,7 +38,7 @@ class Metric:
     digits: int  # number of decimals
 
 
-METRICS = {
+CHART_METRICS = {
     "psnr": Metric("PSNR (dB)", True, 2),
     "ssim": Metric("SSIM", True, 3),
     "lpips_vgg": Metric("LPIPS (VGG)", False, 3),
@@ -85,7 +85,7 @@ def mean_interval(values: Sequence[float]) -> Interval:
     array = np.asarray(values, np.float64)
     mean, half = float(array.mean()), 0.0
     if len(array) > 1:
-        factor = float(stdtrit(len(array) - 1, 0.5 + LEVEL / 2))
+        factor = float(stdtrit(len(array) - 1, 0.5 + CONFIDENCE / 2))
         half = factor * float(array.std(ddof=1)) / math.sqrt(len(array))
     return Interval(mean, mean - half, mean + half, len(array))
 
@@ -109,13 +109,13 @@ def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
 
 def line_key(record: RunRecord) -> LineKey:
     """Return the key of a record's line, which is the method and all settings except the size."""
-    settings = {name: value for name, value in record.settings.items() if name not in SIZES}
+    settings = {name: value for name, value in record.settings.items() if name not in SIZE_SETTINGS}
     return record.method, tuple(sorted(settings.items()))
 
 
 def size_label(record: RunRecord) -> str:
     """Return the requested size of a run as text; empty for the default."""
-    for name in SIZES:
+    for name in SIZE_SETTINGS:
         if name in record.settings:
             value = record.settings[name]
             number = f"{value:,}" if isinstance(value, int) else str(value)
@@ -152,7 +152,7 @@ class Results:
         self.names = line_names(list(keys))
         counts = {part: sum(r.value(f"psnr_{part}") is not None for r in self.runs) for part in PARTS}
         self.part = next((p for p in counts if self.runs and counts[p] >= 0.9 * len(self.runs)), "context")
-        names = [m for m in METRICS if any(r.value(f"{m}_{self.part}") is not None for r in self.runs)]
+        names = [m for m in CHART_METRICS if any(r.value(f"{m}_{self.part}") is not None for r in self.runs)]
         self.metrics = [m for m in names if m != "lpips_alex" or "lpips_vgg" not in names]
 
     @property

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.left_out import LEAST_VIEWS, choose_views
+from gsmerge.compaction.left_out import LEAST_VIEWS, choose_left_out
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
 from gsmerge.io.scene_files import find_scene_files
@@ -22,9 +22,8 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene, Views
 
 RUNS = "runs.jsonl"  # in the folder of a grid
-HELD_OUT = "without --targets no run sees these photos, by which all are judged"
+HELD_OUT_NOTE = "without --targets no run sees these photos, by which all are judged"
 SCORING = ("score", "input")  # stages of a run that only measure
-MAX_DB = 100.0  # PSNR of equal pictures, since JSON has no infinity
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, 
         count=len(gaussians),
         bytes=file_bytes(len(gaussians), gaussians.sh_degree),
         seconds=seconds,
-        scores=score(scene, None if record.method == INPUT else gaussians, held_out, measured),
+        scores=mean_scores(scene, None if record.method == INPUT else gaussians, held_out, measured),
         notes=notes,
     )
 
@@ -110,7 +109,7 @@ def load_source(source: ChartScene) -> tuple[Scene, HeldOutViews | None, tuple[s
     if source.targets is not None:
         return load.scene, read_held_out(load, source.targets), tuple(load.notes)
     scene, held_out = hold_out(load.scene)
-    judges = () if held_out is None else (f"{HELD_OUT}: {', '.join(held_out.names)}",)
+    judges = () if held_out is None else (f"{HELD_OUT_NOTE}: {', '.join(held_out.names)}",)
     return scene, held_out, (*load.notes, *judges)
 
 
@@ -119,13 +118,13 @@ def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:
     photos = scene.photo_views
     if len(photos) < LEAST_VIEWS or scene.images is None:
         return scene, None
-    ids, _ = choose_views(photos)
+    ids, _ = choose_left_out(photos)
     rest = [view for view in range(len(scene)) if view not in ids]
     names = tuple(scene.names[view] for view in ids)
     return subset(scene, rest), HeldOutViews(scene.cameras[ids], scene.images[ids], names, tuple(ids), tuple(rest))
 
 
-def score(
+def mean_scores(
     scene: Scene, gaussians: Gaussians | None, targets: Views | None, options: EvaluateOptions
 ) -> dict[str, float]:
     """Measure mean scores by name (``psnr_target_visible``, ...); names without a measurement are left out.
@@ -135,10 +134,11 @@ def score(
     results = {} if gaussians is None else {"result": gaussians}
     evaluation = evaluate(scene, results, targets, replace(options, own=gaussians is None, fog=False))
     scores: dict[str, float] = {}
+    max_db = 100.0  # PSNR of equal pictures, since JSON has no infinity
     for split in evaluation.num_views:
         full, masked = evaluation.results[-1].mean(split)
         for part, quality in (("", full), ("_visible", masked)):
             for name, value in asdict(quality).items():
                 if value is not None and not math.isnan(value):
-                    scores[f"{name}_{split}{part}"] = min(value, MAX_DB)
+                    scores[f"{name}_{split}{part}"] = min(value, max_db)
     return scores

@@ -22,7 +22,7 @@ from gsmerge.settings.setting import Settings, flat_settings, setting
 
 if TYPE_CHECKING:
     from gsmerge.measure.evaluate import EvaluateOptions
-    from gsmerge.research.charts.grid import Run
+    from gsmerge.research.charts.grid import GridRun
 
 CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # in the folder
 
@@ -46,7 +46,7 @@ class ChartOptions(Settings):
     ),
     opt.settings_option(CompactOptions, ChartOptions, example="lpips=none"),
     *opt.panel(
-        opt.INPUT,
+        opt.INPUT_GROUP,
         opt.option("targets", str, "Cameras of held-out photos: one file, or with {scene}, {parent} and {stem} of each "
                    "scene in it."),
     ),
@@ -82,7 +82,7 @@ def chart(args: opt.Args) -> None:
 
 def _plan_runs(
     args: opt.Args, scenes: Sequence[str], own: ChartOptions, fixed: dict[str, Any]
-) -> tuple[EvaluateOptions, list[Run], list[str]]:
+) -> tuple[EvaluateOptions, list[GridRun], list[str]]:
     """Make the options of all measurements, the runs of the grid, and notes."""
     from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.research.charts.grid import find_sources, make_runs, parse_grid
@@ -93,7 +93,7 @@ def _plan_runs(
     return measured, make_runs(sources, grid, fixed, measured), list(notes)
 
 
-def _run_all(args: opt.Args, runs: Sequence[Run], measured: EvaluateOptions) -> list[tuple[str, str]]:
+def _run_all(args: opt.Args, runs: Sequence[GridRun], measured: EvaluateOptions) -> list[tuple[str, str]]:
     """Run all, and append the record of each to the folder; return name and reason of those that failed."""
     from gsmerge.io.jsonl import append_line
     from gsmerge.research.charts.measure_run import RUNS, run_setting
@@ -114,7 +114,7 @@ def _run_all(args: opt.Args, runs: Sequence[Run], measured: EvaluateOptions) -> 
 
 def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     """Draw charts, page and table of all runs in the folder, and print a summary; ``notes`` were printed before."""
-    from gsmerge.research.charts.chart_page import list_held_out_notes, make_page, make_table
+    from gsmerge.research.charts.chart_page import list_held_out_notes, make_chart_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures
     from gsmerge.research.charts.lines import Results
     from gsmerge.research.charts.measure_run import read_runs
@@ -129,7 +129,7 @@ def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     for name, value in args.given(("grid", "set", "targets")).items():
         for element in value if isinstance(value, list) else [value]:
             words += [f"--{name}", element]
-    page = make_page(records, figures, drawings, shlex.join(words))
+    page = make_chart_page(records, figures, drawings, shlex.join(words))
     write_texts({out / PAGE: page, out / TABLE: make_table(records)})
     failed = sum(record.error is not None for record in records)
     document = {

@@ -30,7 +30,7 @@ class StressFiles(Settings):
 
 @opt.command(
     opt.SCENE,
-    *opt.panel(opt.MEASURING, opt.option("cases", str, "Try only these.", wording="all", metavar="NAME,...")),
+    *opt.panel(opt.MEASURING_GROUP, opt.option("cases", str, "Try only these.", wording="all", metavar="NAME,...")),
     opt.settings_option(CompactOptions, StressFiles, example="targets=FILE"),
 )
 def stress(args: opt.Args) -> None:

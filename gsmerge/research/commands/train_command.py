@@ -18,7 +18,7 @@ OPTIONS = LazyFunction("gsmerge.research.training", "TrainOptions")
 
 @opt.command(
     *opt.panel(
-        opt.INPUT,
+        opt.INPUT_GROUP,
         opt.option("data", list[Path], "Scenes to learn from: a folder, a folder of such, or a .ply; may be repeated.",
                    default=opt.REQUIRED, metavar="DIR"),
         opt.option("validation", list[Path], "Scenes that only choose the best checkpoint; left out where --data holds "

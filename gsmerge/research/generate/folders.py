@@ -17,7 +17,7 @@ from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import FLIP
 from gsmerge.kernels.matrices import matmul
 from gsmerge.research.generate.photograph import Float
-from gsmerge.research.generate.shapes import invert
+from gsmerge.research.generate.shapes import invert_motion
 from gsmerge.research.generate.synthetic_scene import GenerateOptions, make_scene
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras
@@ -38,7 +38,7 @@ def generate_scene(folder: Path, options: GenerateOptions | None = None, *, seed
     it cannot be written.
     """
     options = options or GenerateOptions()
-    key = scene_key(seed, index, options)
+    key = scene_facts(seed, index, options)
     if not is_complete(folder, key):
         scene = make_scene(seed, index, options)
         record = {
@@ -82,7 +82,7 @@ def generate(
     planned = []
     for index in range(count):
         folder = out / f"scene_{index:04d}"
-        planned.append(SceneFolder(folder, is_complete(folder, scene_key(seed, index, options))))
+        planned.append(SceneFolder(folder, is_complete(folder, scene_facts(seed, index, options))))
     todo = [i for i, scene in enumerate(planned) if not scene.kept]
 
     def work(index: int) -> None:
@@ -97,12 +97,12 @@ def generate(
 
 
 RECORD = "generated.json"
-RECORD_VERSION = 3  # increases if the same seed and options give other scenes than before
 
 
-def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
+def scene_facts(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
     """Return everything that a scene depends on, as plain values."""
-    return {"record_version": RECORD_VERSION, "seed": seed, "index": index, "options": options.to_dict()}
+    record_version = 3  # increases if the same seed and options give other scenes than before
+    return {"record_version": record_version, "seed": seed, "index": index, "options": options.to_dict()}
 
 
 def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
@@ -128,7 +128,7 @@ def _write_views(add: AddOutput, folder: Path, cameras: Cameras, images: Sequenc
         name = f"images/view_{i:0{digits}d}.png"
         _, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
         add(folder / name).write_bytes(data.tobytes())
-        c2w = matmul(invert(cameras.viewmats[i]), FLIP)
+        c2w = matmul(invert_motion(cameras.viewmats[i]), FLIP)
         frames.append({"file_path": name, "transform_matrix": c2w.tolist()})
     K = cameras.Ks[0]
     shared = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": cameras.width, "h": cameras.height}

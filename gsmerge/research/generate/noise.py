@@ -13,7 +13,7 @@ from gsmerge.kernels.pictures import blur, convolve
 from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.research.generate.photograph import Float, Pinhole
 from gsmerge.research.generate.shapes import Array, rotate
-from gsmerge.research.generate.textures import enlarge
+from gsmerge.research.generate.textures import enlarge_texture
 from gsmerge.types import SH_C0, Gaussians
 
 Range = tuple[float, float]
@@ -67,17 +67,17 @@ class NoiseOptions:
     unit: Range = (0.2, 5.0)  # world units per metre
 
 
-RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]
+NOISE_RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]
 if TYPE_CHECKING:
     Noise: TypeAlias = Any
 else:  # the values that were drawn for one scene, under the names of their ranges
-    Noise = make_dataclass("Noise", [*RANGES, "sh_degree"], frozen=True)
+    Noise = make_dataclass("Noise", [*NOISE_RANGES, "sh_degree"], frozen=True)
 
 
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
     """Draw the values of one scene; ``factor`` multiplies errors, not habits. Shares and ``bleed`` are at most 1."""
     drawn: dict[str, float] = {}
-    for name in RANGES:
+    for name in NOISE_RANGES:
         low, high = getattr(options, name)
         is_log = name in LOG_UNIFORM
         drawn[name] = float(exp(rng.uniform(log(low), log(high)))) if is_log else rng.uniform(low, high)
@@ -104,7 +104,7 @@ class TrueView:
 def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) -> Float:
     """Draw smooth noise ``[height,width]`` of standard deviation 1, with ``cells`` cells along the longer side."""
     side = max(height, width)
-    field = enlarge(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
+    field = enlarge_texture(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
     return field / max(float(field.std(dtype=np.float64)), 1e-3)
 
 
@@ -119,7 +119,6 @@ def edge_mask(depth: Array) -> Float:
 
 
 MEAN_FILTER = np.full(7, 1 / 7, np.float32)  # averages 7 pixels
-TEXTURED = 0.05  # standard deviation of grey values, from which an area counts as detailed
 
 
 def texture_mask(image: Float) -> Float:
@@ -127,7 +126,8 @@ def texture_mask(image: Float) -> Float:
     grey = image.mean(2)
     mean, mean_square = (convolve(values, MEAN_FILTER, MEAN_FILTER) for values in (grey, grey * grey))
     deviation = np.sqrt(np.maximum(mean_square - mean * mean, 0))
-    return np.clip(deviation / TEXTURED, 0, 1)
+    min_deviation = 0.05  # standard deviation of grey values, from which an area counts as detailed
+    return np.clip(deviation / min_deviation, 0, 1)
 
 
 def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
@@ -204,14 +204,12 @@ def pixel_gaussians(view: TrueView, lens: Pinhole, noise: Noise, rng: np.random.
     scales = _pixel_scales(depth / lens.focal, noise, rng)
     opacities = noise.opacity_low + (noise.opacity_high - noise.opacity_low) * confidence
     opacities = np.clip(opacities + rng.normal(0, noise.opacity_grain, n), 0.01, 0.995)
-    image = blur(view.image, noise.color_blur) if noise.color_blur > MIN_BLUR else view.image
+    min_blur = 0.2  # least standard deviation of the smoothing of colours, pixels; smaller values change nothing
+    image = blur(view.image, noise.color_blur) if noise.color_blur > min_blur else view.image
     colors = np.clip(image.reshape(-1, 3) + rng.normal(0, noise.color_grain, (n, 3)), 0, 1).astype(np.float32)
     sh0, shN = _harmonics(colors, means, view.c2w[:3, 3], noise, rng)
     columns = (means, quats, scales, opacities, sh0, shN)
     return Gaussians(*(np.ascontiguousarray(column, dtype=np.float32) for column in columns))
-
-
-MIN_BLUR = 0.2  # least standard deviation of the smoothing of colours, pixels; smaller values change nothing
 
 
 def _pixel_scales(footprints: Array, noise: Noise, rng: np.random.Generator) -> Array:

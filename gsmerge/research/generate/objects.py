@@ -21,7 +21,7 @@ from gsmerge.research.generate.shapes import (
     column,
     leaf,
     norm,
-    place,
+    place_shapes,
     quad,
     rod,
 )
@@ -79,7 +79,7 @@ def shelf(pal: Palette, width: float, height: float) -> Shapes:
             out.append(box((left, -top, front), (max(right, left + 0.1), -y - 0.02, -0.02), pal.material("spines")))
         else:
             for x in rng.uniform(-width / 2.3, width / 2.3, rng.integers(1, 4)):
-                out += place(small_object(pal), (x, -y - 0.02, -depth / 2), yaw=rng.uniform(0, 6))
+                out += place_shapes(small_object(pal), (x, -y - 0.02, -depth / 2), yaw=rng.uniform(0, 6))
     return out
 
 
@@ -145,7 +145,7 @@ def books(pal: Palette) -> Shapes:
     for _ in range(rng.integers(1, 6)):
         w, d, h = rng.uniform(0.12, 0.22), rng.uniform(0.1, 0.16), rng.uniform(0.01, 0.04)
         book = box((-w / 2, -h, -d / 2), (w / 2, 0, d / 2), pal.material("label", "printed", "cloth", "spines"))
-        out += place([book], (0, y, 0), yaw=rng.normal(0, 0.25))
+        out += place_shapes([book], (0, y, 0), yaw=rng.normal(0, 0.25))
         y -= h
     return out
 
@@ -215,21 +215,19 @@ def small_object(pal: Palette) -> Shapes:
     return SMALL[pal.rng.integers(len(SMALL))](pal)
 
 
-CLEARANCE = 0.16  # least distance between the middles of small objects, metres
-
-
 def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) -> Shapes:
     """Spread small objects over a rectangle so that they do not touch, with papers and cables between them."""
     rng, out = pal.rng, []
     spots: list[Array] = []
+    clearance = 0.16  # least distance between the middles of small objects, metres
     for _ in range(count * 4):
         spot = rng.uniform(-1, 1, 2) * half
-        if len(spots) < count and all(norm(spot - occupied) > CLEARANCE for occupied in spots):
+        if len(spots) < count and all(norm(spot - occupied) > clearance for occupied in spots):
             spots.append(spot)
-            out += place(small_object(pal), (spot[0], -height, spot[1]), yaw=rng.uniform(0, 2 * np.pi))
+            out += place_shapes(small_object(pal), (spot[0], -height, spot[1]), yaw=rng.uniform(0, 2 * np.pi))
     for _ in range(rng.integers(0, count // 2 + 1)):
         x, z = rng.uniform(-1, 1, 2) * half
-        out += place(paper(pal), (x, -height, z), yaw=rng.uniform(0, 2 * np.pi))
+        out += place_shapes(paper(pal), (x, -height, z), yaw=rng.uniform(0, 2 * np.pi))
     if rng.random() < 0.5:
         ends = rng.uniform(-1, 1, (2, 2)) * half
         a, b = (np.array([x, -height - 0.004, z]) for x, z in ends)
@@ -264,7 +262,7 @@ def _walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:
     out.append(box((-w, -0.09, d - 0.02), (w, 0, d), skirting))
     out += [box((x - 0.02, -0.09, -d), (x + 0.02, 0, d), skirting) for x in (-w, w)]
     for half_length, spot, facing in ((w, (0, 0, d), np.eye(3)), (d, (-w, 0, 0), FACING.T), (d, (w, 0, 0), FACING)):
-        out += place(_wall_objects(pal, half_length, h), spot, rotation=facing)
+        out += place_shapes(_wall_objects(pal, half_length, h), spot, rotation=facing)
     pipe = rng.uniform(-w, w)
     return [*out, rod((pipe, 0, d - 0.06), (pipe, -h, d - 0.06), rng.uniform(0.01, 0.04), skirting)]
 
@@ -277,14 +275,16 @@ def _wall_objects(pal: Palette, half: float, height: float) -> Shapes:
         at = (x + wide / 2, 0.0, 0.0)
         if kind <= 1:
             frame = picture(pal, wide, min(wide * rng.uniform(0.6, 1.4), 0.45 * height))
-            out += place(frame, (at[0], -rng.uniform(0.35, 0.5) * height, 0))
+            out += place_shapes(frame, (at[0], -rng.uniform(0.35, 0.5) * height, 0))
         elif kind == 2:
             pane = window(pal, wide, rng.uniform(0.35, 0.55) * height)
-            out += place(pane, (at[0], -0.35 * height, 0))
+            out += place_shapes(pane, (at[0], -0.35 * height, 0))
         elif kind == 3:
-            out += place(shelf(pal, wide, rng.uniform(0.4, 0.85) * height), at)
+            out += place_shapes(shelf(pal, wide, rng.uniform(0.4, 0.85) * height), at)
         else:
-            out += place([box((-0.45, -0.8 * height, -0.04), (0.45, 0, 0), pal.material("wood", "plain", "cloth"))], at)
+            out += place_shapes(
+                [box((-0.45, -0.8 * height, -0.04), (0.45, 0, 0), pal.material("wood", "plain", "cloth"))], at
+            )
         x += wide + rng.uniform(0.15, 0.8)
     return out
 
@@ -297,10 +297,10 @@ def room(pal: Palette) -> Stage:
     spots = [(x * w, z * d) for x in (-0.3, 0.0, 0.3) for z in (0.05, 0.32)]
     for i in rng.permutation(len(spots))[: rng.integers(3, 6)]:
         at = spots[i][0] + rng.normal(0, 0.15), 0.0, spots[i][1] + rng.normal(0, 0.15)
-        shapes += place(_furniture(pal), at, yaw=rng.normal(0, 0.5))
+        shapes += place_shapes(_furniture(pal), at, yaw=rng.normal(0, 0.5))
     pot = plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90)))
-    shapes += place(pot, (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
-    shapes += place(lamp(pal, rng.uniform(1.1, 1.8)), (rng.uniform(-0.4, 0.4) * w, 0, rng.uniform(0, 0.4) * d))
+    shapes += place_shapes(pot, (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
+    shapes += place_shapes(lamp(pal, rng.uniform(1.1, 1.8)), (rng.uniform(-0.4, 0.4) * w, 0, rng.uniform(0, 0.4) * d))
     a, b = (np.array([x * w, -h * rng.uniform(0.75, 1), rng.uniform(0, 0.45) * d]) for x in (-0.5, 0.5))
     shapes += wire(pal, a, b, rng.uniform(0.05, 0.4), rng.uniform(0.003, 0.008))
     focus = np.array([rng.normal(0, 0.2), -rng.uniform(0.4, 1.0), rng.uniform(0.15, 0.35) * d])
@@ -327,4 +327,4 @@ def _furniture(pal: Palette) -> Shapes:
     width, depth, height = rng.uniform(0.7, 1.5), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)
     top = clutter(pal, int(rng.integers(2, 7)), (0.3 * width, 0.3 * depth), height)
     out = table(pal, width, depth, height) + top
-    return out + (place(chair(pal), (0, 0, -0.7), yaw=np.pi) if rng.random() < 0.5 else [])
+    return out + (place_shapes(chair(pal), (0, 0, -0.7), yaw=np.pi) if rng.random() < 0.5 else [])

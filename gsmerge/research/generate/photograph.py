@@ -17,23 +17,15 @@ from numpy.typing import NDArray
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.kernels.elementary import arctan2, cos, power, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack, rotate
+from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack_shapes, rotate
 from gsmerge.research.generate.textures import Picture, pyramid
 
-FAR = 1e6  # depth of pixels without a surface
-NEAR_PLANE = 1e-3
-REMAP_WIDTH = 4096  # columns of a table for cv2.remap, which takes at most 32767
+NO_SURFACE_DEPTH = 1e6  # depth of pixels without a surface
 SAMPLE_RAYS = 2  # rays per pixel and axis for the colours; depth is measured at the pixel's centre
 KEY_MAPS, KEY_SIZE = 5, 640  # number of shadow maps of the direct light, for soft shadows, and their side in pixels
 AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # number and side of the shadow maps of the light from all sides
-KEY_BIAS, AMBIENT_BIAS = 2.0, 1.2  # texels of a shadow map by which surfaces may lie behind it and still be lit
-BEHIND = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel
 GLOW = 0.7  # brightness of glowing shapes, relative to a white wall in full light
-FROM_BELOW = 0.5  # brightness of light from below, relative to light from above
-LAMP_GAIN, LAMP_FALLOFF = 2.5, 1.5  # brightness of the direct light at the lamp, and its decrease with the distance
-RIM = 0.25  # strength of reflections at grazing angles, relative to the gloss
-GAMMA = 2.2  # exponent from sRGB to linear light
-MIN_COSINE = 0.1  # least cosine of a surface's tilt in the size of a sample, which has no bound at grazing angles
+GRAZING_STRENGTH = 0.25  # strength of reflections at grazing angles, relative to the gloss
 
 Float: TypeAlias = NDArray[Any]  # float32
 
@@ -122,17 +114,18 @@ def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
     # Corners whose numbers differ in one bit share an edge
     edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
+    near_plane = 1e-3  # depth in metres at which edges that reach behind the camera are cut
     with np.errstate(divide="ignore", invalid="ignore"):  # edges that are parallel to the plane do not cross it
-        crossing = a + (b - a) * ((NEAR_PLANE - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
-    crosses = (a[..., 2] < NEAR_PLANE) != (b[..., 2] < NEAR_PLANE)
+        crossing = a + (b - a) * ((near_plane - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
+    crosses = (a[..., 2] < near_plane) != (b[..., 2] < near_plane)
     points = np.concatenate([local, np.where(crosses[..., None], crossing, 0.0)], 1)
-    return points, np.concatenate([local[..., 2] >= NEAR_PLANE, crosses], 1)[..., None]
+    return points, np.concatenate([local[..., 2] >= near_plane, crosses], 1)[..., None]
 
 
 def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
     """Cast ``samples`` x ``samples`` rays for each pixel."""
     h, w = lens.height * samples, lens.width * samples
-    hits = Hits(np.full((h, w), FAR), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
+    hits = Hits(np.full((h, w), NO_SURFACE_DEPTH), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
     c2w = np.ascontiguousarray(c2w, dtype=np.float64)
     eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()
@@ -153,14 +146,15 @@ def _axes(towards: Array) -> Array:
 def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, size: int) -> Float:
     """Compute a shadow map ``[size,size]``: depth of the first surface, relative to the middle."""
     c2w = np.eye(4)
-    c2w[:3, :3], c2w[:3, 3] = axes.T, middle - BEHIND * radius * axes[2]
-    hits = trace(shapes, c2w, Pinhole(size, size, BEHIND * size / 2), 1)
-    return (hits.depth - BEHIND * radius).astype(np.float32)
+    behind = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel
+    c2w[:3, :3], c2w[:3, 3] = axes.T, middle - behind * radius * axes[2]
+    hits = trace(shapes, c2w, Pinhole(size, size, behind * size / 2), 1)
+    return (hits.depth - behind * radius).astype(np.float32)
 
 
 def light_stage(stage: Stage) -> LitStage:
     """Prepare a stage for rendering: arrays, smaller textures, shadow maps."""
-    opaque = pack([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
+    opaque = pack_shapes([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
     extent = bounds(opaque)
     reach = np.linalg.norm(extent, axis=1)
     low, high = (opaque.centres - reach[:, None]).min(0), (opaque.centres + reach[:, None]).max(0)
@@ -169,16 +163,17 @@ def light_stage(stage: Stage) -> LitStage:
     key = [stage.light.towards + stage.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
     ambient = _ambient_directions()
     axes = np.stack([_axes(towards) for towards in (*key, *ambient)])
+    from_below = 0.5  # brightness of light from below, relative to light from above
     return LitStage(
         stage,
-        pack(stage.shapes),
+        pack_shapes(stage.shapes),
         tuple(pyramid(texture) for texture in stage.textures),
         axes,
         middle,
         radius,
         np.stack([_shadow_map(opaque, a, middle, radius, KEY_SIZE) for a in axes[:KEY_MAPS]]),
         np.stack([_shadow_map(opaque, a, middle, radius, AMBIENT_SIZE) for a in axes[KEY_MAPS:]]),
-        np.where(-ambient[:, 1] > 0, 1.0, FROM_BELOW) * 4 / AMBIENT_MAPS,
+        np.where(-ambient[:, 1] > 0, 1.0, from_below) * 4 / AMBIENT_MAPS,
     )
 
 
@@ -236,10 +231,11 @@ def paint(lit: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) -
 def _lookup(texture: Picture, uv: Float) -> Float:
     """Sample a repeating texture bilinearly; y of the texture points down."""
     size = len(texture)
-    rows = -(-len(uv) // REMAP_WIDTH)
-    texels = np.zeros((rows * REMAP_WIDTH, 2), np.float32)
+    remap_width = 4096  # columns of a table for cv2.remap, which takes at most 32767
+    rows = -(-len(uv) // remap_width)
+    texels = np.zeros((rows * remap_width, 2), np.float32)
     texels[: len(uv)] = (uv - np.floor(uv)) * size - 0.5
-    x, y = np.moveaxis(texels.reshape(rows, REMAP_WIDTH, 2), 2, 0)
+    x, y = np.moveaxis(texels.reshape(rows, remap_width, 2), 2, 0)
     colors = cv2.remap(texture, x.copy(), y.copy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     return colors.reshape(-1, 3)[: len(uv)]
 
@@ -264,9 +260,11 @@ def _reflect(lit: LitStage, hits: Hits, rows: NDArray[np.int64], c2w: Array, len
     rays = rotate(np.concatenate([rays, np.ones((len(rays), 1))], 1), c2w[:3, :3])
     positions = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
     rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    cosine = np.maximum(-(normals * rays).sum(1), MIN_COSINE)
+    min_cosine = 0.1  # least cosine of a surface's tilt in the size of a sample, which has no bound at grazing angles
+    cosine = np.maximum(-(normals * rays).sum(1), min_cosine)
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
-    albedo = power(paint(lit, ids, points, spread), GAMMA)
+    gamma = 2.2  # exponent from sRGB to linear light
+    albedo = power(paint(lit, ids, points, spread), gamma)
     return _shade(lit, ids, albedo, positions, normals, rays)
 
 
@@ -274,14 +272,16 @@ def _incoming_light(lit: LitStage, positions: Float, normals: Float) -> tuple[Fl
     """Compute the direct and the ambient light ``[n]`` that arrives at points, with shadows."""
     light, half_side = lit.stage.light, lit.radius
     direct, indirect = np.zeros((2, len(positions)), np.float32)
-    bias = KEY_BIAS * 2 * half_side / KEY_SIZE
+    key_bias, ambient_bias = 2.0, 1.2  # texels of a shadow map by which surfaces may lie behind it and still be lit
+    bias = key_bias * 2 * half_side / KEY_SIZE
     equal = np.full(KEY_MAPS, 1 / KEY_MAPS)
     # add_light adds to its last argument
     add_light(positions, normals, lit.axes[:KEY_MAPS], lit.middle, half_side, lit.key, bias, equal, direct)
-    bias = AMBIENT_BIAS * 2 * half_side / AMBIENT_SIZE
+    bias = ambient_bias * 2 * half_side / AMBIENT_SIZE
     add_light(positions, normals, lit.axes[KEY_MAPS:], lit.middle, half_side, lit.ambient, bias, lit.weights, indirect)
     lamp_distance = np.linalg.norm(positions - light.lamp.astype(np.float32), axis=1)
-    direct *= LAMP_GAIN / (1 + (lamp_distance / norm(light.lamp - lit.stage.focus)) ** 2 * LAMP_FALLOFF)
+    lamp_gain, lamp_falloff = 2.5, 1.5  # brightness of the direct light at the lamp, and its decrease with the distance
+    direct *= lamp_gain / (1 + (lamp_distance / norm(light.lamp - lit.stage.focus)) ** 2 * lamp_falloff)
     return direct, indirect
 
 
@@ -296,7 +296,7 @@ def _shade(
     halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
     shine = gloss * direct * power(np.clip((normals * halfway).sum(1), 0, 1), 8 + 120 * gloss)
     grazing = (1 + (normals * rays).sum(1)).clip(0, 1)
-    rim = RIM * gloss * (grazing * grazing) ** 2  # grazing views reflect more (Schlick 1994)
+    rim = GRAZING_STRENGTH * gloss * (grazing * grazing) ** 2  # grazing views reflect more (Schlick 1994)
     key, ambient = light.key.astype(np.float32), light.ambient.astype(np.float32)
     out = albedo * (key * direct[:, None] + ambient * indirect[:, None])
     out += shine[:, None] * key + rim[:, None] * ambient

@@ -16,7 +16,7 @@ from gsmerge.kernels.matrices import matmul
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
 Pair: TypeAlias = tuple[float, float]
-NUM_WAVES = 4
+NUM_WAVES = 4  # waves that bend the surface of a shape
 NO_WAVES = np.zeros((NUM_WAVES, 5))
 TAPER, AMPLITUDE = 3, 4  # columns of a shape's size, and of its waves
 
@@ -55,7 +55,7 @@ def rotate(points: Array, rotation: Array) -> Array:
     return matmul(points, rotation.T)
 
 
-def invert(motion: Array) -> Array:
+def invert_motion(motion: Array) -> Array:
     """Invert a rigid motion ``[4,4]``."""
     out = np.eye(4)
     out[:3, :3] = motion[:3, :3].T
@@ -72,7 +72,7 @@ def axis_rotation(axis: int, angle: float) -> Array:
     return out
 
 
-UPRIGHT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # rotations with which quads and leaves face -z, and up
+FACING_FRONT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # rotations with which quads and leaves face -z, and up
 
 
 def box(low: Vector, high: Vector, material: Material) -> Shape:
@@ -82,7 +82,7 @@ def box(low: Vector, high: Vector, material: Material) -> Shape:
     return Shape(BOX, (*half, 1.0), material, (a + b) / 2)
 
 
-def quad(centre: Vector, half: Pair, material: Material, rotation: Array = UPRIGHT) -> Shape:
+def quad(centre: Vector, half: Pair, material: Material, rotation: Array = FACING_FRONT) -> Shape:
     """Make a rectangle."""
     return Shape(QUAD, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
@@ -121,7 +121,7 @@ def blob(centre: Vector, radii: Vector, material: Material, rng: np.random.Gener
     return Shape(BLOB, (radii[0], radii[1], radii[2], 1.0), material, np.asarray(centre, float), waves=waves)
 
 
-def place(
+def place_shapes(
     shapes: Iterable[Shape], at: Vector = (0, 0, 0), *, yaw: float = 0.0, rotation: Array | None = None
 ) -> list[Shape]:
     """Rotate shapes about the origin, by ``yaw`` about y or by ``rotation``, then move them to ``at``."""
@@ -144,7 +144,7 @@ class ShapeArrays:
     waves: Array  # [m,4,5]
 
 
-def pack(shapes: Sequence[Shape]) -> ShapeArrays:
+def pack_shapes(shapes: Sequence[Shape]) -> ShapeArrays:
     """Convert shapes to arrays."""
     return ShapeArrays(
         tuple(shapes),

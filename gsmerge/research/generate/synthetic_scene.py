@@ -17,7 +17,7 @@ from gsmerge.kernels.pictures import blur
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
 from gsmerge.research.generate.objects import room
 from gsmerge.research.generate.photograph import (
-    FAR,
+    NO_SURFACE_DEPTH,
     SAMPLE_RAYS,
     Float,
     Hits,
@@ -30,24 +30,15 @@ from gsmerge.research.generate.photograph import (
     radiance,
     trace,
 )
-from gsmerge.research.generate.shapes import Array, invert, norm
+from gsmerge.research.generate.shapes import Array, invert_motion, norm
 from gsmerge.research.generate.textures import Palette
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.types import Cameras, Gaussians
 
-PATH_TRIES, STAGE_TRIES = 6, 6  # most paths per stage, and most stages, that are tried until all views are usable
-SMALL = 8  # divides the sides of views to check if they are usable, and to compute exposures
 FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
-MIN_HITS = 0.6  # least share of a usable view's rays that hit a shape
-MIN_NEAR, MIN_NEAR_METRES = 0.22, 0.6  # least first percentile of depths: as a share of their median, or in metres
-MAX_TURN = 50  # largest angle between neighbouring views, degrees
-ARC = 15, 60  # range of the angle that a path has around the focus, degrees
 SWING = 35  # largest angle between -z and a camera, seen from the focus, degrees
-HEIGHT = 0.9, 1.8  # range of the height of cameras above the ground, metres
-BRIGHTNESS = 0.22, 0.62  # range of the mean of a scene's photos, sRGB
-VIGNETTE = 0.3  # loss of light at a distance of one diagonal from the middle of a photo; grows with its square
-SENSOR_NOISE = 0.004  # standard deviation of the noise of a photo, sRGB
+CAMERA_HEIGHTS = 0.9, 1.8  # range of the height of cameras above the ground, metres
 Path = Callable[[float], Array]  # position along a path, 0 to 1 -> camera-to-world matrix [4,4]
 
 
@@ -66,11 +57,13 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
 
 def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Path:
     """Draw an arc around the focus that sways up and down."""
-    limit = MAX_TURN * max(1, num_views - 1)
-    span = rng.uniform(min(ARC[0], limit), min(ARC[1], limit))
+    max_turn = 50  # largest angle between neighbouring views, degrees
+    limit = max_turn * max(1, num_views - 1)
+    arc_degrees = 15, 60  # range of the angle that a path has around the focus, degrees
+    span = rng.uniform(min(arc_degrees[0], limit), min(arc_degrees[1], limit))
     start = rng.uniform(-SWING, SWING - span)
-    distance, height = rng.uniform(*stage.distance), rng.uniform(*HEIGHT)
-    swing = rng.uniform(0, 0.4) * (HEIGHT[1] - HEIGHT[0])
+    distance, height = rng.uniform(*stage.distance), rng.uniform(*CAMERA_HEIGHTS)
+    swing = rng.uniform(0, 0.4) * (CAMERA_HEIGHTS[1] - CAMERA_HEIGHTS[0])
     phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
 
     def pose(s: float) -> Array:
@@ -84,11 +77,13 @@ def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Path:
 
 def is_usable(hits: Hits) -> bool:
     """Return True if a view's camera is outside all shapes and not too close to any."""
-    depth = hits.depth[hits.depth < FAR]
-    if depth.size < MIN_HITS * hits.depth.size:
+    depth = hits.depth[hits.depth < NO_SURFACE_DEPTH]
+    min_hits = 0.6  # least share of a usable view's rays that hit a shape
+    if depth.size < min_hits * hits.depth.size:
         return False
     nearest = np.percentile(depth, 1)
-    return bool(nearest > MIN_NEAR * np.median(depth) or nearest > MIN_NEAR_METRES)
+    min_near, min_near_metres = 0.22, 0.6  # least first percentile of depths: as a share of their median, or in metres
+    return bool(nearest > min_near * np.median(depth) or nearest > min_near_metres)
 
 
 @dataclass(frozen=True)
@@ -150,7 +145,7 @@ class _Shoot:
         ``deviation [2,3]`` is the random error of the pose, see :func:`_perturb_pose`.
         """
         hits = trace(self.lit.shapes, self.poses[place], self.lens, 1)
-        depth = np.minimum(hits.depth, FAR) * self.noise.unit
+        depth = np.minimum(hits.depth, NO_SURFACE_DEPTH) * self.noise.unit
         pose = _perturb_pose(self.exported_pose(place), self.noise, float(np.median(depth)), deviation)
         normals = matmul(hits.normals, self.to_export[:3, :3].T).astype(np.float32)
         size = self.lens.width, self.lens.height
@@ -166,7 +161,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     num_places = len(shoot.poses)
     photo_seeds = rng.integers(0, 2**63, num_places)
     # many exporters use the frame of the first camera
-    shoot = replace(shoot, to_export=invert(shoot.poses[0]) if rng.random() < 0.5 else np.eye(4))
+    shoot = replace(shoot, to_export=invert_motion(shoot.poses[0]) if rng.random() < 0.5 else np.eye(4))
     views, targets = range(0, num_places, 2), range(1, num_places, 2)
     errors = {place: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for place in views}
 
@@ -197,20 +192,23 @@ def _plan_shoot(rng: np.random.Generator, options: GenerateOptions) -> _Shoot:
     lit, path = _find_stage(rng, photo_lens, options.views)
     poses = [path(s) for s in np.linspace(0, 1, 2 * options.views - 1)]
     previews = [radiance(lit, pose, _shrink(lens), 1) for pose in poses[::2]]
-    gain = find_exposure(previews, rng.uniform(*BRIGHTNESS))
+    brightness = 0.22, 0.62  # range of the mean of a scene's photos, sRGB
+    gain = find_exposure(previews, rng.uniform(*brightness))
     return _Shoot(lit, poses, np.eye(4), lens, photo_lens, noise, gain)
 
 
 def _shrink(lens: Pinhole) -> Pinhole:
-    return Pinhole(max(8, lens.width // SMALL), max(8, lens.height // SMALL), lens.focal / SMALL)
+    divisor = 8  # divides the sides of views to check if they are usable, and to compute exposures
+    return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
 
 def _find_stage(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitStage, Path]:
     """Draw a room and a path on which all views are usable; after too many tries, return the last ones."""
     side = 1 << min(max(int(1.6 * max(lens.width, lens.height)).bit_length() - 1, 7), 10)  # side of textures, pixels
-    for _ in range(STAGE_TRIES):
+    path_tries, stage_tries = 6, 6  # most paths per stage, and most stages, that are tried until all views are usable
+    for _ in range(stage_tries):
         lit = light_stage(room(Palette(rng, side)))
-        for _ in range(PATH_TRIES):
+        for _ in range(path_tries):
             path = draw_path(lit.stage, rng, num_views)
             poses = (path(s) for s in np.linspace(0, 1, 2 * num_views - 1))
             if all(is_usable(trace(lit.shapes, pose, _shrink(lens), 1)) for pose in poses):
@@ -225,9 +223,11 @@ def _photo(lit: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: float,
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     square_radius = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
-    linear = linear * gains.astype(np.float32) * (1 - VIGNETTE * square_radius)[..., None].astype(np.float32)
+    vignette = 0.3  # loss of light at a distance of one diagonal from the middle of a photo; grows with its square
+    linear = linear * gains.astype(np.float32) * (1 - vignette * square_radius)[..., None].astype(np.float32)
     image = blur(develop(linear), noise.blur)
-    image = np.clip(image + rng.normal(0, SENSOR_NOISE, image.shape), 0, 1).astype(np.float32)
+    sensor_noise = 0.004  # standard deviation of the noise of a photo, sRGB
+    image = np.clip(image + rng.normal(0, sensor_noise, image.shape), 0, 1).astype(np.float32)
     return np.round(image * 255) / np.float32(255)
 
 
@@ -247,5 +247,5 @@ def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> 
 
 
 def _cameras(poses: Sequence[Array], lens: Pinhole) -> Cameras:
-    viewmats = np.stack([invert(pose) for pose in poses])
+    viewmats = np.stack([invert_motion(pose) for pose in poses])
     return Cameras(viewmats, np.repeat(lens.intrinsics[None], len(poses), 0), lens.width, lens.height)

@@ -22,7 +22,7 @@ Color: TypeAlias = NDArray[Any]
 Grey: TypeAlias = NDArray[Any]  # float32: square, repeating without a seam, 0 to 1
 
 
-def enlarge(cells: NDArray[np.float64], size: int) -> Grey:
+def enlarge_texture(cells: NDArray[np.float64], size: int) -> Grey:
     """Enlarge a small periodic picture smoothly to ``[size,size]``."""
     return pictures.enlarge(cells, size, size, periodic=True)
 
@@ -37,7 +37,7 @@ def noise(
     """
     out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
     while cells <= size // 2:
-        layer = enlarge(rng.uniform(-1, 1, (cells, max(1, cells // stretch))), size)
+        layer = enlarge_texture(rng.uniform(-1, 1, (cells, max(1, cells // stretch))), size)
         out += strength * (1 - 2 * np.abs(layer) if ridged else layer)
         strength, cells = strength * fade, cells * 2
     low, high = np.percentile(out, (1, 99))
@@ -105,19 +105,17 @@ def glyphs(rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
     return out
 
 
-PITCH, WORD_SPACE = 6, 4  # pixels from letter to letter, and additional pixels between words
-
-
 def text_line(rng: np.random.Generator, alphabet: NDArray[np.uint8], height: int, width: int) -> Grey:
     """Draw the ink ``[height,width]`` of one line of words."""
     line = np.zeros((7, max(6, 7 * width // height)), np.uint8)
     column = 0
-    while column < line.shape[1] - PITCH:
+    pitch, word_space = 6, 4  # pixels from letter to letter, and additional pixels between words
+    while column < line.shape[1] - pitch:
         for letter in alphabet[rng.integers(0, len(alphabet), rng.integers(2, 10))]:
-            if column < line.shape[1] - PITCH:
+            if column < line.shape[1] - pitch:
                 line[:, column : column + 5] = letter
-            column += PITCH
-        column += WORD_SPACE
+            column += pitch
+        column += word_space
     return cv2.resize(line.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
 
@@ -238,7 +236,7 @@ def carpet(rng: np.random.Generator, size: int) -> Picture:
     base = color(rng, strength=(0.1, 0.7), light=(0.2, 0.6))
     out = mix(*shades(rng, base, 0.4), noise(rng, size, first=32, fade=0.95))
     if rng.random() < 0.5:
-        motif = enlarge(np.pad(rng.uniform(0, 1, (4, 4)), ((0, 4), (0, 4)), mode="symmetric"), size)
+        motif = enlarge_texture(np.pad(rng.uniform(0, 1, (4, 4)), ((0, 4), (0, 4)), mode="symmetric"), size)
         mask = np.mod(3 * motif, 1)[..., None] > 0.5
         out = np.where(mask, out, 0.3 * out + 0.7 * color(rng, strength=(0.2, 0.8)))
     return out.astype(np.float32)
@@ -366,7 +364,6 @@ def pyramid(texture: Picture) -> list[Picture]:
 
 
 MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4}  # most textures of a kind in a scene
-OTHER_TEXTURES = 3  # most textures of any other kind
 
 
 @dataclass
@@ -385,7 +382,8 @@ class Palette:
         zero in about half of the cases.
         """
         kind = kinds[self.rng.integers(len(kinds))]
-        ids, limit = self.by_kind.setdefault(kind, []), MAX_TEXTURES.get(kind, OTHER_TEXTURES)
+        other_textures = 3  # most textures of any other kind
+        ids, limit = self.by_kind.setdefault(kind, []), MAX_TEXTURES.get(kind, other_textures)
         if len(ids) < limit:
             ids.append(len(self.textures))
             self.textures.append(KINDS[kind](self.rng, self.size).astype(np.float32))

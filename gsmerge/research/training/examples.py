@@ -18,7 +18,13 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.pooling import Members, feature_to_gaussians
 from gsmerge.geometry.transforms import lower_median
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures
-from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, make_training_scene, view_subsets
+from gsmerge.research.training.scenes import (
+    TrainingScene,
+    covered_pixels,
+    make_training_scene,
+    measure_covered,
+    view_subsets,
+)
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
@@ -86,12 +92,12 @@ def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, Call
     for ids in view_subsets(len(scene), options.example_views):
         training = make_training_scene(scene, ids, held_out)
         for density in options.densities:
-            make = partial(make_example, training, options, density, scene_name(path))
+            make = partial(make_example, training, options, density, example_name(path))
             label = f"{len(ids)}-views-{share_text(density).rstrip('%')}"
             yield label, make
 
 
-def scene_name(path: Path) -> str:
+def example_name(path: Path) -> str:
     """Name a scene by its folder, and by its file as well if the path is a file."""
     path = path.absolute()
     return f"{path.parent.name}-{path.stem}" if path.is_file() else path.name
@@ -109,11 +115,11 @@ def make_example(training: TrainingScene, options: TrainOptions, density: float,
     unit = float(lower_median(features.footprints * focals.astype(np.float64)[features.views]))
     return Example(
         name, unit, members, scene.cameras, features, feature_to_gaussians(features),
-        blank_photos(training.cameras, level), images, coverage(training, level),
+        blank_photos(training.cameras, level), images, measure_covered(training, level),
     )  # fmt: skip
 
 
-def select_views(example: Example, ids: Sequence[int]) -> Example:
+def select_example_views(example: Example, ids: Sequence[int]) -> Example:
     """Keep the views ``ids`` (ascending) of an example; photos of other views become novel views."""
     views, own = len(example.cameras), example.members
     if len(ids) == views:
@@ -140,14 +146,14 @@ def select_views(example: Example, ids: Sequence[int]) -> Example:
     )
 
 
-def draw_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
+def draw_random_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
     """Draw a random subset of an example's views by ``options.random_views`` (paper supplement C)."""
     if not options.random_views:
         return example
     num_views = len(example.cameras)
     least, most = (min(count, num_views) for count in options.random_views)
     count = int(rng.integers(least, most + 1))
-    return select_views(example, sorted(rng.choice(num_views, count, replace=False).tolist()))
+    return select_example_views(example, sorted(rng.choice(num_views, count, replace=False).tolist()))
 
 
 def recolor(example: Example, rng: np.random.Generator) -> Example:

@@ -26,9 +26,9 @@ from torch.nn import Parameter
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.corrections import LOGIT
+from gsmerge.networks.corrections import LOGIT_COLUMN
 from gsmerge.photos.views import even_views
-from gsmerge.research.training.examples import Example, draw_views, recolor
+from gsmerge.research.training.examples import Example, draw_random_views, recolor
 from gsmerge.research.training.losses import render_window, window_loss, window_psnr
 from gsmerge.research.training.modules import Head, Networks
 from gsmerge.research.training.shards import Shard, read_shard
@@ -37,14 +37,14 @@ from gsmerge.research.training.windows import Window, sample_window
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 VALIDATION = 2**32  # replaces the step in the seed of the random numbers of validation
-Row = dict[str, float]  # a row of the table of losses
+LossRow = dict[str, float]  # a row of the table of losses
 Scores = list[tuple[float, float, float]]  # of each window: PSNR (dB) without and with networks, share merged
-OnStep = Callable[[int, int, float], None]  # step, steps, loss
+OnTrainingStep = Callable[[int, int, float], None]  # step, steps, loss
 FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
 
 
-def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions) -> Row:
+def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions) -> LossRow:
     """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians."""
     scores = [window for i, shard in enumerate(shards) for window in _score(networks, shard, i, options)]
     analytic, learned, matched = np.mean(scores, 0).tolist()
@@ -56,7 +56,7 @@ def _score(networks: Networks, shard: Shard, number: int, options: TrainOptions)
     rng = np.random.default_rng([options.seed, VALIDATION, number])
     example = read_shard(shard)
     windows = [
-        sample_window(draw_views(example, options, rng), options.levels, options.window, options.most, 1, rng)
+        sample_window(draw_random_views(example, options, rng), options.levels, options.window, options.most, 1, rng)
         for _ in range(options.validation_windows)
     ]
 
@@ -103,7 +103,7 @@ def train(
     options: TrainOptions | None = None,
     *,
     threads: int | None = None,
-    progress: OnStep = lambda *_: None,
+    progress: OnTrainingStep = lambda *_: None,
 ) -> TrainResult:
     """Train networks, or continue the run in the folder.
 
@@ -132,7 +132,7 @@ def train(
 
 
 def _train(
-    options: TrainOptions, shards: Sequence[Shard], validation: Sequence[Shard], out: Path, progress: OnStep
+    options: TrainOptions, shards: Sequence[Shard], validation: Sequence[Shard], out: Path, progress: OnTrainingStep
 ) -> TrainResult:
     with torch.random.fork_rng(devices=[]):  # new networks depend only on the seed
         torch.manual_seed(options.seed)
@@ -160,7 +160,9 @@ def _train(
     return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], best_psnr, resumed)
 
 
-def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[str, Any], options: TrainOptions) -> None:
+def _save(
+    out: Path, state: TrainingState, rows: Sequence[LossRow], head: Mapping[str, Any], options: TrainOptions
+) -> None:
     """Write the checkpoints, the table of losses, and the state for resuming the run."""
     figures = {name: value for name, value in rows[-1].items() if name not in ("step", "rate", "loss")}
     training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **head}
@@ -168,22 +170,22 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
     with torch.no_grad():
         for module in networks.heads.values():
             assert isinstance(module, Head)
-            module.out.bias[LOGIT] += options.opacity_shift
+            module.out.bias[LOGIT_COLUMN] += options.opacity_shift
     if all(row["psnr_learned"] < rows[-1]["psnr_learned"] for row in rows[:-1]):
         save_checkpoint(out / "best.safetensors", networks.weights(), training)
     save_checkpoint(out / "last.safetensors", networks.weights(), training)
     lines = [",".join(rows[0]), *(",".join(f"{value:.8g}" for value in row.values()) for row in rows)]
     with atomic_output(out / "losses.csv", overwrite=True) as temporary:
         temporary.write_bytes("\n".join([*lines, ""]).encode())
-    save_state(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
+    save_training(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
 
 
-def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[Row]]:
+def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[LossRow]]:
     """Read the step and the table of losses of the run in the folder; step 0 and no rows if there is no run."""
     path = out / "state.safetensors"
     if not path.exists():
         return 0, []
-    facts = load_state(path, state)
+    facts = load_training(path, state)
     for name, value in expected.items():
         if facts.get(name) != value:
             raise SceneError(path, f"expected a run with the same {name}, found another", REMEDY)
@@ -199,7 +201,7 @@ def _step(
     def crop_gradients(crop: int) -> Tensor:
         """Compute the gradients of one crop in one vector, with the loss as its last element."""
         rng = np.random.default_rng([options.seed, step, crop])
-        example = draw_views(read(shards[int(rng.integers(len(shards)))]), options, rng)
+        example = draw_random_views(read(shards[int(rng.integers(len(shards)))]), options, rng)
         if options.recolor:
             example = recolor(example, rng)
         window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
@@ -227,7 +229,7 @@ def _step(
     return loss[0]
 
 
-def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
+def save_training(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
     """Write weights, running means, moments and facts about the run to a file, replacing it."""
     tensors: dict[str, torch.Tensor] = {}
     for name, parameter, mean in state.pairs():
@@ -238,7 +240,7 @@ def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> No
         temporary.write_bytes(save(tensors, {FORMAT: json.dumps(dict(facts))}))
 
 
-def load_state(path: Path, state: TrainingState) -> dict[str, Any]:
+def load_training(path: Path, state: TrainingState) -> dict[str, Any]:
     """Read weights, running means and moments into ``state``; return the facts about the run.
 
     Raises SceneError if the file is damaged or has other networks.

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gsmerge.kernels.raster.image_loss import C1, C2, SIDE
+from gsmerge.kernels.raster.image_loss import C1, C2, WINDOW_SIDE
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-LOSS_WINDOW = SIDE  # pixels per side of the windows of loss_ssim
+LOSS_WINDOW = WINDOW_SIDE  # pixels per side of the windows of loss_ssim
 
 
 def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:

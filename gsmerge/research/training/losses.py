@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsmerge.geometry.pooling import Members, pool_members, to_gaussians
-from gsmerge.measure.lpips import EPSILON, SCALE, SHIFT, Layer, min_size, read_layers
+from gsmerge.measure.lpips import EPSILON, INPUT_SCALE, INPUT_SHIFT, Convolution, min_size, read_layers
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR_PLANE
@@ -56,9 +56,9 @@ def _kernels(net: str) -> list[Tensor]:
     return [torch.from_numpy(layer.kernel).permute(0, 3, 1, 2) for layer in read_layers(net)]
 
 
-def _unit_features(image: Tensor, layers: tuple[Layer, ...], kernels: list[Tensor]) -> Iterator[Tensor]:
+def _unit_features(image: Tensor, layers: tuple[Convolution, ...], kernels: list[Tensor]) -> Iterator[Tensor]:
     """Yield the features ``[c,h,w]`` of each compared layer, with unit length at every pixel."""
-    values = (2 * image[None] - 1 - torch.from_numpy(SHIFT)) / torch.from_numpy(SCALE)
+    values = (2 * image[None] - 1 - torch.from_numpy(INPUT_SHIFT)) / torch.from_numpy(INPUT_SCALE)
     features = values.permute(0, 3, 1, 2)
     for layer, kernel in zip(layers, kernels, strict=True):
         conv = layer.conv
@@ -93,9 +93,6 @@ def window_loss(
             loss = loss + teacher * teacher_loss(prediction, crop.example.members)
         total = total + loss / len(levels)
     return total
-
-
-MAX_DB = 100.0  # PSNR of windows without an error
 
 
 def draw_window(gaussians: Gaussians, window: Window, background: np.ndarray) -> Tensor:
@@ -145,7 +142,8 @@ def render_window(window: Window, networks: Networks | None, options: TrainOptio
 def window_psnr(window: Window, image: Tensor) -> float:
     """Compute the PSNR (dB) of a render ``[h,w,3]`` of a window within the mask."""
     error = float(color_loss(image, window.image, window.mask, "mse"))
-    return min(MAX_DB, -10 * float(np.log10(max(error, 1e-12))))
+    max_db = 100.0  # PSNR of windows without an error
+    return min(max_db, -10 * float(np.log10(max(error, 1e-12))))
 
 
 def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
@@ -193,8 +191,7 @@ def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
         return proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
 
 
-GOAL = 0.5  # overlap of the boxes of two children at which the loss is 0
-GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversification
+GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of the diversification
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
@@ -211,7 +208,7 @@ def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tens
     weights = (volumes[left] * volumes[right]).clamp_min(1e-30).sqrt()
     profile = overlap_profile(gaussians, left, right)
     opacity = (gaussians.opacities[left] - gaussians.opacities[right]).square()
-    return (weights * (GEOMETRY * profile + OPACITY * opacity)).sum() / weights.sum()
+    return (weights * (GEOMETRY_WEIGHT * profile + OPACITY_WEIGHT * opacity)).sum() / weights.sum()
 
 
 def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
@@ -239,5 +236,6 @@ def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor
     overlaps = shared / union
     contact = (a.norm(dim=1) + b.norm(dim=1)).clamp_min(1e-12)
     gaps = (away.norm(dim=1) - contact).clamp_min(0) / contact
-    apart = 0.5 * ((GOAL - overlaps) / GOAL) ** 3 + 0.5 * (1 - torch.exp(-3 * gaps))
-    return torch.where(overlaps >= GOAL, ((overlaps - GOAL) / (1 - GOAL)) ** 3, apart)
+    free_overlap = 0.5  # overlap of the boxes of two children at which the loss is 0
+    apart = 0.5 * ((free_overlap - overlaps) / free_overlap) ** 3 + 0.5 * (1 - torch.exp(-3 * gaps))
+    return torch.where(overlaps >= free_overlap, ((overlaps - free_overlap) / (1 - free_overlap)) ** 3, apart)

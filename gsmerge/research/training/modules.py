@@ -16,7 +16,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from gsmerge.networks.options import FEATURE, GROUP, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
+from gsmerge.networks.options import (
+    FEATURE,
+    GROUP_COLUMNS,
+    MEMBER_COLUMNS,
+    PART_COLUMNS,
+    RESIDUAL,
+    SLOTS,
+    NetworkOptions,
+)
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.values.arrays import Array, as_array, as_tensor
 
@@ -105,10 +113,10 @@ class SetNetwork(nn.Module):
         width, heads = options.width, options.heads
         self.embed = mlp(token, width, width)
         self.blocks = nn.ModuleList(AttentionBlock(width, heads) for _ in range(options.blocks))
-        self.pool, self.join = Pooling(width, heads), mlp(width + GROUP, 2 * width, out)
+        self.pool, self.join = Pooling(width, heads), mlp(width + GROUP_COLUMNS, 2 * width, out)
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
-        """Compute ``[b,out]`` from ``tokens [b,n,token]``, ``mask [b,n]`` and ``group [b,GROUP]``."""
+        """Compute ``[b,out]`` from ``tokens [b,n,token]``, ``mask [b,n]`` and ``group [b,GROUP_COLUMNS]``."""
         x = self.embed(tokens)
         for block in self.blocks:
             x = block(x, mask)
@@ -120,7 +128,7 @@ class Encoder(nn.Module):
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
-        self.set = SetNetwork(MEMBER, options.width, options)
+        self.set = SetNetwork(MEMBER_COLUMNS, options.width, options)
         self.latent, self.shift = nn.Linear(options.width, options.latent), zero_init(nn.Linear(options.width, 3))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
@@ -137,12 +145,12 @@ class Head(nn.Module):
         self.slots, width = slots, options.width
         self.numbers = list(options.head_numbers)
         self.seeds = mlp(options.latent + len(self.numbers), width, slots * width)
-        self.child = nn.Linear(PART, width) if options.reads_children else None
+        self.child = nn.Linear(PART_COLUMNS, width) if options.reads_children else None
         self.block, self.norm = AttentionBlock(width, options.heads), nn.LayerNorm(width)
         self.out = (small_init if options.makes_children else zero_init)(nn.Linear(width, RESIDUAL))
 
     def forward(self, latents: Tensor, group: Tensor, children: Tensor, mask: Tensor) -> Tensor:
-        """Return raw corrections ``[b,slots,RESIDUAL]`` of ``children [b,slots,PART]`` with ``mask [b,slots]``."""
+        """Return raw corrections ``[b,slots,RESIDUAL]`` of ``children [b,slots,PART_COLUMNS]``; ``mask [b,slots]``."""
         seeds = self.seeds(torch.cat([latents, group[:, self.numbers]], -1)).unflatten(-1, (self.slots, -1))
         slots = seeds if self.child is None else seeds + self.child(children)
         return self.out(self.norm(self.block(slots, mask)))
@@ -153,7 +161,7 @@ class Merger(nn.Module):
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
-        self.set = SetNetwork(PART + options.latent, options.width, options)
+        self.set = SetNetwork(PART_COLUMNS + options.latent, options.width, options)
         self.out = zero_init(nn.Linear(options.width, FEATURE + options.latent))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
@@ -167,11 +175,11 @@ class Refiner(nn.Module):
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
         width, last = options.width, options.refine_blocks - 1
-        self.embed = mlp(PART + 1 + options.latent, width, width)
+        self.embed = mlp(PART_COLUMNS + 1 + options.latent, width, width)
         self.blocks = nn.ModuleList(
             AttentionBlock(width, options.heads, first=i == last) for i in range(options.refine_blocks)
         )
-        self.norm, self.join = nn.LayerNorm(width), mlp(width + GROUP, 2 * width, width)
+        self.norm, self.join = nn.LayerNorm(width), mlp(width + GROUP_COLUMNS, 2 * width, width)
         self.out = zero_init(nn.Linear(width, FEATURE + options.latent))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:

@@ -18,9 +18,16 @@ from torch.nn.functional import normalize
 
 from gsmerge.geometry.pooling import MAX_OPACITY, Members, principal_axes
 from gsmerge.networks.apply import NetworkContext, prepare_children, run_heads
-from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
+from gsmerge.networks.corrections import (
+    COLOR_COLUMNS,
+    LOGIT_COLUMN,
+    MASS_COLUMN,
+    MEAN_COLUMNS,
+    ROTATION_COLUMNS,
+    SIZE_COLUMNS,
+)
 from gsmerge.networks.cross_view_stats import NUM_STATS
-from gsmerge.networks.options import CORRECTED, PART
+from gsmerge.networks.options import CORRECTED, PART_COLUMNS
 from gsmerge.networks.tensors import (
     gaussian_sizes,
     move_tensors,
@@ -41,7 +48,6 @@ from gsmerge.values.arrays import Array, as_array, as_tensor
 
 TINY = 1e-12  # world units
 CONSTANT = slice(6, 8)  # columns of a group without a gradient: log of the number of members, and their mean weight
-MIN_GAP = 1e-3  # least difference of two squared scales in the gradient of axes, over the largest squared scale
 
 
 def features_to_tensors(features: FeatureGaussians) -> FeatureGaussians:
@@ -75,7 +81,8 @@ def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     change = axes.transpose(1, 2) @ (covars - covars.detach()) @ axes  # zero, with a gradient
     squares = scales.square()
     gaps = squares[:, None] - squares[:, :, None]  # [i,j]: square of j minus that of i
-    least = (MIN_GAP * squares[:, 2])[:, None, None]
+    min_gap = 1e-3  # least difference of two squared scales in the gradient of axes, over the largest squared scale
+    least = (min_gap * squares[:, 2])[:, None, None]
     spins = change * gaps / (gaps.square() + least.square()).clamp_min(1e-37)
     grown = scales + change.diagonal(dim1=1, dim2=2) / (2 * scales)
     return grown, rotate_quats(rotate_vectors(axes, skew_vectors(spins)), quats)
@@ -143,7 +150,7 @@ def differentiate_tokens(
     colors = SH_C0 * (selected.sh0 - g.base.sh0[owner_ids])[:, 0]
     numbers = [torch.asinh(local), _log_scales(ordered, pixels), _logits(selected.opacities)[:, None], colors]
     tokens = torch.cat([*numbers, flat[:, None] * facing], 1)
-    assert tokens.shape[1] == PART
+    assert tokens.shape[1] == PART_COLUMNS
     return tokens.nan_to_num()
 
 
@@ -162,19 +169,19 @@ def _log_ratio(values: Tensor, units: Tensor) -> Tensor:
 def move_feature_tensors(group_features: GroupFeatures, residuals: Tensor) -> FeatureGaussians:
     """Apply corrections ``[g,14]`` like :func:`gsmerge.networks.corrections.move_features`, differentiable."""
     g, f = group_features, group_features.features
-    rotations = _rotations(rotate_vectors(g.frames, residuals[:, ROTATION]))
-    axes, logs = quat_to_rotmat(g.base.quats), residuals[:, SIZE]
+    rotations = _rotations(rotate_vectors(g.frames, residuals[:, ROTATION_COLUMNS]))
+    axes, logs = quat_to_rotmat(g.base.quats), residuals[:, SIZE_COLUMNS]
     stretches = torch.eye(3) + (axes * torch.expm1(logs)[:, None]) @ axes.transpose(1, 2)
     changes = rotations @ stretches
     covars = changes @ f.covars @ changes.transpose(1, 2)
     discs = logs[:, 1] + logs[:, 2]
     return replace(
         f,
-        means=f.means + rotate_vectors(g.frames, residuals[:, MEAN] * gaussian_sizes(g.base.scales)[:, None]),
+        means=f.means + rotate_vectors(g.frames, residuals[:, MEAN_COLUMNS] * gaussian_sizes(g.base.scales)[:, None]),
         covars=(covars + covars.transpose(1, 2)) / 2,
-        masses=f.masses * torch.exp(residuals[:, LOGIT] + logs[:, 0] + discs + residuals[:, MASS]),
-        extinctions=f.extinctions * torch.exp(residuals[:, LOGIT] + discs),
-        sh0=f.sh0 + residuals[:, None, COLOR] / SH_C0,
+        masses=f.masses * torch.exp(residuals[:, LOGIT_COLUMN] + logs[:, 0] + discs + residuals[:, MASS_COLUMN]),
+        extinctions=f.extinctions * torch.exp(residuals[:, LOGIT_COLUMN] + discs),
+        sh0=f.sh0 + residuals[:, None, COLOR_COLUMNS] / SH_C0,
     )
 
 

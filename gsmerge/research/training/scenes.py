@@ -17,8 +17,6 @@ from gsmerge.raster.photos import NEAR_PLANE, Photos, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene, Views
 
-OPAQUE = 0.5  # least alpha of a pixel that the Gaussians cover
-
 
 @dataclass(frozen=True, eq=False)
 class TrainingScene:
@@ -59,7 +57,7 @@ def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None
     return TrainingScene(canonical, scene_members(canonical), frame.enter_cameras(cameras), images)
 
 
-def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
+def measure_covered(training: TrainingScene, level: float = 1) -> np.ndarray:
     """Measure the share of each photo's pixels that each chosen view covers, ``[v,p,h,w]`` uint8.
 
     Values are the opacity of the view's Gaussians times 255, and 0 on surfaces that the view does not see. The
@@ -82,8 +80,9 @@ def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
 
 
 def covered_pixels(covers: np.ndarray) -> np.ndarray:
-    """Return the mask of pixels that the views together cover, from ``covers [v,...]`` of :func:`coverage`."""
+    """Return the mask of pixels that the views together cover, from ``covers [v,...]`` of :func:`measure_covered`."""
     left = np.ones(covers.shape[1:], np.float32)
     for cover in covers:
         left *= 1 - cover.astype(np.float32) / 255
-    return left <= 1 - OPAQUE
+    min_alpha = 0.5  # least alpha of a pixel that the Gaussians cover
+    return left <= 1 - min_alpha

@@ -23,7 +23,7 @@ from gsmerge.geometry.pooling import Members
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.scene_files import find_scene_files
 from gsmerge.raster.photos import Photos
-from gsmerge.research.training.examples import Example, make_examples, scene_name
+from gsmerge.research.training.examples import Example, example_name, make_examples
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.scene.content_hash import content_hash, digest, list_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
@@ -34,8 +34,8 @@ LAYOUT = 7  # version of the files and their contents
 FORMAT = "gsmerge-example"
 REMEDY = "remove it; the next call makes it again"
 # Settings that an example depends on
-SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
-PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}
+EXAMPLE_SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
+STORED_PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,13 @@ def prepare_shards(
         raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
     shards: list[Shard] = []
     for number, scene in enumerate(scenes):
-        report(f"examples: {scene_name(scene)}", number, len(scenes))
+        report(f"examples: {example_name(scene)}", number, len(scenes))
         shards += _scene_shards(scene, options, folder)
     return shards
 
 
 def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shard]:
-    key, name = scene_key(scene, options), scene_name(scene)
+    key, name = scene_key(scene, options), example_name(scene)
     record = folder / f"{key[:32]}.json"
     hashes = _read_record(record)
     if hashes is None:
@@ -83,7 +83,7 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shar
 def scene_key(scene: Path, options: TrainOptions) -> str:
     """Return a hash of a scene's files and the settings that its examples depend on; SceneError without a scene."""
     head = {"layout": LAYOUT, "gsmerge": __version__, "views": options.example_views}
-    head |= {name: getattr(options, name) for name in SETTINGS}
+    head |= {name: getattr(options, name) for name in EXAMPLE_SETTINGS}
     files = find_scene_files(scene)
     targets = files.ply.parent / "targets"
     held_out = content_hash([targets]) if targets.is_dir() else None  # separate, since names are relative to folders
@@ -110,7 +110,7 @@ def write_shard(path: Path, example: Example) -> str:
 
 
 def _arrays(example: Example) -> Iterator[tuple[str, np.ndarray]]:
-    for part, kind in PARTS.items():
+    for part, kind in STORED_PARTS.items():
         for f in fields(kind):
             yield f"{part}.{f.name}", np.ascontiguousarray(getattr(getattr(example, part), f.name))
     for part, cameras in (("cameras", example.cameras), ("photos", example.photos)):

@@ -13,12 +13,12 @@ from gsmerge.research.training.loss_ssim import LOSS_WINDOW
 from gsmerge.settings.setting import Settings, change_settings, setting
 from gsmerge.settings.stages import SEGMENTATIONS, MatchMethod, MatchOptions
 
-COUNT: dict[str, Any] = {"least": 1, "most": 10**9}
-FROM_0: dict[str, Any] = {"least": 0, "most": 10**9}
-PART: dict[str, Any] = {"least": 0, "most": 1}
-RATE: dict[str, Any] = {"least": 1e-12, "most": 1e6}
-WEIGHT: dict[str, Any] = {"least": 0, "most": 1e6}
-LISTS = ("levels", "densities", "views", "random_views")
+COUNT_LIMITS: dict[str, Any] = {"least": 1, "most": 10**9}
+FROM_0_LIMITS: dict[str, Any] = {"least": 0, "most": 10**9}
+SHARE_LIMITS: dict[str, Any] = {"least": 0, "most": 1}
+RATE_LIMITS: dict[str, Any] = {"least": 1e-12, "most": 1e6}
+WEIGHT_LIMITS: dict[str, Any] = {"least": 0, "most": 1e6}
+LIST_OPTIONS = ("levels", "densities", "views", "random_views")
 
 
 @dataclass(frozen=True)
@@ -40,52 +40,56 @@ class TrainOptions(Settings):
     segmentation: str = setting("rdseg", "Superpixel method.", choices=SEGMENTATIONS)
     match: MatchMethod = setting("overlap", "Merging across views.",
         "The networks' results for a window are matched in every step.")  # fmt: skip
-    overlap: float = setting(0.7, "Least overlap of a match by `overlap`.", **PART)
-    iou: float = setting(0.2, "Least intersection over union of the boxes of a match by `aabb`.", **PART)
+    overlap: float = setting(0.7, "Least overlap of a match by `overlap`.", **SHARE_LIMITS)
+    iou: float = setting(0.2, "Least intersection over union of the boxes of a match by `aabb`.", **SHARE_LIMITS)
     similarity: float = setting(0.8, "Least cosine of the latents of a match by `aabb`.", least=-1, most=1)
     levels: tuple[int, ...] = setting(SLOTS, "Numbers of children K whose heads are trained.", choices=SLOTS,
         filled=True, unique=True)  # fmt: skip
     joint: bool = setting(False, "Train the heads of all levels on every window, as in the paper; otherwise that of "
         "a random level.")  # fmt: skip
     buffer: int = setting(10, "Examples that stay in memory. Every window is of a random one, and others are read.",
-        **COUNT)  # fmt: skip
-    steps: int = setting(6000, "Steps of the training.", **COUNT)
-    warmup: int = setting(200, "Steps over which the learning rate increases.", **FROM_0)
-    rate: float = setting(1e-3, "Highest learning rate.", **RATE)
-    least_rate: float = setting(1e-5, "Rate at the end of the cosine.", **RATE)
-    decay: float = setting(1e-4, "Weight decay (AdamW).", **WEIGHT)
-    clip: float = setting(1.0, "Largest norm of the gradient.", **RATE)
+        **COUNT_LIMITS)  # fmt: skip
+    steps: int = setting(6000, "Steps of the training.", **COUNT_LIMITS)
+    warmup: int = setting(200, "Steps over which the learning rate increases.", **FROM_0_LIMITS)
+    rate: float = setting(1e-3, "Highest learning rate.", **RATE_LIMITS)
+    least_rate: float = setting(1e-5, "Rate at the end of the cosine.", **RATE_LIMITS)
+    decay: float = setting(1e-4, "Weight decay (AdamW).", **WEIGHT_LIMITS)
+    clip: float = setting(1.0, "Largest norm of the gradient.", **RATE_LIMITS)
     average: float = setting(0.998, "Weight of the previous mean in the running mean of the weights, which is "
-        "validated and saved; less in the first steps.", **PART)  # fmt: skip
-    crops: int = setting(2, "Windows per step, computed in parallel.", **COUNT)
-    novel: float = setting(0.75, "Share of the windows in novel views, if there are any.", **PART)
-    photo_scale: int = setting(2, "Factor by which the sides of the photos are divided.", **COUNT)
+        "validated and saved; less in the first steps.", **SHARE_LIMITS)  # fmt: skip
+    crops: int = setting(2, "Windows per step, computed in parallel.", **COUNT_LIMITS)
+    novel: float = setting(0.75, "Share of the windows in novel views, if there are any.", **SHARE_LIMITS)
+    photo_scale: int = setting(2, "Factor by which the sides of the photos are divided.", **COUNT_LIMITS)
     photo_side: int = setting(0, "Longer side in pixels to which larger photos are reduced; it replaces `photo_scale`. "
-        "476 in the paper; 0: not used.", **FROM_0)  # fmt: skip
+        "476 in the paper; 0: not used.", **FROM_0_LIMITS)  # fmt: skip
     window: int = setting(96, "Side of a window of a photo that is rendered, pixels.", least=LOSS_WINDOW, most=10**9)
-    most: int = setting(4000, "Feature Gaussians that may reach into a window; a window with more is halved.", **COUNT)
+    most: int = setting(
+        4000, "Feature Gaussians that may reach into a window; a window with more is halved.", **COUNT_LIMITS
+    )
     photo_loss: str = setting("l1", "Colour loss: `l1` or `mse` (as in the paper).", choices=("l1", "mse"))
-    photo_weight: float = setting(0.8, "Weight of the colour loss.", **WEIGHT)
-    ssim_weight: float = setting(0.2, "Weight of 1 - SSIM.", **WEIGHT)
+    photo_weight: float = setting(0.8, "Weight of the colour loss.", **WEIGHT_LIMITS)
+    ssim_weight: float = setting(0.2, "Weight of 1 - SSIM.", **WEIGHT_LIMITS)
     lpips_weight: float = setting(0.0, "Weight of LPIPS (VGG), whose weights must be installed; a step takes twice as "
-        "long with it.", **WEIGHT)  # fmt: skip
-    lpips_start: float = setting(0.0, "Share of the steps after which LPIPS has its weight.", **PART)
+        "long with it.", **WEIGHT_LIMITS)  # fmt: skip
+    lpips_start: float = setting(0.0, "Share of the steps after which LPIPS has its weight.", **SHARE_LIMITS)
     teacher_weight: float = setting(0.0, "Weight of the distance from the moments of the groups (paper eq. "
-        "teacher_mean, teacher_cov).", **WEIGHT)  # fmt: skip
-    teacher_steps: int = setting(2000, "Steps over which `teacher_weight` falls to 0.", **COUNT)
+        "teacher_mean, teacher_cov).", **WEIGHT_LIMITS)  # fmt: skip
+    teacher_steps: int = setting(2000, "Steps over which `teacher_weight` falls to 0.", **COUNT_LIMITS)
     diversity_weight: float = setting(0.0, "Weight of the diversification of several children, relative to the "
-        "photometric loss: the term is at most this times that loss.", **WEIGHT)  # fmt: skip
-    diversity_steps: int = setting(50_000, "Steps over which `diversity_weight` falls to 0.", **COUNT)
+        "photometric loss: the term is at most this times that loss.", **WEIGHT_LIMITS)  # fmt: skip
+    diversity_steps: int = setting(50_000, "Steps over which `diversity_weight` falls to 0.", **COUNT_LIMITS)
     opacity_shift: float = setting(0.0, "Added to the raw correction of the opacity in the heads of the checkpoints.",
         "New captures have holes that scenes in training lack.", least=-8, most=8)  # fmt: skip
-    save_every: int = setting(200, "Steps between checkpoints, validation and lines of the table.", **COUNT)
+    save_every: int = setting(200, "Steps between checkpoints, validation and lines of the table.", **COUNT_LIMITS)
     validation_examples: int = setting(24, "Most examples for validation, spread evenly over all examples.",
-        **COUNT)  # fmt: skip
-    validation_windows: int = setting(4, "Windows of each validation example, the same in every validation.", **COUNT)
-    seed: int = setting(0, "Seed of all random numbers.", **FROM_0)
+        **COUNT_LIMITS)  # fmt: skip
+    validation_windows: int = setting(
+        4, "Windows of each validation example, the same in every validation.", **COUNT_LIMITS
+    )
+    seed: int = setting(0, "Seed of all random numbers.", **FROM_0_LIMITS)
 
     def __post_init__(self) -> None:
-        for name in LISTS:  # JSON and TOML have lists
+        for name in LIST_OPTIONS:  # JSON and TOML have lists
             object.__setattr__(self, name, tuple(getattr(self, name)))
         super().__post_init__()
         if self.random_views and (len(self.random_views) != 2 or self.random_views[0] > self.random_views[1]):
@@ -128,7 +132,7 @@ class TrainOptions(Settings):
 
     def to_dict(self) -> dict[str, Any]:
         """Convert all settings to plain values."""
-        return asdict(self) | {name: list(getattr(self, name)) for name in LISTS}
+        return asdict(self) | {name: list(getattr(self, name)) for name in LIST_OPTIONS}
 
 
 # Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper. Settings that the paper does not state have their
@@ -165,7 +169,7 @@ PAPER: Mapping[str, Any] = {
 }
 # Settings of the shipped networks. Encoder and merger gained nothing in validation, and colour corrections learnt the
 # exposure of the training photos; docs/internals/networks.md has the figures.
-SHIPPED: Mapping[str, Any] = {
+SHIPPED_TRAINING: Mapping[str, Any] = {
     "encoder": False,
     "merger": False,
     "color": 0.0,  # the bound of corrections
@@ -200,7 +204,7 @@ PAPER_SHIPPED: Mapping[str, Any] = {
     "validation_windows": 4,
 }
 PRESETS: Mapping[str, Mapping[str, Any]] = {
-    "default": {}, "shipped": SHIPPED, "paper": PAPER, "paper-shipped": PAPER_SHIPPED,
+    "default": {}, "shipped": SHIPPED_TRAINING, "paper": PAPER, "paper-shipped": PAPER_SHIPPED,
 }  # fmt: skip
 
 

@@ -15,7 +15,6 @@ from gsmerge.research.training.examples import Example
 from gsmerge.types import Cameras
 
 MIN_SIDE = 16  # least side of a halved window, pixels
-BORDER = 4  # pixels around a window from which corrections may move Gaussians into it
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,8 @@ def _draw_photo(example: Example, novel: float, rng: np.random.Generator) -> tup
 
 def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
     """Find the ascending rows of the Feature Gaussians that reach into the window or close to it."""
-    wide = Box(box.left - BORDER, box.top - BORDER, box.width + 2 * BORDER, box.height + 2 * BORDER)
+    border = 4  # pixels around a window from which corrections may move Gaussians into it
+    wide = Box(box.left - border, box.top - border, box.width + 2 * border, box.height + 2 * border)
     tiled = tile_view(
         make_splats(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR_PLANE
     )

@@ -12,7 +12,7 @@ from gsmerge.geometry.pooling import Members, scene_members
 from gsmerge.geometry.transforms import camera_distances, project
 from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.cross_view import sum_cross_view
-from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR_LOG, cross_view_stats
+from gsmerge.networks.cross_view_stats import FAR_LOG, MIN_SURFACE_OPACITY, NEAR_LOG, cross_view_stats
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, Cameras, Scene
 
@@ -35,15 +35,15 @@ def slowly(
                 continue
             j = (v * cameras.height + y) * cameras.width + x
             there = project(members.means[j : j + 1], cameras)[1][v, 0]
-            if not (there > 0 and members.opacities[j] > MIN_OPACITY):
+            if not (there > 0 and members.opacities[j] > MIN_SURFACE_OPACITY):
                 continue
             ratio, seen = float(elementary.log(depths[v, i] / there)), seen + 1
             kinds[0 if abs(ratio) < NEAR_LOG else 1 if ratio < 0 else 2] += 1
             if abs(ratio) < NEAR_LOG:
                 color += float(np.abs(SH_C0 * (sh0[i, 0] - members.sh0[j, 0])).mean())
-            ratios += float(np.clip(ratio, -FAR, FAR))
+            ratios += float(np.clip(ratio, -FAR_LOG, FAR_LOG))
         shares = [kind / max(seen, 1) for kind in kinds]
-        actual[i, :6] = [elementary.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR]
+        actual[i, :6] = [elementary.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR_LOG]
     return actual
 
 

@@ -11,7 +11,7 @@ import pytest
 from messages import refuses
 
 from gsmerge.kernels import elementary
-from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE, adam
+from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, MAX_FIT_LOGIT, MIN_FIT_LOGIT, QUAT, SIZE, adam
 
 RATES = np.array([0.1] * 3 + [0.2] * 3 + [0.03] * 4 + [0.3] + [0.03] * 3)
 # of the mean, log scale, logit; of the largest scale above the second, and above the least
@@ -120,7 +120,7 @@ def step_slowly(run: Run, g: Wanted, step: int) -> None:
         most = max(sorted(x[SIZE:QUAT])[1] + LIMITS[3], run.min_sizes[i] + LIMITS[4])
         x[SIZE:QUAT] = np.minimum(x[SIZE:QUAT], most)
         logit = np.clip(x[LOGIT], x0[LOGIT] - LIMITS[2], x0[LOGIT] + LIMITS[2])
-        x[LOGIT] = np.clip(logit, MIN_LOGIT, MAX_LOGIT)
+        x[LOGIT] = np.clip(logit, MIN_FIT_LOGIT, MAX_FIT_LOGIT)
         x[COLOR:] = np.clip(x[COLOR:], np.minimum(x0[COLOR:], -0.05), np.maximum(x0[COLOR:], 1.05))
         x[TURN] /= np.linalg.norm(x[TURN])
         run.x[i] = x

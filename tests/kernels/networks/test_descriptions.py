@@ -14,7 +14,7 @@ from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.kernels.elementary import log
 from gsmerge.networks.corrections import move_features, move_gaussians
-from gsmerge.networks.options import FEATURE, MEMBER, PART, RESIDUAL
+from gsmerge.networks.options import FEATURE, MEMBER_COLUMNS, PART_COLUMNS, RESIDUAL
 from gsmerge.networks.tokens import GroupFeatures, compute_group_features, contiguous, part_tokens
 from gsmerge.stages.merge import take
 from gsmerge.types import SH_C0, Gaussians
@@ -112,13 +112,16 @@ def test_parts(some: Made, each_target: Each) -> None:
     parts = replace(parts, scales=rng.permuted(parts.scales, axis=1))
     ids, owners = rng.integers(0, len(parts), (2, 50))
     members, relative, wide = each_target(
-        lambda: [part_tokens(parts, ids, owners, features, columns) for columns in (MEMBER, PART, PART + 3)]
+        lambda: [
+            part_tokens(parts, ids, owners, features, columns)
+            for columns in (MEMBER_COLUMNS, PART_COLUMNS, PART_COLUMNS + 3)
+        ]
     )
     expected = [slow_part(features, parts, *pair) for pair in zip(ids, owners, strict=True)]
     np.testing.assert_allclose(members, expected, atol=1e-5, rtol=1e-5)
-    assert np.array_equal(members[:, :PART], relative)
-    assert np.array_equal(wide[:, :PART], relative)
-    assert not wide[:, PART:].any()
+    assert np.array_equal(members[:, :PART_COLUMNS], relative)
+    assert np.array_equal(wide[:, :PART_COLUMNS], relative)
+    assert not wide[:, PART_COLUMNS:].any()
 
 
 @pytest.mark.parametrize("odd", [np.nan, np.inf, -np.inf, 0.0, 3e38])
@@ -136,7 +139,7 @@ def test_odd_numbers_give_finite_ones(some: Made, odd: float, each_target: Each)
     for f in fields(parts):
         getattr(parts, f.name)[1::2] = odd
     ids = np.arange(len(parts))
-    tokens = each_target(lambda: [part_tokens(parts, ids, ids[::-1].copy(), features, MEMBER)])[0]
+    tokens = each_target(lambda: [part_tokens(parts, ids, ids[::-1].copy(), features, MEMBER_COLUMNS)])[0]
     assert np.isfinite(tokens).all()
 
 
@@ -151,7 +154,7 @@ def test_ids_outside_are_refused(some: Made) -> None:
         with refuses(ValueError, "correct_gaussians: owners", wrong):
             move_gaussians(features.base[:3], np.zeros((3, RESIDUAL), np.float32), bad, features.frames)
     with pytest.raises(ValueError, match="describe_parts"):
-        part_tokens(features.base, ids, ids, features, PART - 1)
+        part_tokens(features.base, ids, ids, features, PART_COLUMNS - 1)
 
 
 def test_corrections_have_the_same_bits(some: Made, each_target: Each) -> None:

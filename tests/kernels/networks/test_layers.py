@@ -13,9 +13,19 @@ from network_fixtures import noisy
 from sweeps import sweep
 
 from gsmerge.kernels import elementary
-from gsmerge.kernels.networks.layers import GELU, PLAIN, TANH, attend, dense, normalise, pack, padded, scratch_size
+from gsmerge.kernels.networks.layers import (
+    GELU,
+    PLAIN,
+    TANH,
+    attend,
+    dense,
+    normalise,
+    pack_weights,
+    padded,
+    scratch_size,
+)
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
-from gsmerge.networks.options import GROUP, MEMBER, PART, SLOTS, NetworkOptions, weight_shapes
+from gsmerge.networks.options import GROUP_COLUMNS, MEMBER_COLUMNS, PART_COLUMNS, SLOTS, NetworkOptions, weight_shapes
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 SHAPES = [(0, 3, 2), (1, 1, 1), (1, 5, 3), (5, 16, 16), (7, 48, 48), (13, 19, 50), (6, 0, 4)]
@@ -38,7 +48,13 @@ def some(*shape: int, seed: int = 0) -> np.ndarray:
 def activate(values: np.ndarray, activation: int) -> np.ndarray:
     """A dense layer that changes nothing, and its activation."""
     out = np.empty((len(values), 1), np.float32)
-    dense(values.reshape(-1, 1), *pack(np.ones((1, 1), np.float32), np.zeros(1, np.float32)), None, activation, out)
+    dense(
+        values.reshape(-1, 1),
+        *pack_weights(np.ones((1, 1), np.float32), np.zeros(1, np.float32)),
+        None,
+        activation,
+        out,
+    )
     return out[:, 0]
 
 
@@ -49,9 +65,9 @@ def test_dense(rows: int, inputs: int, outputs: int, each_target: Callable[..., 
 
     def run() -> list[np.ndarray]:
         outs = [np.empty((rows, outputs), np.float32) for _ in range(3)]
-        dense(x, *pack(weight, bias), None, PLAIN, outs[0])
-        dense(x, *pack(weight, bias), residual, PLAIN, outs[1])
-        dense(x, *pack(weight, bias), residual, TANH, outs[2])
+        dense(x, *pack_weights(weight, bias), None, PLAIN, outs[0])
+        dense(x, *pack_weights(weight, bias), residual, PLAIN, outs[1])
+        dense(x, *pack_weights(weight, bias), residual, TANH, outs[2])
         return outs
 
     plain, added, bounded = each_target(run)
@@ -128,9 +144,9 @@ def test_attention(tokens: int, width: int, heads: int, each_target: Callable[..
 def test_sizes_that_do_not_go_together_are_refused() -> None:
     x, out = some(2, 3), np.empty((2, 40), np.float32)
     with pytest.raises(ValueError, match="dense"):
-        dense(x, *pack(some(16, 3), some(16)), None, PLAIN, out)
+        dense(x, *pack_weights(some(16, 3), some(16)), None, PLAIN, out)
     with pytest.raises(ValueError, match="activation"):
-        dense(x, *pack(some(40, 3), some(40)), None, 3, out)
+        dense(x, *pack_weights(some(40, 3), some(40)), None, 3, out)
     query, pairs, mask = some(1, 1, 6), some(1, 2, 6 + 2 * 16), np.ones((1, 2), np.uint8)
     mixed, scratch = np.empty((1, 1, 32), np.float32), np.empty(scratch_size(2, 6), np.float32)
     attend(query, pairs, mask, 2, scratch, mixed)
@@ -149,12 +165,12 @@ def inputs_of(name: str, options: NetworkOptions, count: int) -> tuple[np.ndarra
     """Random inputs of a network: some tokens do not count."""
     kind, _, slots = name.partition(".")
     width, tokens = {
-        "encoder": (MEMBER, options.members), "merger": (PART + options.latent, 5),
-        "refiner": (PART + 1 + options.latent, options.neighbors + 1), "heads": (PART, int(slots or 1)),
+        "encoder": (MEMBER_COLUMNS, options.members), "merger": (PART_COLUMNS + options.latent, 5),
+        "refiner": (PART_COLUMNS + 1 + options.latent, options.neighbors + 1), "heads": (PART_COLUMNS, int(slots or 1)),
     }[kind]  # fmt: skip
     mask = np.random.default_rng(1).random((count, tokens)) < 0.7
     mask[:, 0] = True
-    table, group = some(count, tokens, width, seed=2), some(count, GROUP, seed=3)
+    table, group = some(count, tokens, width, seed=2), some(count, GROUP_COLUMNS, seed=3)
     return (some(count, options.latent), group, table, mask) if kind == "heads" else (table, mask, group)
 
 

@@ -64,7 +64,7 @@ def test_opacities_in_place_of_the_gaussians_own() -> None:
 
 @pytest.mark.parametrize("threads", [2, 8])
 def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.modules["gsmerge.raster.tiled_view"], "PIECE", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.raster.tiled_view"], "THREAD_PIECE", 200)
     monkeypatch.setattr(sys.modules["gsmerge.raster.gradient"], "MIN_PER_THREAD", 200)
     gaussians, cameras = random_gaussians(2000, 3, 10).numpy(), turned_cameras(1).numpy()
     gaussians = replace(gaussians, scales=gaussians.scales * 0.3)

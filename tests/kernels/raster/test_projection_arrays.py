@@ -215,7 +215,7 @@ def test_loss_has_the_same_bits_on_every_processor(each_target: Any, size: tuple
 
 def test_memory_of_the_loss_that_is_too_small_is_refused() -> None:
     image, weight = np.zeros((4, 9), np.float32), np.zeros((4, 3), np.float32)
-    terms, rows = (np.empty((*shape, image_loss.CHUNK), np.float32) for shape in ((12, 3), (7,)))
+    terms, rows = (np.empty((*shape, image_loss.SUM_CHUNK), np.float32) for shape in ((12, 3), (7,)))
     outputs = image.copy(), weight[:, 0].copy(), terms, rows
     with refuses(ValueError, "loss_gradient", "indices"):
         image_loss.loss_gradient(image, image, weight, 0.2, 1.2, 0, 4, *outputs)

@@ -59,7 +59,7 @@ class View:
         return max(np.ptp(self.y[used]), np.ptp(self.x[used])) if used.any() else 0.0
 
     def rows(self) -> tuple[np.ndarray, float]:
-        rows = np.empty((2 * COUNT, kernels.ROW))
+        rows = np.empty((2 * COUNT, kernels.TREE_COLUMNS))
         return rows, kernels.region_sums(pad_labels(self.labels), self.pixels, self.depths, COUNT, rows)
 
     def merges(self, max_extent: float = 1e9) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,7 +98,7 @@ def test_sums_of_the_leaves(seed: int) -> None:
     masks = [view.labels == i for i in range(COUNT)]
     assert colour_error == pytest.approx(sum(map(view.colour_error, masks)), rel=1e-9)
     np.testing.assert_allclose(rows[:COUNT, kernels.PLANE_ERROR], [view.plane_error(m) for m in masks], atol=1e-9)
-    assert rows[:COUNT, kernels.NUM_PIXELS].tolist() == [((view.depths > 0) & m).sum() for m in masks]
+    assert rows[:COUNT, kernels.TREE_PIXELS].tolist() == [((view.depths > 0) & m).sum() for m in masks]
 
 
 @pytest.mark.parametrize("max_extent", [1e9, 9.0])

@@ -68,5 +68,5 @@ def test_merging_from_a_low_ceiling_gives_the_same(pixels: np.ndarray, labels: n
         rows[:30, ward.INVERSE] = 1 / rows[:30, 5]
         _, num_nodes = ward.merge_tree(ward.adjacent_pairs(pad_labels(labels)), rows, 30, 15, np.float32(ceiling))
         assert num_nodes >= 45
-        heights.append(np.sort(rows[30:num_nodes, ward.HEIGHT])[:15])
+        heights.append(np.sort(rows[30:num_nodes, ward.MERGE_HEIGHT])[:15])
     assert heights[0] == pytest.approx(heights[1], rel=0.02)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from messages import NO_FOLDER, refuses
 
-from gsmerge.batch.records import DONE, FAILED, RECORDS, DoneResult, RecordIndex, check_folder, record
+from gsmerge.batch.records import DONE, FAILED, RECORDS, DoneResult, RecordIndex, prepare_folder, record
 from gsmerge.errors import SceneError
 from gsmerge.io.jsonl import append_line
 
@@ -98,8 +98,8 @@ def test_a_pipe_in_place_of_a_result_is_not_waited_for(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with refuses(SceneError, "out", *NO_FOLDER, "--output"):
-        check_folder(tmp_path / "file" / "out")
-    check_folder(tmp_path / "new" / "out")
+        prepare_folder(tmp_path / "file" / "out")
+    prepare_folder(tmp_path / "new" / "out")
     assert (tmp_path / "new" / "out" / RECORDS).exists()
 
 
@@ -107,4 +107,4 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Pa
 def test_a_pipe_in_the_place_of_the_records_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / RECORDS)
     with refuses(SceneError, RECORDS, "pipe"):
-        check_folder(tmp_path)
+        prepare_folder(tmp_path)

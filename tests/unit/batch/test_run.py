@@ -23,8 +23,8 @@ from gsmerge.batch import jobs as calls
 from gsmerge.batch import run as runs
 from gsmerge.batch import run_batch
 from gsmerge.batch.jobs import find_jobs
-from gsmerge.batch.records import DONE, FAILED, SKIPPED, check_folder
-from gsmerge.batch.run import Run, lock_result, make_result, pending_jobs, remove_unfinished
+from gsmerge.batch.records import DONE, FAILED, SKIPPED, prepare_folder
+from gsmerge.batch.run import Run, lock_result, pending_jobs, remove_unfinished, run_job
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic
 
@@ -82,7 +82,7 @@ def test_a_lock_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
 
 
 def run(scene: Path, out: Path, options: Any = QUICK) -> dict[str, Any]:
-    actual = make_result(*one_job(scene, out, options), wait=False)
+    actual = run_job(*one_job(scene, out, options), wait=False)
     assert actual is not None
     return actual
 
@@ -217,7 +217,7 @@ def test_a_failure_leaves_an_earlier_result_and_says_so(
     monkeypatch.setattr(calls, "content_hash", refuse)
     job, started = one_job(scene, out)
     [(_, foreseen)] = pending_jobs([job], out, QUICK)
-    ended = make_result(job, started, wait=False)
+    ended = run_job(job, started, wait=False)
     assert ended is not None
     assert foreseen == ended["error"]
     assert says(foreseen, "scene.ply", "Permission denied", "stays")
@@ -233,7 +233,7 @@ def test_the_result_of_another_scene_is_kept(scene: Path, out: Path) -> None:
     for options in (QUICK, replace(QUICK, overwrite=True)):
         both, started = find_jobs([str(other), str(scene)], out, options), Run(out, 1, options.overwrite)
         foreseen = {job.scene: refused for job, refused in pending_jobs(both, out, options)}
-        ended = {job.scene: make_result(job, started, wait=False) for job in both}
+        ended = {job.scene: run_job(job, started, wait=False) for job in both}
         assert [line and line["status"] for line in ended.values()] == [FAILED, DONE if options.overwrite else SKIPPED]
         assert says(foreseen[str(other)], out / "room.ply", scene, other, "--name")
         assert foreseen.get(str(scene)) is None
@@ -250,7 +250,7 @@ def test_what_is_done_is_skipped_in_a_folder_that_cannot_be_written(
     monkeypatch.setattr(os, "access", lambda path, _: Path(path) != out)
     monkeypatch.setattr(runs, "lock_file", None)
     monkeypatch.setattr(Path, "touch", None)
-    check_folder(out)
+    prepare_folder(out)
     assert run(scene, out)["status"] == SKIPPED
 
 
@@ -285,8 +285,8 @@ def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None
         assert begun is not None
         begun.touch()
         (out / left_by_a_dead_process()).touch()
-        assert make_result(job, started, wait=False) is None
-        assert make_result(job, started, False, "died") is None
+        assert run_job(job, started, wait=False) is None
+        assert run_job(job, started, False, "died") is None
         remove_unfinished(started, [job])
         assert len(results(out)) == 3  # lock, mark, and the file that the other process may yet clean up
     assert not (out / "batch.jsonl").exists()
@@ -331,7 +331,7 @@ import os, signal, sys
 sys.path.insert(0, {str(root / "tests" / "helpers")!r})
 from pathlib import Path
 from batches import one_job
-from gsmerge.batch.run import make_result
+from gsmerge.batch.run import run_job
 target, name = {where!r}.rsplit(".", 1)
 owner = __import__("pkgutil").resolve_name(target)
 kept = getattr(owner, name)
@@ -340,7 +340,7 @@ def killed(*args, **kwargs):
         kept(*args, **kwargs)
     os.kill(os.getpid(), signal.SIGKILL)
 setattr(owner, name, killed)
-make_result(*one_job(Path({str(scene)!r}), Path({str(out)!r})), wait=False)
+run_job(*one_job(Path({str(scene)!r}), Path({str(out)!r})), wait=False)
 """
     killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
@@ -384,7 +384,7 @@ def test_where_nothing_can_be_recorded_nothing_is_forgotten(
         run(scene, out)
     job, started = one_job(scene, out)
     with refuses(SceneError, "batch.jsonl", "No space"):
-        make_result(job, started, False, "died")
+        run_job(job, started, False, "died")
     remove_unfinished(started, [job])
     monkeypatch.undo()
     assert run(scene, out)["status"] == DONE  # the result is there without a record, and known as ours
@@ -399,7 +399,7 @@ def left_by_a_dead_process() -> str:
 
 
 def status(call: Any) -> str:
-    actual = make_result(*call, wait=False)
+    actual = run_job(*call, wait=False)
     assert actual is not None
     return str(actual["status"])
 
@@ -422,7 +422,7 @@ def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path
     job, started = one_job(scene, out)
     kill(out)
     (out / ".room-mine.ply").touch()
-    actual = make_result(job, started, False, "killed")
+    actual = run_job(job, started, False, "killed")
     assert actual is not None
     assert (actual["status"], actual["error"]) == (FAILED, "killed")
     assert records(out) == [actual]

@@ -12,7 +12,7 @@ import pytest
 
 from gsmerge.cli.console import RunEnd, json_progress, plain_warnings, say, stage_progress, total_progress
 from gsmerge.errors import Doubt
-from gsmerge.runtime.record import Part, begin_part, expect_parts, record_run, report_progress
+from gsmerge.runtime.record import RunPart, begin_part, expect_parts, record_run, report_progress
 
 
 class Terminal(io.StringIO):
@@ -39,7 +39,7 @@ def test_the_bar_of_a_run_fills_and_names_the_stage(monkeypatch: pytest.MonkeyPa
     with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
         progress("read: small.ply", 3, 3)
     with redirect_stderr(terminal), stage_progress(quiet=False) as progress, record_run(progress):
-        expect_parts([Part(1.0, 3.0)])
+        expect_parts([RunPart(1.0, 3.0)])
         begin_part()
         report_progress("fit: photos 20.0 dB", 100, 100)
     lines = [line for line in terminal.lines() if "━" in line]

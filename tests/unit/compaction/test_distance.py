@@ -14,7 +14,7 @@ from messages import refuses
 
 import gsmerge
 from gsmerge import Gaussians, Scene, compact, pipeline, render
-from gsmerge.compaction.distance import BLUR, SIDE, TWICE, WRONG, describe_far, is_far
+from gsmerge.compaction.distance import DISTANCE_BLUR, DISTANCE_PIXELS, TWICE_DB, WRONG_DB, describe_far, is_far
 from gsmerge.errors import TargetError
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.prepare import Prepared, prepare
@@ -39,19 +39,23 @@ def tiny(gaussians: Gaussians) -> Gaussians:
 
 def slow_psnr(a: np.ndarray, b: np.ndarray, covered: np.ndarray) -> float:
     """PSNR over the covered pixels of all pictures, blurred by OpenCV."""
-    blurred = [np.stack([cv2.GaussianBlur(p.clip(0, 1), (0, 0), BLUR) for p in pictures]) for pictures in (a, b)]
+    blurred = [
+        np.stack([cv2.GaussianBlur(p.clip(0, 1), (0, 0), DISTANCE_BLUR) for p in pictures]) for pictures in (a, b)
+    ]
     return decibels(float(((blurred[0] - blurred[1]) ** 2)[covered].mean()))
 
 
 def test_distances_are_those_of_a_slow_reference(prepared: Prepared) -> None:
     scene = prepared.scene
     result = tiny(scene.gaussians)
-    cameras = resize_cameras(scene.cameras, SIDE, round(SIDE * scene.cameras.height / scene.cameras.width))
+    cameras = resize_cameras(
+        scene.cameras, DISTANCE_PIXELS, round(DISTANCE_PIXELS * scene.cameras.height / scene.cameras.width)
+    )
     own, between = render(scene.gaussians, cameras[[0, 2]]), between_cameras(cameras)
     inputs, results = (render(gaussians, between) for gaussians in (scene.gaussians, result))
     error = slow_psnr(own.images, scene.images[[0, 2]], own.alphas[..., 0] > 0.5)
     distance = slow_psnr(inputs.images, results.images, inputs.alphas[..., 0] > 0.5)
-    assert distance < error - TWICE
+    assert distance < error - TWICE_DB
     text = describe_far(result, prepared)
     assert text is not None
     assert [float(value) for value in re.findall(r"([\d.]+) dB", text)] == pytest.approx([distance, error], abs=0.3)
@@ -65,7 +69,7 @@ def test_the_input_and_usual_results_are_not_far(room: Scene, prepared: Prepared
 
 @pytest.mark.parametrize(
     ("before", "after", "expected"),
-    [(20, 20 - TWICE - 0.1, True), (20, 20 - TWICE + 0.1, False), (60, WRONG + 0.1, False), (None, 3, False),
+    [(20, 20 - TWICE_DB - 0.1, True), (20, 20 - TWICE_DB + 0.1, False), (60, WRONG_DB + 0.1, False), (None, 3, False),
      (20, None, False), (float("nan"), 3, False)],
 )  # fmt: skip
 def test_far_is_twice_the_error_and_wrong(before: float | None, after: float | None, expected: bool) -> None:

@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.compaction.left_out import LEAST_VIEWS, choose_views, cover, leave_out, mean_seen
+from gsmerge.compaction.left_out import LEAST_VIEWS, choose_left_out, cover, leave_out, mean_seen
 from gsmerge.compaction.new_views import OWN, SPREAD, NewViews, Trial, shrink_scene
 from gsmerge.facts.prepare import prepare
 from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_new_views
@@ -91,7 +91,7 @@ def test_a_trial_leaves_the_result_as_it_is(room: Scene) -> None:
 
 @pytest.mark.parametrize("count", [4, 7, 18, 60])
 def test_views_left_out_together_are_no_neighbours(count: int) -> None:
-    rounds = choose_views(range(0, 2 * count, 2))
+    rounds = choose_left_out(range(0, 2 * count, 2))
     assert len(rounds[0]) == len(rounds[1]) == min(3, max(1, count // 6))
     assert len({*rounds[0], *rounds[1]}) == 2 * len(rounds[0])
     assert {*rounds[0], *rounds[1]} <= {*range(0, 2 * count, 2)}

@@ -13,7 +13,7 @@ from messages import noted, refuses
 
 from gsmerge.compaction.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.compaction.left_out import LeftOut
-from gsmerge.compaction.search import CLOSE, MAX_RUNS, MAX_TRIED, CountSearch, level_counts, search_count
+from gsmerge.compaction.search import MAX_RUNS, MAX_TRIED, SAME_COUNT_RATIO, CountSearch, level_counts, search_count
 from gsmerge.facts.counts import exact_count, max_allowed
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import FitOptions
@@ -248,7 +248,7 @@ def test_more_are_taken_until_photos_are_shown_as_well(slope: float, needed: flo
     """Beyond the four times the usual count that a quality may take."""
     actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 40_000, rendered=False)
     assert actual.met
-    assert actual.best.count <= 1000 * needed * 2 ** (FIDELITY_LOSS / slope) * CLOSE
+    assert actual.best.count <= 1000 * needed * 2 ** (FIDELITY_LOSS / slope) * SAME_COUNT_RATIO
     assert len(actual.tried) <= 5
     assert noted(actual.notes, f"{actual.best.count:,} of 40,000", "at most 0.3 dB worse than the input")
 

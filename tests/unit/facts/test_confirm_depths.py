@@ -12,7 +12,15 @@ import unaligned_scenes
 from motions import with_nearer_half
 
 from gsmerge import Cameras, Scene
-from gsmerge.facts.confirm_depths import FEWEST, MOST, PIXELS, REACH, SAME, Agreement, confirm_depths
+from gsmerge.facts.confirm_depths import (
+    AGREEMENT_PIXELS,
+    AGREEMENT_SHARE,
+    FEWEST,
+    MOST_PER_PIXEL,
+    SAME_LOG_DEPTH,
+    Agreement,
+    confirm_depths,
+)
 from gsmerge.kernels.elementary import log
 
 VIEWS, WIDTH, HEIGHT = 4, 48, 36
@@ -45,7 +53,7 @@ def confirm_slowly(scene: Scene) -> Agreement:
     """Look up each pixel in each other view, one after the other, in the words of the definition."""
     means = scene.gaussians.means.reshape(VIEWS, HEIGHT, WIDTH, 3).tolist()
     lenses = list(zip(scene.cameras.viewmats.tolist(), scene.cameras.Ks.tolist(), strict=True))
-    reach = max(PIXELS, REACH * WIDTH)
+    reach = max(AGREEMENT_PIXELS, AGREEMENT_SHARE * WIDTH)
     counts = [0, 0, 0]
     for view in range(VIEWS):
         for row in range(HEIGHT):
@@ -61,9 +69,9 @@ def confirm_slowly(scene: Scene) -> Agreement:
                     there = look_at(surface, *lenses[other])[2]
                     away = hypot(back_x - column - 0.5, back_y - row - 0.5) / reach if ahead > 0 else inf
                     behind = float(log(depth / there))
-                    if away < 1 and abs(behind) < SAME:
+                    if away < 1 and abs(behind) < SAME_LOG_DEPTH:
                         same += 1
-                    elif behind < -2 * SAME or (behind < 0 and away > 2):
+                    elif behind < -2 * SAME_LOG_DEPTH or (behind < 0 and away > 2):
                         through += 1
                 counts[0] += same > 0 and same >= through
                 counts[1] += through > same
@@ -76,7 +84,7 @@ def test_a_wall_that_all_views_see_is_confirmed(wall: Scene) -> None:
     assert agreement.confirmed > 0.97
     assert agreement.contradicted < 0.01
     assert agreement.advice is None
-    assert agreement.share == MOST
+    assert agreement.share == MOST_PER_PIXEL
 
 
 def test_what_stands_nearer_is_contradicted(wall: Scene) -> None:
@@ -130,7 +138,7 @@ def test_the_worst_part_is_named(wall: Scene) -> None:
 def test_what_a_scene_bears_falls_with_the_share() -> None:
     shares = [Agreement(confirmed, 0, 0).share for confirmed in (1, 0.75, 0.7, 0.65, 0.6, 0.1)]
     assert shares == sorted(shares, reverse=True)
-    assert shares[0] == shares[1] == MOST
+    assert shares[0] == shares[1] == MOST_PER_PIXEL
     assert shares[1] > shares[2] > shares[3] > shares[4] == shares[5] == FEWEST
 
 

@@ -11,7 +11,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.facts.holes import LARGE, RIM, large_parts
+from gsmerge.facts.holes import LARGE_SIDE, RIM_PIXELS, large_parts
 from gsmerge.facts.prepare import prepare
 
 WIDTH, HEIGHT, THIRD = 96, 72, 24
@@ -54,9 +54,9 @@ def compared(scene: Scene, **settings: Any) -> tuple[np.ndarray, np.ndarray, lis
 
 def test_a_part_without_rows_stays_empty(room: Scene) -> None:
     before, after, notes = compared(without_top(room))
-    top = np.s_[:, : THIRD - 2 * RIM]
+    top = np.s_[:, : THIRD - 2 * RIM_PIXELS]
     assert after[top].mean() <= before[top].mean() + 0.02
-    assert after[:, THIRD + RIM :].mean() > 0.9
+    assert after[:, THIRD + RIM_PIXELS :].mean() > 0.9
     assert len(notes) == 1
     assert "4 of 4 views" in notes[0]
 
@@ -101,13 +101,13 @@ def test_empty_parts_do_not_count(room: Scene) -> None:
     assert scene.masks is not None
     assert not (scene.masks & scene.empty).any()
     assert (scene.images[scene.empty] == 0).all()
-    assert scene.empty[:, : THIRD - 2 * RIM].mean() > 0.95  # other views show some of it
+    assert scene.empty[:, : THIRD - 2 * RIM_PIXELS].mean() > 0.95  # other views show some of it
     assert not scene.empty[:, THIRD:].any()
     assert prepare(room).scene.empty is None
 
 
 def test_large_parts_hold_a_large_square() -> None:
-    side = round(LARGE * WIDTH)
+    side = round(LARGE_SIDE * WIDTH)
     for width, large in ((side // 2, False), (side + 2, True)):
         empty = np.zeros((HEIGHT, WIDTH), bool)
         empty[10 : 10 + width, 5:90] = True

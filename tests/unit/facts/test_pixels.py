@@ -10,7 +10,7 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Gaussians, Scene, compact
-from gsmerge.facts.pixels import HIDDEN, LOW_PASS, choose_level, find_pixels, raise_sizes, with_pixels
+from gsmerge.facts.pixels import HIDDEN_SIZE, LOW_PASS, choose_level, find_pixels, raise_sizes, with_pixels
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels import elementary
@@ -103,7 +103,7 @@ def least_scales(scene: Scene) -> np.ndarray:
         view = home // scene.pixels_per_view
         depth = camera_depths(scene.gaussians.means[row].astype(float), scene.cameras.viewmats[view])
         pixel = depth / np.sqrt(scene.cameras.Ks[view, 0, 0] * scene.cameras.Ks[view, 1, 1])
-        if scales[row].max() * np.sqrt(homes.count(home)) < HIDDEN * LOW_PASS * pixel:
+        if scales[row].max() * np.sqrt(homes.count(home)) < HIDDEN_SIZE * LOW_PASS * pixel:
             scales[row] = LOW_PASS * pixel
     return scales
 

@@ -15,7 +15,7 @@ from gsmerge.geometry.frame import canonicalise, scene_frame
 from gsmerge.geometry.transforms import project
 from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.photos.scene_photos import without_photo
-from gsmerge.raster.photos import MASKED, scene_pictures
+from gsmerge.raster.photos import MASKED_WEIGHT, scene_pictures
 from gsmerge.runtime.record import record_part
 
 
@@ -123,5 +123,5 @@ def test_views_without_a_photo_take_part_in_a_fit(own: bool) -> None:
         assert weights is None
     else:
         np.testing.assert_array_equal(scene.masks.all((1, 2)), [True, False, True])
-        np.testing.assert_array_equal(weights[:, 0, 0], [1, MASKED, 1])
+        np.testing.assert_array_equal(weights[:, 0, 0], [1, MASKED_WEIGHT, 1])
         np.testing.assert_array_equal(scene.images[1], render(scene.gaussians, scene.cameras[[1]]).images[0].clip(0, 1))

@@ -11,7 +11,7 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import Gaussians, Scene, compact
-from gsmerge.facts.scene_size import BRIGHT, FEWEST, LARGE, unlike_captures
+from gsmerge.facts.scene_size import BRIGHT_COLOR, FEWEST_TESTED, LARGE_SCALE, unlike_captures
 
 FIT = {"superpixels": 50, "fit_steps": 5, "checkpoint": "none", "poses": "fixed"}
 
@@ -27,14 +27,16 @@ def sized(gaussians: Gaussians, share: float) -> Gaussians:
     return replace(gaussians, scales=np.full_like(gaussians.scales, share * np.linalg.norm(high - low)))
 
 
-@pytest.mark.parametrize(("share", "words"), [(1e-8, None), (0.9 * LARGE, None), (1.1 * LARGE, "at least")])
+@pytest.mark.parametrize(("share", "words"), [(1e-8, None), (0.9 * LARGE_SCALE, None), (1.1 * LARGE_SCALE, "at least")])
 def test_sizes_have_a_bound(share: float, words: str | None, room: Scene) -> None:
     odd = unlike_captures(sized(room.gaussians, share))
     assert (odd is None) == (words is None)
     assert words is None or (f"{words} {share:.2g} times as large as the scene" in odd and "nothing is scored" in odd)
 
 
-@pytest.mark.parametrize(("value", "is_odd"), [(0.9 * BRIGHT, False), (1.1 * BRIGHT, True), (-1.1 * BRIGHT, True)])
+@pytest.mark.parametrize(
+    ("value", "is_odd"), [(0.9 * BRIGHT_COLOR, False), (1.1 * BRIGHT_COLOR, True), (-1.1 * BRIGHT_COLOR, True)]
+)
 def test_colours_have_a_bound(value: float, is_odd: bool, room: Scene) -> None:
     colors = value * (1 + 0.01 * np.random.default_rng(0).random(room.gaussians.sh0.shape, np.float32))
     odd = unlike_captures(replace(room.gaussians, sh0=colors))
@@ -55,7 +57,7 @@ def test_some_odd_ones_and_few_are_none(room: Scene) -> None:
     assert unlike_captures(replace(room.gaussians, scales=scales)) is None
     assert unlike_captures(room.gaussians) is None
     large = sized(room.gaussians, 10)
-    assert unlike_captures(large[: FEWEST - 1]) is None
+    assert unlike_captures(large[: FEWEST_TESTED - 1]) is None
     assert unlike_captures(large[:0]) is None
 
 

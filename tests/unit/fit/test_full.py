@@ -310,7 +310,7 @@ def test_whole_photos_have_a_mean_of_their_own(truth: Gaussians, photos: Pair, m
 
 def test_pieces_of_a_step_change_no_bit(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     one = fit_full(scenes.spoil(truth), scenes.run_for(photos, QUICK))
-    monkeypatch.setattr(steps, "ROWS", 17)
+    monkeypatch.setattr(steps, "ADAM_ROWS", 17)
     assert scenes.identical(fit_full(scenes.spoil(truth), scenes.run_for(photos, QUICK))[0], one[0])
 
 

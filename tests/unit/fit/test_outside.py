@@ -12,12 +12,12 @@ from gsmerge import Gaussians
 from gsmerge.fit import FitJob, FitOptions, fit, record_fit
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import (
-    EMPTY,
+    EMPTY_OPACITY,
+    LEAST_FOG_WEIGHT,
     LEAST_WIDTH,
-    LIGHT,
-    MARGIN,
-    RIM,
-    VEIL,
+    RIM_SHARE,
+    VEIL_WEIGHT,
+    VEILED_LOSS,
     Outside,
     mark_empty,
     place_outside_views,
@@ -60,8 +60,8 @@ def with_curtain(gaussians: Gaussians, opacity: float = 0.8) -> Gaussians:
 
 def test_a_rim_beside_what_is_shown_does_not_count() -> None:
     opacities = np.zeros((40, 100), np.float32)
-    opacities[:, :10] = EMPTY + 0.01
-    assert mark_empty(opacities)[20].tolist() == [column >= 10 + round(100 * RIM) for column in range(100)]
+    opacities[:, :10] = EMPTY_OPACITY + 0.01
+    assert mark_empty(opacities)[20].tolist() == [column >= 10 + round(100 * RIM_SHARE) for column in range(100)]
     assert mark_empty(np.zeros((3, 4), np.float32)).all()
     assert not mark_empty(np.full((3, 4), 0.5, np.float32)).any()
 
@@ -71,7 +71,7 @@ def test_views_stand_behind_and_around(outside: Outside, truth: Gaussians, photo
     views = outside.views
     assert views.weights is not None
     assert views.weights.shape == (len(views), LEAST_WIDTH * photos[1].height // photos[1].width, LEAST_WIDTH)
-    assert np.unique(views.weights) == pytest.approx([0, LIGHT, VEIL * LIGHT])
+    assert np.unique(views.weights) == pytest.approx([0, LEAST_FOG_WEIGHT, VEIL_WEIGHT * LEAST_FOG_WEIGHT])
     eyes, own = camera_centres(views.viewmats), camera_centres(photos[1].viewmats)
     assert np.linalg.norm(eyes - truth.means.mean(0), axis=1).min() > 0.8 * np.linalg.norm(own, axis=1).min()
     assert len(np.unique(views.viewmats.round(6), axis=0)) == len(views)
@@ -122,7 +122,7 @@ def test_gradients_are_those_of_what_is_hidden(outside: Outside, truth: Gaussian
     depth = float((outside.views.viewmats[0, 2] * np.append(spoilt.means[-1], 1)).sum())
     far = np.full_like(outside.limits, 4 * depth)
     looked = replace(outside, limits=np.where(np.isinf(outside.limits), np.inf, 0) if empty else far)
-    weights = np.full_like(far, 1) if not empty else np.where(np.isinf(looked.limits), np.float32(LIGHT), 0)
+    weights = np.full_like(far, 1) if not empty else np.where(np.isinf(looked.limits), np.float32(LEAST_FOG_WEIGHT), 0)
     looked = replace(looked, views=replace(outside.views, weights=weights.astype(np.float32)))
     g = veil_gradients(make_splats(spoilt[len(truth) :]), looked, 0)
 
@@ -140,7 +140,7 @@ def test_gradients_are_those_of_what_is_hidden(outside: Outside, truth: Gaussian
 def test_what_hides_little_and_what_stands_behind_is_left(outside: Outside, truth: Gaussians) -> None:
     curtain = with_curtain(truth, 0.3)[len(truth) :]
     depth = float((outside.views.viewmats[0, 2] * np.append(curtain.means[0], 1)).sum())
-    for limit, count in ((depth / (1 - MARGIN), 0), (0.5 * depth, 0), (8 * depth, 1)):
+    for limit, count in ((depth / (1 - VEILED_LOSS), 0), (0.5 * depth, 0), (8 * depth, 1)):
         looked = replace(outside, limits=np.full_like(outside.limits, limit))
         assert len(veil_gradients(make_splats(curtain), looked, 0).ids) == count
 

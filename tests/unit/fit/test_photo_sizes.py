@@ -18,7 +18,8 @@ from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale, tr
 from gsmerge.fit.schedule import DrawMode, prepare_fit
 from gsmerge.geometry.transforms import project
 from gsmerge.photos.views import subset
-from gsmerge.raster.photos import EPS2D, MASKED, scene_photos, score_photos
+from gsmerge.raster.photos import MASKED_WEIGHT, scene_photos, score_photos
+from gsmerge.raster.tiled_view import EPS2D
 from gsmerge.types import LargePhotos, PicturedScene
 
 LONG = FitOptions(fit_steps=160, holdout=0.2)
@@ -115,7 +116,7 @@ def test_masks_weigh_larger_photos(scene: Scene) -> None:
     masks[:, :, half:] = False
     weights = large_photos(replace(with_large(scene, 2), masks=masks), 2).weights
     assert (weights[:, :, : 2 * half] == 1).all()
-    assert (weights[:, :, 2 * half :] == MASKED).all()
+    assert (weights[:, :, 2 * half :] == MASKED_WEIGHT).all()
 
 
 def test_a_point_has_the_same_place_in_every_size(scene: Scene) -> None:
@@ -192,7 +193,7 @@ def test_a_run_says_at_what_scale_it_looked(scene: Scene) -> None:
 def test_what_is_held_out_is_what_counts(scene: Scene) -> None:
     """Of a small part, at least one patch of each view; none of what is to stay empty."""
     photos = scene_photos(scene)
-    weights = np.full((len(photos), photos.height, photos.width), MASKED, np.float32)
+    weights = np.full((len(photos), photos.height, photos.width), MASKED_WEIGHT, np.float32)
     weights[:, 16:28, 16:28] = 1
     empty = np.zeros_like(weights)
     empty[:, :, :20] = 1

@@ -13,7 +13,14 @@ from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import place_outside_views, score_fog
 from gsmerge.fit.schedule import prepare_fit
-from gsmerge.fit.survey import MOST_SCORED, choose_views, peak_weights, score_images, scored_views, survey_photos
+from gsmerge.fit.survey import (
+    MOST_SCORED,
+    choose_photos,
+    choose_scored_photos,
+    peak_weights,
+    score_images,
+    survey_photos,
+)
 from gsmerge.raster import composite, contributions, make_splats, tile_view
 from gsmerge.raster.photos import Photos
 
@@ -109,9 +116,9 @@ def test_many_photos_are_surveyed_by_some_that_look_everywhere(truth: Gaussians)
     places = np.zeros((500, 3), np.float32)
     places[:, 0], places[:, 2] = np.linspace(-0.4, 40, 500), 2
     points = replace(truth[np.zeros(500, int)], means=places)
-    assert choose_views(points, photos_of(np.zeros(9))) == list(range(9))
-    near = choose_views(points, photos_of(np.linspace(0, 0.001, 40)))
-    assert near == scored_views(40)
+    assert choose_photos(points, photos_of(np.zeros(9))) == list(range(9))
+    near = choose_photos(points, photos_of(np.linspace(0, 0.001, 40)))
+    assert near == choose_scored_photos(40)
     assert len(near) == MOST_SCORED
     assert np.diff(near).max() <= 8
-    assert choose_views(points, photos_of(np.arange(40.0))) == list(range(40))  # each surface is in two
+    assert choose_photos(points, photos_of(np.arange(40.0))) == list(range(40))  # each surface is in two

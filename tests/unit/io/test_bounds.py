@@ -12,17 +12,17 @@ from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import bounds
-from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, parse_json, read_lines, read_text
+from gsmerge.io.bounds import ReadBudget, check_file, check_image_size, parse_json, read_lines, read_text
 from gsmerge.io.image_names import list_images
 from gsmerge.scene.content_hash import content_hash
 
 
 def test_images_beyond_all_use_are_refused(tmp_path: Path) -> None:
-    check_pixels("a", 8192, 8192)
+    check_image_size("a", 8192, 8192)
     with refuses(SceneError, "a", "67 million", "8193 x 8192"):
-        check_pixels("a", 8193, 8192)
+        check_image_size("a", 8193, 8192)
     with refuses(SceneError, "a", "0 x 5"):
-        check_pixels("a", 0, 5)
+        check_image_size("a", 0, 5)
 
 
 def test_only_files_are_read(tmp_path: Path) -> None:

@@ -20,12 +20,12 @@ from gsmerge.measure.camera_path import (
     median_camera,
     orbit,
     outside_camera,
-    parse_path,
+    parse_camera_path,
     sample_path,
     spline,
     viewing_depth,
 )
-from gsmerge.measure.fog import outside_cameras
+from gsmerge.measure.fog import fog_cameras
 from gsmerge.types import Cameras
 
 DEPTH = 3.0
@@ -175,7 +175,7 @@ def test_a_wide_orbit_turns_that_far_and_keeps_its_distance(walk: Cameras, turn:
 
 @sweep("kind", ["orbit:30", "spline", "orbit"], often=2)
 def test_a_step_back_keeps_what_is_looked_at(kind: str, walk: Cameras) -> None:
-    path, back = (sample_path(parse_path(text), walk, DEPTH, 20) for text in (kind, f"{kind},back:0.5"))
+    path, back = (sample_path(parse_camera_path(text), walk, DEPTH, 20) for text in (kind, f"{kind},back:0.5"))
     if kind == "spline":  # even speed is another one farther away: the ends are the same cameras
         path, back = path[[0, -1]], back[[0, -1]]
     np.testing.assert_allclose(back.viewmats[:, :3, :3], path.viewmats[:, :3, :3], atol=1e-12)
@@ -196,7 +196,7 @@ def test_a_step_back_keeps_what_is_looked_at(kind: str, walk: Cameras) -> None:
     ],
 )
 def test_parse_path(text: str, path: CameraPath | None) -> None:
-    assert parse_path(text) == path
+    assert parse_camera_path(text) == path
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_parse_path(text: str, path: CameraPath | None) -> None:
 )  # fmt: skip
 def test_other_paths_are_refused(text: str, place: str, found: str) -> None:
     with refuses(ValueError, place, found):
-        parse_path(text)
+        parse_camera_path(text)
 
 
 def test_the_camera_outside_is_one_that_fog_is_measured_with(walk: Cameras) -> None:
@@ -219,7 +219,7 @@ def test_the_camera_outside_is_one_that_fog_is_measured_with(walk: Cameras) -> N
     camera, distance = outside_camera(middle, means)
     assert distance == pytest.approx(1.5 * viewing_depth(middle, means))
     given = SimpleNamespace(means=means)
-    assert any(np.array_equal(camera.viewmats, one.viewmats) for _, one, _ in outside_cameras(given, middle))
+    assert any(np.array_equal(camera.viewmats, one.viewmats) for _, one, _ in fog_cameras(given, middle))
 
 
 @sweep("kind", ["orbit:40", "spline,back:0.5", "orbit"], often=2)
@@ -227,9 +227,9 @@ def test_a_path_moves_with_its_scene(kind: str, walk: Cameras) -> None:
     means = np.random.default_rng(1).uniform(-4, 4, (500, 3))
     motion = motion_matrices(np.array([[0.3, -1.1, 0.7, 4, -2, 1]]))[0]
     moved = replace(walk, viewmats=walk.viewmats @ np.linalg.inv(motion))
-    path = sample_path(parse_path(kind), walk, viewing_depth(walk, means), 30)
+    path = sample_path(parse_camera_path(kind), walk, viewing_depth(walk, means), 30)
     depth = viewing_depth(moved, means @ motion[:3, :3].T + motion[:3, 3])
-    other = sample_path(parse_path(kind), moved, depth, 30)
+    other = sample_path(parse_camera_path(kind), moved, depth, 30)
     np.testing.assert_allclose(other.viewmats @ motion, path.viewmats, atol=1e-9)
 
 

@@ -10,22 +10,22 @@ import scenes
 from messages import says
 from tiny_scene import rotation
 
-from gsmerge.fit.outside import HIGH, LOW, PLACES
+from gsmerge.fit.outside import PLACES, STEP_BACK_HIGH, STEP_BACK_LOW
 from gsmerge.fit.outside import outside_cameras as place_views
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.kernels import elementary
 from gsmerge.measure.fog import (
     ALL,
-    CAMERAS,
+    FOG_CAMERAS,
     HAZE,
     VEILED,
     Fog,
     OutsidePicture,
-    count_pixels,
     describe_fog,
+    fog_cameras,
     mean_fog,
     measure_fog,
-    outside_cameras,
+    sum_pixels,
 )
 from gsmerge.types import Cameras, Gaussians
 
@@ -69,7 +69,7 @@ def fog_of(given: Gaussians, result: Gaussians, seen: Cameras | None = None, nea
 
 def figures(kinds: dict[str, Fog]) -> np.ndarray:
     """Near fog, far fog, holes and veils ``[3,5]``, of cameras stepped back, turned, and all."""
-    return np.array([list(vars(kinds[kind]).values()) for kind in (*CAMERAS, ALL)], float)
+    return np.array([list(vars(kinds[kind]).values()) for kind in (*FOG_CAMERAS, ALL)], float)
 
 
 def test_the_input_itself_has_no_fog() -> None:
@@ -125,7 +125,7 @@ def test_a_veil_is_what_stands_before_seven_tenths_of_a_surface() -> None:
     few = np.zeros((4, 4))
     few[0, 3] = 0.95
     counts = [
-        count_pixels(OutsidePicture(given, given, 2 * ones), OutsidePicture(seen, seen, half))
+        sum_pixels(OutsidePicture(given, given, 2 * ones), OutsidePicture(seen, seen, half))
         for given in (seen, few, np.zeros((4, 4)))
     ]
     fog = mean_fog(np.stack(counts))
@@ -134,7 +134,7 @@ def test_a_veil_is_what_stands_before_seven_tenths_of_a_surface() -> None:
 
 def pixels(given: np.ndarray, result: np.ndarray) -> np.ndarray:
     """Count the pixels of two pictures of opacities at one depth."""
-    return count_pixels(*(OutsidePicture(one, one, np.ones_like(one)) for one in (given, result)))
+    return sum_pixels(*(OutsidePicture(one, one, np.ones_like(one)) for one in (given, result)))
 
 
 def test_missing_pieces_are_holes() -> None:
@@ -146,7 +146,7 @@ def test_missing_pieces_are_holes() -> None:
 
 
 def test_nothing_empty_and_nothing_solid() -> None:
-    kinds = (*CAMERAS, ALL)
+    kinds = (*FOG_CAMERAS, ALL)
     assert fog_of(curtain(0.95), curtain(0.95)) == dict.fromkeys(kinds, Fog(None, None, 0.0, 0.0, 0.0, 0.0, 0.0))
     assert fog_of(curtain(0.5), curtain(0.2)) == dict.fromkeys(kinds, Fog(spikes=0.0, strokes=0.0))
 
@@ -155,13 +155,13 @@ def test_places_of_the_cameras() -> None:
     """Of each view two behind it, and two beside it at half the depth more from what it looks at."""
     seen = cameras(views=7)
     seen.viewmats[:, 1, 3] = -np.arange(7) / 10  # the second, fourth and sixth are taken
-    places = [(kind, *camera_centres(camera.viewmats)[0]) for kind, camera, _ in outside_cameras(curtain(1), seen[[3]])]
+    places = [(kind, *camera_centres(camera.viewmats)[0]) for kind, camera, _ in fog_cameras(curtain(1), seen[[3]])]
     y, side, back = 0.3, 3 * elementary.sin(np.radians(30)), 2 - 3 * elementary.cos(np.radians(30))
     expected = [("back", 0, y, -1), ("back", 0, y, -3), ("turned", -side, y, back), ("turned", side, y, back)]
     for (kind, *place), (expected_kind, *expected_place) in zip(places, expected, strict=True):
         assert kind == expected_kind
         assert place == pytest.approx(expected_place, abs=1e-6)
-    every = [camera_centres(camera.viewmats)[0, 1] for _, camera, _ in outside_cameras(wall(), seen)]
+    every = [camera_centres(camera.viewmats)[0, 1] for _, camera, _ in fog_cameras(wall(), seen)]
     assert every == pytest.approx(np.repeat([0.1, 0.3, 0.5], 4))
 
 
@@ -169,7 +169,7 @@ def test_places_of_the_cameras() -> None:
 def test_large_pictures_are_shrunk(size: tuple[int, int]) -> None:
     result = Gaussians.concat([wall(-1.0, 0.5), curtain(0.3)])
     large, small = cameras(*size), cameras(size[0] // 4, size[1] // 4)
-    for _, camera, _ in outside_cameras(wall(), large):
+    for _, camera, _ in fog_cameras(wall(), large):
         assert (camera.width, camera.height) == (small.width, small.height)
     assert fog_of(wall(), result, large) == fog_of(wall(), result, small)
 
@@ -217,8 +217,8 @@ def test_no_fit_looks_from_where_it_is_measured(views: int) -> None:
     """Cameras outside are a fiftieth of the depth apart, or look elsewhere by a degree."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(views, 32, 24))
     points = scene.gaussians.means
-    fitted = place_views(points, scene.cameras, max(PLACES, views), LOW, HIGH)
-    for _, camera, depth in outside_cameras(scene.gaussians, scene.cameras):
+    fitted = place_views(points, scene.cameras, max(PLACES, views), STEP_BACK_LOW, STEP_BACK_HIGH)
+    for _, camera, depth in fog_cameras(scene.gaussians, scene.cameras):
         apart = np.linalg.norm(fitted.centres - camera.centres, axis=1) / depth
         cosines = (fitted.viewmats[:, 2, :3] * camera.viewmats[0, 2, :3]).sum(1)
         assert ((apart > 0.02) | (cosines < np.cos(np.radians(1)))).all()

@@ -32,10 +32,10 @@ def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
     sheet = preview.contact_sheet(
         preview.view_pictures([("dark", blob(0.3)), ("bright", blob(0.9))], cameras(2), photos), min_width=20
     )
-    tile_height, tile_width = 12 + preview.BAND, 20
-    assert sheet.shape == (2 * tile_height + preview.GAP, 3 * tile_width + 2 * preview.GAP, 3)
-    middle = preview.BAND + 6
-    columns = [tile_width // 2 + i * (tile_width + preview.GAP) for i in range(3)]
+    tile_height, tile_width = 12 + preview.LABEL_HEIGHT, 20
+    assert sheet.shape == (2 * tile_height + preview.GAP_PIXELS, 3 * tile_width + 2 * preview.GAP_PIXELS, 3)
+    middle = preview.LABEL_HEIGHT + 6
+    columns = [tile_width // 2 + i * (tile_width + preview.GAP_PIXELS) for i in range(3)]
     photo, dark, bright = (int(sheet[middle, x, 0]) for x in columns)
     assert photo == 51
     assert dark == pytest.approx(0.95 * 0.3 * 255, abs=4)
@@ -46,7 +46,7 @@ def test_a_view_without_a_photo_has_none_and_no_score() -> None:
     photo = np.full((12, 20, 3), 0.2, np.float32)
     first, second = preview.view_pictures([("one", blob(0.3))], cameras(2), [None, photo], ["a.jpg", "b.jpg"])
     assert [text for text, _ in first] == ["a.jpg: no photo", "one: 1"]
-    assert float(first[0][1].mean()) == preview.DARK
+    assert float(first[0][1].mean()) == preview.LABEL_LEVEL
     assert [text.partition(",")[0] for text, _ in second] == ["b.jpg", "one: 1"]
     assert second[1][0].endswith("dB to the photo")
 
@@ -68,13 +68,13 @@ def test_the_row_from_outside_has_no_photo_and_no_score(photos: bool) -> None:
     row = preview.outside_pictures([("dark", blob(0.3)), ("bright", blob(0.9))], cameras(2), photos=photos)
     assert [text for text, _ in row] == ["step back: no photo"] * photos + ["dark: step back", "bright: step back"]
     *blank, dark, bright = [float(image.mean()) for _, image in row]
-    assert blank == [preview.DARK] * photos
+    assert blank == [preview.LABEL_LEVEL] * photos
     assert 0 < dark < bright < 255
 
 
 def test_small_renders_are_enlarged_by_whole_pixels() -> None:
     sheet = preview.contact_sheet(preview.view_pictures([("one", blob(0.5))], cameras(1)), min_width=50)
-    assert sheet.shape == (3 * 12 + preview.BAND, 3 * 20, 3)
+    assert sheet.shape == (3 * 12 + preview.LABEL_HEIGHT, 3 * 20, 3)
 
 
 def test_long_labels_lose_their_last_parts_and_then_their_middle() -> None:
@@ -88,9 +88,9 @@ def test_long_labels_lose_their_last_parts_and_then_their_middle() -> None:
 
 def test_labels_never_widen_a_tile() -> None:
     picture = np.zeros((4, 30, 3), np.uint8)
-    assert preview.label(picture, "a label that is far too long for it").shape == (4 + preview.BAND, 30, 3)
+    assert preview.label(picture, "a label that is far too long for it").shape == (4 + preview.LABEL_HEIGHT, 30, 3)
     wide = np.zeros((4, 1920, 3), np.uint8)
-    assert preview.label(wide, "larger on a large tile").shape == (4 + 3 * preview.BAND, 1920, 3)
+    assert preview.label(wide, "larger on a large tile").shape == (4 + 3 * preview.LABEL_HEIGHT, 1920, 3)
 
 
 def test_to_picture_clamps() -> None:

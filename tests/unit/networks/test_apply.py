@@ -11,7 +11,7 @@ from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.geometry.transforms import covariances
 from gsmerge.networks.apply import NetworkContext, decode_gaussians, encode_features, find_neighbors, run_heads
 from gsmerge.networks.corrector import ANALYTIC
-from gsmerge.networks.options import GROUP, PAPER_NUMBERS, NetworkOptions
+from gsmerge.networks.options import GROUP_COLUMNS, PAPER_NUMBERS, NetworkOptions
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.settings.stages import DecodeOptions, MatchOptions
 from gsmerge.stages.decode import decode, divide
@@ -276,7 +276,7 @@ def test_heads_of_the_paper_read_latent_mass_and_base_colour_alone(scene: Made) 
     features = context.encode(scene.features)
     described = context.describe(features)
     parents, changed = np.arange(len(features)), described.group.copy()
-    changed[:, [i for i in range(GROUP) if i not in PAPER_NUMBERS]] += 1
+    changed[:, [i for i in range(GROUP_COLUMNS) if i not in PAPER_NUMBERS]] += 1
     before, after = (
         decode_gaussians(described.base, parents, replace(described, group=group), context)
         for group in (described.group, changed)

@@ -12,12 +12,12 @@ from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.geometry.transforms import covariances, quat_to_rotmat
 from gsmerge.kernels import elementary
 from gsmerge.networks.corrections import (
-    COLOR,
-    LOGIT,
-    MASS,
-    MEAN,
-    ROTATION,
-    SIZE,
+    COLOR_COLUMNS,
+    LOGIT_COLUMN,
+    MASS_COLUMN,
+    MEAN_COLUMNS,
+    ROTATION_COLUMNS,
+    SIZE_COLUMNS,
     move_features,
     move_gaussians,
     residual_limits,
@@ -79,7 +79,7 @@ def test_any_number_of_rows_at_once_gives_the_same_bits(rows: int, monkeypatch: 
         return [move_features(features, base, noise(), frames()), move(base, noise(), own, frames())]
 
     whole = moved()
-    monkeypatch.setattr("gsmerge.networks.corrections.ROWS", rows)
+    monkeypatch.setattr("gsmerge.networks.corrections.CORRECTION_ROWS", rows)
     for one, other in zip(whole, moved(), strict=True):
         for f in fields(one):
             assert np.array_equal(getattr(one, f.name), getattr(other, f.name)), f.name
@@ -90,15 +90,15 @@ def test_any_number_of_rows_at_once_gives_the_same_bits(rows: int, monkeypatch: 
 
 def test_gaussians_move_as_told() -> None:
     base, residuals = base_of(some()), zeros()
-    residuals[:, MEAN], residuals[:, SIZE] = [1.0, 0, 0], [0.1, 0.2, -0.3]
-    residuals[:, LOGIT], residuals[:, COLOR] = 0.7, [0.1, -0.1, 0.2]
+    residuals[:, MEAN_COLUMNS], residuals[:, SIZE_COLUMNS] = [1.0, 0, 0], [0.1, 0.2, -0.3]
+    residuals[:, LOGIT_COLUMN], residuals[:, COLOR_COLUMNS] = 0.7, [0.1, -0.1, 0.2]
     moved = move(base, residuals, EACH, frames())
     sizes = np.sqrt(np.sort(base.scales, 1)[:, 1:].prod(1))
     np.testing.assert_allclose(moved.means, base.means + frames()[:, :, 0] * sizes[:, None], atol=1e-6)
-    np.testing.assert_allclose(np.log(moved.scales) - np.log(base.scales), residuals[:, SIZE], atol=1e-5)
+    np.testing.assert_allclose(np.log(moved.scales) - np.log(base.scales), residuals[:, SIZE_COLUMNS], atol=1e-5)
     logits = [elementary.log(g.opacities / (1 - g.opacities)) for g in (base, moved)]
-    np.testing.assert_allclose(logits[1] - logits[0], residuals[:, LOGIT], atol=1e-5)
-    np.testing.assert_allclose(SH_C0 * (moved.sh0 - base.sh0)[:, 0], residuals[:, COLOR], atol=1e-6)
+    np.testing.assert_allclose(logits[1] - logits[0], residuals[:, LOGIT_COLUMN], atol=1e-5)
+    np.testing.assert_allclose(SH_C0 * (moved.sh0 - base.sh0)[:, 0], residuals[:, COLOR_COLUMNS], atol=1e-6)
 
 
 def test_tensors_move_in_the_same_way(torch: Any) -> None:
@@ -118,7 +118,7 @@ def test_opacities_at_the_ends_stay_within_them(opacity: float) -> None:
     base = replace(base_of(some()), opacities=np.full(20, opacity, np.float32))
     for logit in (-3.0, 3.0):
         residuals = zeros()
-        residuals[:, LOGIT] = logit
+        residuals[:, LOGIT_COLUMN] = logit
         moved = move(base, residuals, EACH, frames()).opacities
         assert ((moved >= 0) & (moved <= 1)).all()
 
@@ -128,12 +128,12 @@ def test_rotations_agree_with_each_other(torch: Any) -> None:
     from gsmerge.networks import tensors
 
     features, residuals = some(), zeros()
-    residuals[:, ROTATION] = 3 * np.random.default_rng(3).normal(size=(20, 3))
+    residuals[:, ROTATION_COLUMNS] = 3 * np.random.default_rng(3).normal(size=(20, 3))
     base = base_of(features)
     turned, one = move_features(features, base, residuals, frames()), move(base, residuals, EACH, frames())
     np.testing.assert_allclose(turned.covars, covariances(one.quats, one.scales), atol=1e-4, rtol=1e-4)
     quarter = zeros()
-    quarter[:, ROTATION] = [0, 0, np.pi / 2]
+    quarter[:, ROTATION_COLUMNS] = [0, 0, np.pi / 2]
     same = np.tile(np.eye(3, dtype=np.float32), (20, 1, 1))
     round_ones = replace(base, quats=np.tile(np.float32([1, 0, 0, 0]), (20, 1)))
     quats = move(round_ones, quarter, EACH, same).quats
@@ -147,8 +147,8 @@ def test_feature_gaussians_move_like_gaussians() -> None:
     """Means, covariances and colours alike; opacity stays with scales and follows its own column."""
     features = some()
     base, residuals = base_of(features), noise()
-    residuals[:, LOGIT] = 0
-    residuals[:, SIZE] = np.sort(residuals[:, SIZE], 1) * 0.1  # scales still rise
+    residuals[:, LOGIT_COLUMN] = 0
+    residuals[:, SIZE_COLUMNS] = np.sort(residuals[:, SIZE_COLUMNS], 1) * 0.1  # scales still rise
     moved = move_features(features, base, residuals, frames())
     one = move(base, residuals, EACH, frames())
     np.testing.assert_allclose(moved.means, one.means, atol=1e-5, rtol=1e-5)
@@ -156,10 +156,10 @@ def test_feature_gaussians_move_like_gaussians() -> None:
     decoded = base_of(moved)
     np.testing.assert_allclose(decoded.opacities, base.opacities, atol=1e-4)
     residuals = zeros()
-    residuals[:, LOGIT] = elementary.log(2)
+    residuals[:, LOGIT_COLUMN] = elementary.log(2)
     doubled = base_of(move_features(features, base, residuals, frames()))
     np.testing.assert_allclose(doubled.opacities, 1 - (1 - base.opacities) ** 2, atol=1e-4)
-    residuals[:, MASS] = elementary.log(3)
+    residuals[:, MASS_COLUMN] = elementary.log(3)
     heavier = move_features(features, base, residuals, frames())
     np.testing.assert_allclose(heavier.masses, 6 * features.masses, rtol=1e-5)
 

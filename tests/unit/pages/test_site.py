@@ -18,7 +18,7 @@ from page_policy import check_policy
 from gsmerge.cli.paths import output_file
 from gsmerge.io import read_gaussians
 from gsmerge.io.first_bytes import may_be_replaced
-from gsmerge.pages.site import MAX_VIEWS, NAMES, make_page
+from gsmerge.pages.site import MAX_VIEWPOINTS, NAMES, make_page
 from gsmerge.types import Cameras
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
@@ -74,7 +74,7 @@ def test_of_many_views_the_page_knows_some_and_the_middle_one() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3))
     many = scene.cameras[np.repeat(np.arange(3), 50)]
     data = data_of(make_page(scene.gaussians, many, "a", ()))
-    assert len(data["views"]) in (MAX_VIEWS, MAX_VIEWS + 1)
+    assert len(data["views"]) in (MAX_VIEWPOINTS, MAX_VIEWPOINTS + 1)
     assert data["free"] is False
     np.testing.assert_allclose(data["views"][data["start"]]["viewmat"], scene.cameras.viewmats[1].reshape(-1))
 

@@ -23,7 +23,7 @@ from gsmerge.measure.evaluate import EvaluateOptions, near_plane
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages import data, splats
-from gsmerge.pages.data import ViewData, collect, encode_still, short_names
+from gsmerge.pages.data import ViewData, collect_page_data, encode_still, short_names
 from gsmerge.pages.page import headline
 from gsmerge.pages.splats import pack_splats
 from gsmerge.photos.row_colors import ROW_COLORS
@@ -54,13 +54,13 @@ def held_out() -> Views:
 
 @pytest.fixture(scope="module")
 def actual(scene: Scene, half: Gaussians, held_out: Views) -> ViewData:
-    return collect("room", scene, {"half": half, "all": scene.gaussians}, (300, 200, 100), held_out)
+    return collect_page_data("room", scene, {"half": half, "all": scene.gaussians}, (300, 200, 100), held_out)
 
 
 def test_a_result_that_is_worse_has_no_expected_gain(small: Scene) -> None:
     """It may be of another scene; held-out photos say it themselves."""
     results = {"other": small.gaussians[:10], "same": small.gaussians}
-    made = collect("room", small, results, (300, 10, 300), new_gains=dict.fromkeys(results, (6.5, 9.0)))
+    made = collect_page_data("room", small, results, (300, 10, 300), new_gains=dict.fromkeys(results, (6.5, 9.0)))
     assert [side.new_gain for side in made.sides] == [None, None, (6.5, 9.0)]
     assert noted(made.notes, "other", "worse than room")
     assert "expected" not in headline(made)
@@ -117,13 +117,13 @@ def test_a_page_opens_on_the_middle_view(actual: ViewData) -> None:
 
 
 def test_one_scene_alone(small: Scene) -> None:
-    alone = collect("room", small, {}, (300,))
+    alone = collect_page_data("room", small, {}, (300,))
     assert [side.name for side in alone.sides] == ["input"]
     assert alone.notes == ()
     values = [view.scores[0].psnr or 0 for view in alone.views]
     assert values == sorted(values)
     assert alone.scored
-    assert not collect("room", replace(small, images=None, pixels=None), {}, (300,)).scored
+    assert not collect_page_data("room", replace(small, images=None, pixels=None), {}, (300,)).scored
 
 
 def test_the_worst_view_comes_first(actual: ViewData) -> None:
@@ -196,7 +196,7 @@ def test_many_gaussians_are_less_exact(half: Gaussians, monkeypatch: pytest.Monk
 
 
 def test_a_light_page_has_no_gaussians_of_the_scene(small: Scene) -> None:
-    light = collect("room", small, {"half": small.gaussians[::2]}, (2, 1), light=True)
+    light = collect_page_data("room", small, {"half": small.gaussians[::2]}, (2, 1), light=True)
     assert [side.splats is None for side in light.sides] == [True, False]
     assert not any("stills only" in note or "harmonics" in note for note in light.notes)
 
@@ -205,7 +205,7 @@ def test_too_many_gaussians_are_left_out(small: Scene, monkeypatch: pytest.Monke
     half = small.gaussians[::2]
     monkeypatch.setattr(data, "MAX_GAUSSIANS", len(half) + 1)
     monkeypatch.setattr(splats, "MAX_GAUSSIANS", len(half) + 1)
-    actual = collect("room", small, {"half": half}, (2, 1))
+    actual = collect_page_data("room", small, {"half": half}, (2, 1))
     assert actual.sides[0].splats is None
     assert actual.sides[1].splats is not None
     assert noted(actual.notes, "stills")
@@ -226,7 +226,7 @@ def test_harmonics_of_zeros_are_left_out(small: Scene) -> None:
     flat[:, :3] = 0.1
     assert pack_splats(replace(half, shN=flat))[1] == 1
     assert pack_splats(replace(half, shN=0 * flat)) == pack_splats(half)
-    actual = collect("room", small, {"half": replace(half, shN=flat)}, (2, 1))
+    actual = collect_page_data("room", small, {"half": replace(half, shN=flat)}, (2, 1))
     assert not any("harmonics" in note for note in actual.notes)
 
 
@@ -247,8 +247,8 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
 
 
 def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(data, "MAX_VIEWS", 1)
-    actual = collect("room", small, {"half": small.gaussians[::2]}, (2, 1))
+    monkeypatch.setattr(data, "MAX_SHOWN_VIEWS", 1)
+    actual = collect_page_data("room", small, {"half": small.gaussians[::2]}, (2, 1))
     everything = evaluate(small, {"half": small.gaussians[::2]}, None, EvaluateOptions(lpips=())).results[1].scores
     assert 1 <= len(actual.views) <= 2
     assert actual.views[0].scores[1].psnr == min(score.masked.psnr or 0 for score in everything)
@@ -257,10 +257,10 @@ def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -
 
 def test_without_photos_results_are_compared_with_the_input(small: Scene) -> None:
     bare = replace(small, images=None)
-    actual = collect("room", replace(bare, pixels=None), {"half": small.gaussians[::2]}, (2, 1))
+    actual = collect_page_data("room", replace(bare, pixels=None), {"half": small.gaussians[::2]}, (2, 1))
     assert [view.photo for view in actual.views] == [None] * 3
     assert actual.reference == "renders of the input"
-    colored = collect("room", bare, {"half": small.gaussians[::2]}, (2, 1))
+    colored = collect_page_data("room", bare, {"half": small.gaussians[::2]}, (2, 1))
     assert all(view.photo is not None for view in colored.views)
     assert colored.reference == ROW_COLORS
 
@@ -287,7 +287,8 @@ def test_a_still_keeps_red_red() -> None:
 def test_stills_of_a_result_are_from_its_own_cameras(small: Scene) -> None:
     own = replace(small.cameras, viewmats=motions.random_motions(len(small), 2.0, 0.1) @ small.cameras.viewmats)
     given, moved = (
-        collect("room", small, {"half": small.gaussians[::2]}, (2, 1), cameras=one) for one in (None, {"half": own})
+        collect_page_data("room", small, {"half": small.gaussians[::2]}, (2, 1), cameras=one)
+        for one in (None, {"half": own})
     )
     for before, after in zip(*(sorted(one.views, key=attrgetter("place")) for one in (given, moved)), strict=True):
         assert before.stills[0] == after.stills[0]

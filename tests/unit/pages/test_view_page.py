@@ -15,7 +15,7 @@ import scenes
 from page_policy import check_policy
 
 from gsmerge.measure.evaluate import Quality
-from gsmerge.pages.data import ViewData, collect
+from gsmerge.pages.data import ViewData, collect_page_data
 from gsmerge.pages.page import headline, results_table, speed, speed_words, view_page
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
@@ -26,7 +26,7 @@ NAMES = ("images/<i>0</i>.png", "images/1.png", EVIL)
 @pytest.fixture(scope="module")
 def data() -> ViewData:
     scene = replace(scenes.make_scene(scenes.room(), scenes.arc(3)), names=NAMES)
-    return collect(EVIL, scene, {EVIL: scene.gaussians[::2]}, (2_000_000, 1000))
+    return collect_page_data(EVIL, scene, {EVIL: scene.gaussians[::2]}, (2_000_000, 1000))
 
 
 def page_of(data: ViewData) -> str:
@@ -229,7 +229,7 @@ def test_without_photos(data: ViewData) -> None:
 @pytest.fixture(scope="module")
 def alone() -> ViewData:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
-    return collect("room", scene, {}, (2_000_000,))
+    return collect_page_data("room", scene, {}, (2_000_000,))
 
 
 def test_one_scene_is_compared_with_its_photos(alone: ViewData) -> None:

@@ -10,7 +10,7 @@ from panoramas import cut_views, show, shrunk, take_photos
 
 from gsmerge.kernels.pictures import turn_back
 from gsmerge.photos.assign import FIRST_PHOTOS, Assigner, Assignment, Candidates, assign_photos
-from gsmerge.photos.offsets import SIDE, find_offsets
+from gsmerge.photos.offsets import OFFSET_PIXELS, find_offsets
 
 VIEWS = 6
 Named = Sequence[int | None]
@@ -95,7 +95,7 @@ def test_some_frames_of_a_film(views: np.ndarray, photos: list[np.ndarray]) -> N
 
 
 def test_parts_tell_a_neighbour_s_photo(views: np.ndarray, photos: list[np.ndarray]) -> None:
-    shown = show(views, SIDE)
+    shown = show(views, OFFSET_PIXELS)
     own = find_offsets(shown, 2, photos[2])
     assert own is not None
     assert own.verdict is True

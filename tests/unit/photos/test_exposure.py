@@ -13,9 +13,9 @@ from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.transforms import camera_distances
 from gsmerge.kernels import elementary
 from gsmerge.photos.exposure import (
-    FARTHER,
+    FARTHER_VIEWS,
     FOLLOWS,
-    NEAREST,
+    NEAREST_VIEWS,
     UNEXPECTED,
     _divide,
     _measure_pairs,
@@ -54,16 +54,16 @@ def test_size_of_gains() -> None:
 
 
 def test_few_views_are_compared_with_all_others_and_many_with_some() -> None:
-    few, many = choose_partners(row(NEAREST + FARTHER + 1)), choose_partners(row(200))
+    few, many = choose_partners(row(NEAREST_VIEWS + FARTHER_VIEWS + 1)), choose_partners(row(200))
     assert all(sorted({*others, view}) == list(range(len(few))) for view, others in enumerate(few.tolist()))
-    assert many.shape == (200, NEAREST + FARTHER)
-    assert set(range(100 - NEAREST // 2, 101 + NEAREST // 2)) - {100} <= set(many[100])
+    assert many.shape == (200, NEAREST_VIEWS + FARTHER_VIEWS)
+    assert set(range(100 - NEAREST_VIEWS // 2, 101 + NEAREST_VIEWS // 2)) - {100} <= set(many[100])
     assert many[100].min() == 0  # some are far away
     assert (np.diff(many) > 0).all()
 
 
 def test_gains_of_many_views_follow_from_some_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("NEAREST", "FARTHER"):
+    for name in ("NEAREST_VIEWS", "FARTHER_VIEWS"):
         monkeypatch.setattr(f"gsmerge.photos.exposure.{name}", 4)
     count = 16
     scene, _ = canonicalise(scenes.make_scene(scenes.room(), scenes.arc(count, 24, 16)))

@@ -9,8 +9,8 @@ from panoramas import cut_views, show, take_photos
 from gsmerge.kernels.pictures import ORIENTATIONS, turn_back, turn_picture
 from gsmerge.photos.pictures import ViewPictures, average, fit_size
 from gsmerge.photos.scores import (
-    MARGIN,
-    SIZES,
+    NOISE_MARGIN,
+    SCORE_PIXELS,
     Comparer,
     find_contrast,
     fisher_z,
@@ -23,8 +23,8 @@ from gsmerge.raster.photos import shrink_pictures
 
 def correlate_slowly(shown: ViewPictures, view: int, upright: np.ndarray) -> float:
     """Weighted correlation of local contrasts, the mean of all sizes, pixel by pixel."""
-    out, most = [], fit_size(upright.shape[1::-1], SIZES[-1])
-    for side in SIZES:
+    out, most = [], fit_size(upright.shape[1::-1], SCORE_PIXELS[-1])
+    for side in SCORE_PIXELS:
         small = shown.shrink(side)
         picture, weight = small.pictures[view], small.weights[view]
         height, width = weight.shape
@@ -100,7 +100,7 @@ def test_signed_ranks_are_wilcoxon_s(shift: float) -> None:
     gains = np.random.default_rng(1).standard_normal(200) + shift
     expected = wilcoxon(gains, method="asymptotic", alternative="greater").zstatistic
     assert signed_ranks(gains) == pytest.approx(expected, abs=1e-9)
-    assert stands_out(gains) == (expected > MARGIN)
+    assert stands_out(gains) == (expected > NOISE_MARGIN)
     assert signed_ranks(np.concatenate([gains, [np.nan, 0.0]])) == signed_ranks(gains)
     assert signed_ranks(np.array([np.nan, 0.0])) == 0
 

@@ -12,7 +12,7 @@ from messages import noted
 
 from gsmerge import Scene
 from gsmerge.geometry.transforms import rgb_to_sh0
-from gsmerge.photos.row_colors import FAINT, add_row_colors
+from gsmerge.photos.row_colors import FAINT_OPACITY, add_row_colors
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import record_run
 from gsmerge.types import Gaussians, Pixels
@@ -92,7 +92,7 @@ def test_faint_rows_show_what_is_drawn_there(scene: Scene) -> None:
     """Large neighbours behind them are what a photo would show."""
     inside = square(scene)
     green = rgb_to_sh0(np.array([0.0, 1.0, 0.0])).astype(np.float32)
-    faint = changed(scene, inside, sh0=green, opacities=FAINT / 2)
+    faint = changed(scene, inside, sh0=green, opacities=FAINT_OPACITY / 2)
     wide = changed(faint, ~inside, scales=scene.gaussians.scales.max() * 8)
     pictures, masks, notes = pictures_of(wide)
     assert masks.all()
@@ -103,7 +103,7 @@ def test_faint_rows_show_what_is_drawn_there(scene: Scene) -> None:
 def test_faint_rows_with_nothing_behind_them_keep_their_colours(scene: Scene) -> None:
     """A drawing would be black, or what little of the neighbours reaches there."""
     inside = square(scene)
-    pictures, masks, _ = pictures_of(changed(scene, inside, opacities=FAINT / 2))
+    pictures, masks, _ = pictures_of(changed(scene, inside, opacities=FAINT_OPACITY / 2))
     np.testing.assert_allclose(pictures[INNER], scene_pictures(scene)[INNER], atol=1e-6)
     assert masks[INNER].all()
 

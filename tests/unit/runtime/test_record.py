@@ -10,7 +10,7 @@ from gsmerge.runtime.record import (
     BEFORE_FIT,
     STAGES,
     Forecast,
-    Part,
+    RunPart,
     adopt,
     choose,
     current_record,
@@ -52,6 +52,17 @@ def test_a_stage_inside_another_is_part_of_it() -> None:
     with record_run() as record, stage("prepare"), stage("segment"):
         pass
     assert list(record.seconds) == ["prepare"]
+
+
+def test_a_new_stage_needs_no_list() -> None:
+    events: list[tuple[str, int, int]] = []
+    with record_run(lambda *event: events.append(event)) as record:
+        with stage("prepare"):
+            pass
+        with stage("a new one"):
+            pass
+    assert list(record.seconds) == ["prepare", "a new one"]
+    assert events[1] == ("a new one", 1, len(STAGES))
 
 
 def test_a_stage_that_fails_ends() -> None:
@@ -100,7 +111,7 @@ def test_parts_and_steps_of_their_fits_say_what_share_is_done() -> None:
     """Also with two fits in a part, and after fewer or more parts than were expected."""
     forecast, shares = Forecast(), []
     assert forecast.share is None
-    forecast.expect([Part(20, 80, num_fits=2), Part(10, 90), Part(100), Part(100)])
+    forecast.expect([RunPart(20, 80, num_fits=2), RunPart(10, 90), RunPart(100), RunPart(100)])
     for _ in range(2):
         forecast.begin()
         for step in (1, 50, 100, 1, 100)[: 5 if not shares else 3]:
@@ -110,7 +121,7 @@ def test_parts_and_steps_of_their_fits_say_what_share_is_done() -> None:
     done = [before + 0.4, before + 20, before + 40, before + 40.4, before + 80]
     done += [100 + 10 * BEFORE_FIT + share * 90 for share in (0.01, 0.5, 1.0)]
     assert shares == pytest.approx([seconds / 400 for seconds in done])
-    forecast.expect([Part(50)])  # the search has ended before it was expected to
+    forecast.expect([RunPart(50)])  # the search has ended before it was expected to
     forecast.begin()
     assert forecast.share == pytest.approx(200 / 250)
     forecast.begin()

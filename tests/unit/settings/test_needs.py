@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from gsmerge import CompactOptions
-from gsmerge.settings.compact import PIECE, TRIAL
+from gsmerge.settings.compact import ONE_PIECE, TRIAL
 
 
 def test_values_for_parts_of_a_scene_are_possible() -> None:
-    for values in (PIECE, TRIAL):
+    for values in (ONE_PIECE, TRIAL):
         assert CompactOptions().with_settings(values).to_dict().items() >= values.items()
 
 

@@ -11,7 +11,7 @@ from motions import with_nearer_half
 import gsmerge
 from gsmerge import Scene
 from gsmerge.compaction.make_plan import make_plan
-from gsmerge.facts.confirm_depths import FEWEST, MOST, confirm_depths
+from gsmerge.facts.confirm_depths import FEWEST, MOST_PER_PIXEL, confirm_depths
 from gsmerge.facts.prepare import prepare
 from gsmerge.geometry.pooling import scene_members
 from gsmerge.runtime.record import record_run
@@ -53,8 +53,8 @@ def test_views_that_agree_get_more_superpixels(wall: Scene) -> None:
         assert shares[-1] == pytest.approx(agreement.share, rel=0.05)
         assert len(log.notes) == 1
         assert f"other views confirm {100 * agreement.confirmed:.0f} %" in log.notes[0]
-    assert shares[0] == shares[1] == MOST  # an eighth of the pixels is contradicted, then a quarter
-    assert FEWEST <= shares[2] < MOST
+    assert shares[0] == shares[1] == MOST_PER_PIXEL  # an eighth of the pixels is contradicted, then a quarter
+    assert FEWEST <= shares[2] < MOST_PER_PIXEL
 
 
 @pytest.mark.slow

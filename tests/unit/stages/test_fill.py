@@ -9,7 +9,7 @@ import pytest
 
 from gsmerge.geometry.transforms import is_inside, project, rgb_to_sh0
 from gsmerge.raster import render
-from gsmerge.stages.fill import MOST_VIEWS, fill_between, lies_between
+from gsmerge.stages.fill import MOST_FILLED_VIEWS, fill_between, lies_between
 from gsmerge.types import Cameras, Gaussians
 
 
@@ -110,6 +110,6 @@ def test_what_each_view_shows_as_empty_stays_empty() -> None:
     assert len(fill(sheet(-0.4, 0.4, 3, 0.8), slit(-0.6, 0.0, 0.6)[1])) == 0
 
 
-@pytest.mark.parametrize("count", [1, MOST_VIEWS + 1])
+@pytest.mark.parametrize("count", [1, MOST_FILLED_VIEWS + 1])
 def test_one_view_and_very_many_are_not_filled(count: int) -> None:
     assert len(fill(*slit(*np.linspace(-0.6, 0.6, count)))) == 0

@@ -11,7 +11,7 @@ import scenes
 from gsmerge import Gaussians, Scene
 from gsmerge.raster import contributions, make_splats, render, tile_view
 from gsmerge.raster.photos import blank_photos
-from gsmerge.stages.prune import LEVELS, ROUNDING, split_unseen
+from gsmerge.stages.prune import COMPARED_LEVELS, ROUNDING, split_unseen
 
 Made = tuple[Scene, Gaussians]
 
@@ -22,7 +22,7 @@ def made() -> Made:
 
 
 def peaks_of(gaussians: Gaussians, scene: Scene) -> np.ndarray:
-    photos, splats = blank_photos(scene.cameras, LEVELS[0]), make_splats(gaussians)
+    photos, splats = blank_photos(scene.cameras, COMPARED_LEVELS[0]), make_splats(gaussians)
     views = [tile_view(splats, **photos.camera(view)) for view in range(len(scene))]
     return np.max([contributions(view)[1] for view in views], axis=0)
 

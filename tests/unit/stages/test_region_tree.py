@@ -198,7 +198,7 @@ def test_knee_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
 def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """D = 0.1 / N without a floor: 10 / ln 10 = 4.3 dB per relative increase everywhere; with one it falls."""
     counts = np.arange(1, 2000)
-    monkeypatch.setattr(module, "KNEE_SLOPE", 2.0)
+    monkeypatch.setattr(module, "REGION_KNEE_SLOPE", 2.0)
     for floor in (1e-3, 1e-4):
         monkeypatch.setattr(module, "KNEE_FLOOR", floor)
         actual = knee(counts, 0.1 / counts)

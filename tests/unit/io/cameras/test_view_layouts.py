@@ -20,7 +20,7 @@ from gsmerge.io.cameras.camera_source import CameraSource
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras
 from gsmerge.io.cameras.read_views import read_views
 from gsmerge.io.cameras.table import CAMERA_FORMATS
-from gsmerge.io.cameras.view_layout import Pinhole, RotationAndShift, ViewLayout
+from gsmerge.io.cameras.view_layout import PinholeKeys, RotationAndShift, ViewLayout
 from gsmerge.kernels.elementary import arctan2
 
 Change = Callable[[Any], object]
@@ -56,7 +56,7 @@ def test_a_new_layout_needs_no_function(tmp_path: Path) -> None:
         views="cams",
         name=("file", "id"),
         pose=RotationAndShift("q", "t", quat_to_rotmat),
-        K=Pinhole(("focal", "f"), "ratio", "px", "py"),
+        K=PinholeKeys(("focal", "f"), "ratio", "px", "py"),
         size=("W", "H"),
         optional=("ratio",),
     )

@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import normalize
 from gsmerge.io import write_gaussians, write_ply
 from gsmerge.io.bounds import ReadBudget
-from gsmerge.io.formats.arrays import check_count
+from gsmerge.io.formats.arrays import check_gaussian_count
 from gsmerge.io.formats.sog import PACKED_BYTES
 from gsmerge.kernels import elementary
 from gsmerge.types import Gaussians
@@ -68,9 +68,9 @@ def test_memory_is_within_the_budget(ending: str, tmp_path: Path) -> None:
 def test_files_of_real_density_are_read(each: int, num_higher: int) -> None:
     """Bytes per Gaussian of the smallest .sog and .spz of real scenes, at any size; a twentieth of them are none."""
     for count in (100_000, 1_000_000, 4_000_000, 20_000_000):
-        check_count(ReadBudget("a.sog", each * count), count, num_higher, PACKED_BYTES)
+        check_gaussian_count(ReadBudget("a.sog", each * count), count, num_higher, PACKED_BYTES)
         with refuses(SceneError, "a.sog", f"{20 * count:,}"):
-            check_count(ReadBudget("a.sog", each * count), 20 * count, num_higher, PACKED_BYTES)
+            check_gaussian_count(ReadBudget("a.sog", each * count), 20 * count, num_higher, PACKED_BYTES)
 
 
 @pytest.mark.slow

@@ -23,14 +23,14 @@ def test_what_the_program_converts_is_refused_with_its_command(name: str, tmp_pa
     path.write_bytes(b"\0any")
     quoted = f"'{path}'" if " " in name else path
     for read, place in ((lambda: read_gaussians(path), name), (lambda: find_scene_files(tmp_path), tmp_path)):
-        with refuses(SceneError, place, f"npx {splat_transform.PACKAGE} {quoted} -L 0 scene.ply"):
+        with refuses(SceneError, place, f"npx {splat_transform.CONVERTER_PACKAGE} {quoted} -L 0 scene.ply"):
             read()
 
 
 def test_without_the_program_nothing_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv(VARIABLE, raising=False)
-    with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.PACKAGE}"):
+    with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.CONVERTER_PACKAGE}"):
         splat_transform.run_program("a.ply", "b.ply")
     assert list(tmp_path.iterdir()) == []
 

@@ -22,7 +22,7 @@ from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import glb_bytes
 from gsmerge.io.formats.read import file_notes
 from gsmerge.io.formats.splat import splat_bytes
-from gsmerge.io.formats.spz import AXES, encode_contents, gzip_bytes, spz_bytes
+from gsmerge.io.formats.spz import AXIS_SYSTEMS, encode_contents, gzip_bytes, spz_bytes
 from gsmerge.io.formats.table import Contents
 from gsmerge.settings.files import FileOptions
 
@@ -117,7 +117,7 @@ def test_extensions_that_change_nothing(tmp_path: Path, write: Callable[[Gaussia
         np.testing.assert_array_equal(getattr(extended.gaussians, name), array)
 
 
-@pytest.mark.parametrize(("number", "axes"), list(enumerate(AXES, 1)))
+@pytest.mark.parametrize(("number", "axes"), list(enumerate(AXIS_SYSTEMS, 1)))
 @pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
 def test_axes_are_turned_to_those_of_a_ply(
     tmp_path: Path, write: Callable[[Gaussians], bytes], number: int, axes: str

@@ -156,9 +156,9 @@ def test_an_index_names_no_chunk_of_another(
 
 def test_without_the_program_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, str(tmp_path / "none"))
-    with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.PACKAGE}"):
+    with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.CONVERTER_PACKAGE}"):
         output_format("lod-meta.json", levels=True)
-    with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.PACKAGE}"):
+    with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.CONVERTER_PACKAGE}"):
         write_levels(tmp_path / "scene" / "lod-meta.json", [corners()])
     assert list(tmp_path.iterdir()) == []
 

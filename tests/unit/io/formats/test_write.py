@@ -23,6 +23,7 @@ from gsmerge.geometry.transforms import normalize
 from gsmerge.io import OUTPUT_FORMATS, limit_notes, output_format, read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.kernels import elementary
+from gsmerge.settings.setting import join_words
 from gsmerge.types import Gaussians
 
 QUANTISED = (".spz", ".sog", ".splat")
@@ -133,7 +134,7 @@ def test_names_ask_for_formats() -> None:
     for name, ending in (("a.ply", ".ply"), ("A.SPZ", ".spz"), ("x/b.splat", ".splat")):
         assert output_format(name).ending == ending
     for name in ("a", "a.ksplat", "ply", "a.ply.gz", "spz/a"):
-        with refuses(UsageError, name, ".ply, .spz, .sog, .splat or .glb"):
+        with refuses(UsageError, name, join_words(OUTPUT_FORMATS)):
             output_format(name)
 
 

@@ -49,7 +49,7 @@ def slow_greedy(gaussians: Gaussians, count: int) -> list[Blob]:
         pairs = set()
         for i, blob in enumerate(blobs):
             far = [float(np.linalg.norm(blob.mean - other.mean)) for other in blobs]
-            nearest = [j for j in np.argsort(far, kind="stable") if j != i][: greedy.NEIGHBORS]
+            nearest = [j for j in np.argsort(far, kind="stable") if j != i][: greedy.GREEDY_NEIGHBORS]
             pairs |= {(min(i, int(j)), max(i, int(j))) for j in nearest}
         limit = len(blobs) - count
         chosen: list[tuple[int, int]] = []
@@ -65,7 +65,7 @@ def slow_greedy(gaussians: Gaussians, count: int) -> list[Blob]:
 @pytest.mark.parametrize("degree", [0, 1])
 def test_the_same_as_the_slow_twin(count: int, degree: int) -> None:
     gaussians = some(60, seed=count, degree=degree)
-    merged, slow = greedy.merge(gaussians, count), slow_greedy(gaussians, count)
+    merged, slow = greedy.merge_greedily(gaussians, count), slow_greedy(gaussians, count)
     means = np.stack([blob.mean for blob in slow])
     places = np.linalg.norm(merged.means[:, None] - means, axis=2).argmin(1)
     assert sorted(places) == list(range(count))
@@ -111,7 +111,7 @@ def test_hostile_sets(count: int) -> None:
         np.zeros((60, 3), np.float32), gaussians.quats, gaussians.scales * np.array([1, 1, 0], np.float32),
         np.zeros(60, np.float32), gaussians.sh0, gaussians.shN,
     )  # fmt: skip
-    merged = greedy.merge(stacked, count)
+    merged = greedy.merge_greedily(stacked, count)
     assert len(merged) == count
     for name in scenes.FIELDS:
         assert np.isfinite(getattr(merged, name)).all(), name

@@ -12,8 +12,8 @@ import matplotlib
 import pytest
 from experiments import make_grid, make_record
 
-from gsmerge.research.charts.chart_page import make_page, make_table
-from gsmerge.research.charts.figures import RC, Figure, Panel, draw_curves, draw_figures, line_styles, make_figures
+from gsmerge.research.charts.chart_page import make_chart_page, make_table
+from gsmerge.research.charts.figures import RC, Chart, Panel, draw_curves, draw_figures, line_styles, make_figures
 from gsmerge.research.charts.lines import Interval, Line, Point, Results
 from gsmerge.research.charts.measure_run import RunRecord
 
@@ -42,7 +42,7 @@ class Outline(HTMLParser):
 
 def page_of(records: list[RunRecord], folder: Path) -> str:
     figures = make_figures(Results(records))[-1:]
-    return make_page(records, figures, draw_figures(figures, folder / "charts"), "gsmerge lab chart")
+    return make_chart_page(records, figures, draw_figures(figures, folder / "charts"), "gsmerge lab chart")
 
 
 def test_the_page_stands_alone_and_says_what_was_found(tmp_path: Path) -> None:
@@ -88,11 +88,11 @@ def test_figures_need_their_data() -> None:
     assert alone[0].rows[0][-2:] == ("", "")
 
 
-def figure_of(count: int, name: str = "method") -> Figure:
+def figure_of(count: int, name: str = "method") -> Chart:
     """One panel with so many lines of a point each, and the input."""
     points = [Point("1%", 0.1 * (i + 1), Interval(20 + i, 19 + i, 21 + i, 4), {}) for i in range(count)]
     lines = tuple(Line(f"{name} {i}", i == 0, (point,)) for i, point in enumerate(points))
-    return Figure("quality", "", "", "Seconds", (), (), (Panel("PSNR", True, lines, 22.0),))
+    return Chart("quality", "", "", "Seconds", (), (), (Panel("PSNR", True, lines, 22.0),))
 
 
 @pytest.mark.parametrize("count", [1, 25])

@@ -19,7 +19,7 @@ from gsmerge.research.generate.photograph import (
     screen_boxes,
     trace,
 )
-from gsmerge.research.generate.shapes import LYING, Material, Shape, blob, box, pack, place, quad
+from gsmerge.research.generate.shapes import LYING, Material, Shape, blob, box, pack_shapes, place_shapes, quad
 from gsmerge.research.generate.synthetic_scene import draw_path, is_usable, look_at
 from gsmerge.research.generate.textures import KINDS, Palette
 
@@ -38,8 +38,8 @@ def test_no_rectangle_cuts_off_what_is_seen() -> None:
     rng = np.random.default_rng(2)
     shapes = [box(p - 0.3, p + 0.3, LOOK) for p in rng.uniform(-2, 2, (20, 3))]
     shapes += [blob((0, 1, 0), (3, 1, 3), LOOK, rng, 0.3), quad((0, 0, 3), (2, 2), LOOK)]
-    shapes = place(shapes, (0.1, 0, 0.4), yaw=0.3)
-    given, c2w = pack(shapes), look_at(np.array([0.2, 0.1, -1.0]), np.array([0.3, 0.2, 2.0]), 0.1)
+    shapes = place_shapes(shapes, (0.1, 0, 0.4), yaw=0.3)
+    given, c2w = pack_shapes(shapes), look_at(np.array([0.2, 0.1, -1.0]), np.array([0.3, 0.2, 2.0]), 0.1)
     rects = screen_boxes(given, c2w, LENS, 1)
     together = trace(given, c2w, LENS, 1)
     for m in range(len(shapes)):
@@ -94,7 +94,7 @@ def test_textures_have_no_seam(kind: str) -> None:
 def test_rooms_are_seen_from_their_paths() -> None:
     built = room(Palette(np.random.default_rng(3), 64))
     assert len(built.shapes) > 20
-    view, rng = pack(built.shapes), np.random.default_rng(0)
+    view, rng = pack_shapes(built.shapes), np.random.default_rng(0)
     worth = []
     for _ in range(8):
         pose = draw_path(built, rng, 6)

@@ -15,7 +15,14 @@ from training_runs import PAPER, TINY, noisy_networks, torch, whole_photo
 from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.networks import apply, tokens
 from gsmerge.networks.apply import NetworkContext, encode_features
-from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
+from gsmerge.networks.corrections import (
+    COLOR_COLUMNS,
+    LOGIT_COLUMN,
+    MASS_COLUMN,
+    MEAN_COLUMNS,
+    ROTATION_COLUMNS,
+    SIZE_COLUMNS,
+)
 from gsmerge.networks.options import FEATURE, NetworkOptions
 from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.research.training import Example, make_example, make_training_scene
@@ -35,9 +42,15 @@ from gsmerge.types import FeatureGaussians, Matches
 from gsmerge.values.arrays import as_array
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-COLUMNS = {"mean": MEAN, "size": SIZE, "turn": ROTATION, "logit": slice(LOGIT, LOGIT + 1), "color": COLOR}
+COLUMNS = {
+    "mean": MEAN_COLUMNS,
+    "size": SIZE_COLUMNS,
+    "turn": ROTATION_COLUMNS,
+    "logit": slice(LOGIT_COLUMN, LOGIT_COLUMN + 1),
+    "color": COLOR_COLUMNS,
+}
 SIZE_OF_ROOM = 0.1  # world units, of what a superpixel shows
-OF_FEATURES = COLUMNS | {"mass": slice(MASS, MASS + 1), "latent": slice(FEATURE, FEATURE + TINY.latent)}
+OF_FEATURES = COLUMNS | {"mass": slice(MASS_COLUMN, MASS_COLUMN + 1), "latent": slice(FEATURE, FEATURE + TINY.latent)}
 
 
 @pytest.fixture(scope="module")

