@@ -186,13 +186,13 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
     lacks_views = isinstance(answer, Loaded) and answer.own_views > len(answer.scene)
     if isinstance(answer, Loaded) and not lacks_views:
         return answer
-    is_stray = isinstance(answer, SceneError) and "cameras" not in files.named and not _is_named(files, answer)
+    is_stray = isinstance(answer, SceneError) and "cameras" not in files.named and not _is_fault_of_named(files, answer)
     if files.cameras not in (None, files.ply) and (lacks_views or is_stray):
         fewer = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
         alone = _read_views(ply, fewer, hints, photos=photos)
         lacks_named = "images" in files.named and files.images is not None
         if isinstance(alone, Loaded) and not (lacks_named and alone.scene.images is None):
-            stored = _answer(partial(read_scene_cameras, ply, files))
+            stored = _read_or_error(partial(read_scene_cameras, ply, files))
             text = describe_missing(alone.scene.names, stored, is_right=lacks_views)
             if text is not None:
                 return replace(alone, notes=(text, *(n for n in alone.notes if not n.startswith(NO_CAMERAS_USED))))
@@ -251,7 +251,7 @@ def _confirm_colors(load: Loaded) -> Loaded:
     )
 
 
-def _answer(read: Callable[[], T]) -> T | SceneError:
+def _read_or_error(read: Callable[[], T]) -> T | SceneError:
     """Return what files give, or else why they give nothing: a file is damaged, or they do not fit each other."""
     try:
         return read()
@@ -275,16 +275,16 @@ def _note_left_out(load: Loaded, files: SceneFiles, names: list[str], cause: Sce
 
 def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
     """Read the cameras and photos of a scene, and combine them with its Gaussians; return why if they do not fit."""
-    camera_file = _answer(partial(read_scene_cameras, ply, files))
+    camera_file = _read_or_error(partial(read_scene_cameras, ply, files))
     if camera_file is None:
-        return _without_cameras(ply, files, hints)
+        return _make_scene_without_views(ply, files, hints)
     if isinstance(camera_file, SceneError):
         return camera_file
-    answer = _align(ply, files, camera_file, hints, photos=photos)
+    answer = _add_photos(ply, files, camera_file, hints, photos=photos)
     return _confirm_colors(answer) if isinstance(answer, Loaded) else answer
 
 
-def _align(
+def _add_photos(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, *, photos: bool
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras with their photos; return why if the cameras do not see the Gaussians.
@@ -292,23 +292,25 @@ def _align(
     Photos that were found and do not show the views are left out, with a note, unless they are the only evidence
     against the cameras.
     """
-    proposal = _answer(partial(propose_photos, files, camera_file)) if photos else None
+    proposal = _read_or_error(partial(propose_photos, files, camera_file)) if photos else None
     if isinstance(proposal, Proposal) and proposal.by_names:
         files = replace(files, images=proposal.folder)
-    inside = _answer(partial(photos_inside, files, camera_file)) if photos and proposal is None else ()
+    inside = _read_or_error(partial(photos_inside, files, camera_file)) if photos and proposal is None else ()
     unread = next((answer for answer in (proposal, inside) if isinstance(answer, SceneError)), None)
     if unread is not None and ("images" in files.named or files.images == files.cameras):
         return unread
     if isinstance(proposal, Proposal):
-        load = _assign(ply, files, camera_file, proposal, hints)
+        load = _assign_photos(ply, files, camera_file, proposal, hints)
         of_one_shape = select_one_shape(camera_file, proposal) if isinstance(load, SceneError) else None
         if of_one_shape is not None:
             cameras_left, photos_left, doubts = of_one_shape
-            answer = _assign(ply, files, cameras_left, photos_left, hints)
+            answer = _assign_photos(ply, files, cameras_left, photos_left, hints)
             load = replace(answer, notes=(*answer.notes, *doubts)) if isinstance(answer, Loaded) else load
-        return _without_photos(ply, files, camera_file, proposal, hints, load) if isinstance(load, SceneError) else load
+        return (
+            _leave_out_photos(ply, files, camera_file, proposal, hints, load) if isinstance(load, SceneError) else load
+        )
     pictures = ScenePhotos(() if isinstance(inside, SceneError) else inside)
-    load = _answer(partial(_combine, ply, files, camera_file, pictures, hints))
+    load = _read_or_error(partial(_make_scene_with_views, ply, files, camera_file, pictures, hints))
     if isinstance(load, SceneError):
         return load
     if unread is not None:
@@ -319,7 +321,7 @@ def _align(
     return replace(load, notes=(*load.notes, *films))
 
 
-def _assign(
+def _assign_photos(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras with the photos that names propose, or with other photos that show the views.
@@ -328,16 +330,18 @@ def _assign(
     """
 
     def read(cameras: CameraFile, chosen: Sequence[Assignment | None]) -> Loaded | SceneError:
-        return _answer(lambda: _combine(ply, files, cameras, read_photos(proposal, chosen, cameras), hints))
+        return _read_or_error(
+            lambda: _make_scene_with_views(ply, files, cameras, read_photos(proposal, chosen, cameras), hints)
+        )
 
     is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # photos may have any size
     is_odd = not is_grid and has_other_shape(proposal, camera_file)
-    bare = partial(_combine, ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
+    bare = partial(_make_scene_with_views, ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
     if is_odd:
-        alone = _answer(bare)
+        alone = _read_or_error(bare)
         fitted = choose_part(alone.scene, proposal, camera_file) if isinstance(alone, Loaded) else None
         if fitted is not None:
-            return _assign(ply, files, camera_file, fitted, hints)
+            return _assign_photos(ply, files, camera_file, fitted, hints)
     tried: Loaded | SceneError | None = None
     if not is_grid and any(proposal.choice):
         tried = read(camera_file, proposal.choice)
@@ -345,7 +349,7 @@ def _assign(
         if sound is not None:
             proposal = sound
             tried = read(camera_file, proposal.choice)
-    base = tried if isinstance(tried, Loaded) else _answer(bare)
+    base = tried if isinstance(tried, Loaded) else _read_or_error(bare)
     if isinstance(base, SceneError):
         return base if tried is None else tried
     fit = fit_to_grid(base.scene, proposal) if is_grid and proposal.pool else None
@@ -355,7 +359,7 @@ def _assign(
     if proposal.fit == WHOLE_FIT and not is_odd and (not are_alike or has_bars(base.scene)):
         fitted = choose_part(base.scene, proposal, camera_file, fit)
         if fitted is not None:
-            return _assign(ply, files, camera_file, fitted, hints)
+            return _assign_photos(ply, files, camera_file, fitted, hints)
     if not any(chosen) or (is_odd and not are_alike):  # photos of another shape say nothing against cameras
         is_cause = isinstance(tried, SceneError) and (not is_odd or any(camera_file.lenses))
         return tried if isinstance(tried, SceneError) and is_cause else explain_mismatch(proposal, camera_file)
@@ -367,7 +371,7 @@ def _assign(
     return replace(answer, notes=(*proposal.notes, *answer.notes, *described), photos_explain=are_alike)
 
 
-def _without_photos(
+def _leave_out_photos(
     ply: GaussianFile,
     files: SceneFiles,
     camera_file: CameraFile,
@@ -383,9 +387,9 @@ def _without_photos(
     are_named = "images" in files.named
     if are_named and "cameras" not in files.named and cause.path == camera_file.path:  # the named files are at fault
         return explain_mismatch(proposal, camera_file)
-    if are_named or _is_named(files, cause):
+    if are_named or _is_fault_of_named(files, cause):
         return cause
-    bare = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
+    bare = _read_or_error(partial(_make_scene_with_views, ply, files, camera_file, ScenePhotos(), hints))
     are_at_fault = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(proposal.folder)
     if isinstance(bare, SceneError):
         return cause
@@ -394,7 +398,7 @@ def _without_photos(
     return _note_left_out(bare, replace(files, images=proposal.folder), [f"the photos in {proposal.folder}"], cause)
 
 
-def _is_named(files: SceneFiles, cause: SceneError) -> bool:
+def _is_fault_of_named(files: SceneFiles, cause: SceneError) -> bool:
     """Return whether a picture at fault is in a folder that the caller named, or is named as a mask."""
     folders = (getattr(files, name) for name in ("images", "masks", "protect") if name in files.named)
     return isinstance(cause, CameraMaskError) or any(
@@ -402,11 +406,11 @@ def _is_named(files: SceneFiles, cause: SceneError) -> bool:
     )
 
 
-def _combine(
+def _make_scene_with_views(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, photos: ScenePhotos, hints: ReadHints
 ) -> Loaded:
     """Combine Gaussians, cameras and their photos; SceneError if any of them cannot be used."""
-    order = _choose_order(ply, camera_file, hints)
+    order = _choose_row_order(ply, camera_file, hints)
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
     limited, size_notes = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
@@ -429,9 +433,9 @@ def _combine(
         kind = Doubt if files.named.intersection(unused) else str
         notes.append(kind(f"the pictures of --{' and --'.join(unused)} are not used, since there are no photos"))
     place = camera_file, photos, size, result.transform, result.cameras
-    found = _answer(lambda: find_larger_and_masks(files, *place))
+    found = _read_or_error(lambda: find_larger_and_masks(files, *place))
     if isinstance(found, SceneError):
-        if "masks" in files.named or Path(found.path) in photos.paths or _is_named(files, found):
+        if "masks" in files.named or Path(found.path) in photos.paths or _is_fault_of_named(files, found):
             raise found
         remedy = found.remedy or f"pass --masks FOLDER, or --masks {NONE}"
         notes.append(Doubt(f"masks are left out: {found.path}: {found.problem}; {remedy}"))
@@ -440,7 +444,7 @@ def _combine(
     return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
 
 
-def _choose_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
+def _choose_row_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
     """Choose the order of the rows: by the hints, by the named exporter, or by the format of the cameras."""
     order = (find_exporter(hints.exporter) or camera_file).order
     if hints.order != "auto":
@@ -448,7 +452,7 @@ def _choose_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) 
     return "none" if order == "auto" and RESULT_COMMENT in ply.info.comments else order  # results have no pixels
 
 
-def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
+def _make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
     """Make a scene without views, since views are placed later; a note says that photos are not used."""
     advice = find_cameras_of_model(ply.info)
     notes = [advice] if advice else []
@@ -531,9 +535,9 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
         answer = _choose_cameras(ply, files, hints, photos=with_photos)
         if isinstance(answer, Loaded):
             return answer
-    camera_file = _answer(partial(read_scene_cameras, ply, files))
+    camera_file = _read_or_error(partial(read_scene_cameras, ply, files))
     if isinstance(camera_file, CameraFile):
-        kept = _answer(partial(_keep_stored_cameras, ply, files, camera_file, hints, photos=photos))
+        kept = _read_or_error(partial(_keep_stored_cameras, ply, files, camera_file, hints, photos=photos))
         if isinstance(kept, Loaded):
             return kept
     return align_scene(ply, files, hints=hints, photos=photos)  # leaves out files that were not named

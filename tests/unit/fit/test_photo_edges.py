@@ -127,6 +127,21 @@ def test_haze_before_the_scene_is_not_split() -> None:
     np.testing.assert_array_equal(split_at_edges(state, edges, 100).x, state.x)
 
 
+def test_splits_that_show_the_photos_worse_are_not_taken(
+    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = list[int]()
+
+    def lose(state: FitState, *_: object) -> FitState:
+        calls.append(len(state.x))
+        return state[np.arange(0)]
+
+    monkeypatch.setattr("gsmerge.fit.full.split_at_edges", lose)
+    run = scenes.run_for(photos, FitOptions(fit_steps=150), len(truth), edges=edges_of(photos[1], 2.0))
+    fitted, _ = fit_full(scenes.spoil(with_wide(truth)), run)
+    assert calls == [len(fitted)]
+
+
 def test_threads_write_the_same(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.fit.edges.ROWS", 7)
 
