@@ -97,7 +97,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     files = args.files(*args.scenes)
     default = default_output(files.base)
     out = output_file(args.output or default, default.name)
-    settings = _fit_format(args, settings, out)
+    settings = _choose_levels(args, settings, out)
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not find_format(out).has_cameras else None
     _check_outputs(args, files, settings, writing, out, cameras)
     if args.dry_run:
@@ -116,7 +116,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     _say_result(args, document, out, shown=on_read is not None)
 
 
-def _fit_format(args: opt.Args, settings: CompactOptions, out: Path) -> CompactOptions:
+def _choose_levels(args: opt.Args, settings: CompactOptions, out: Path) -> CompactOptions:
     """Choose the number of levels by the format of ``out``; UsageError if levels or budget do not fit the format."""
     from gsmerge.facts.counts import STREAMED_LEVELS
     from gsmerge.io.formats.table import find_format, output_format

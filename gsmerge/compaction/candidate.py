@@ -39,8 +39,8 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     return Candidate(count, fitted, gaussians, cameras, psnr, current_record(), deciding_psnr)
 
 
-def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
-    """Replace a candidate's Gaussians by a subset of them, and measure its PSNR again."""
+def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
+    """Replace a candidate's Gaussians by all or some of them, and measure its PSNR again."""
     with record_part(silent=True) as record:
         psnr, _ = _measure_candidate(gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan)
     choices = candidate.record.choices | record.choices

@@ -8,7 +8,7 @@ from typing import Any
 
 from gsmerge.compaction.compact import find_count
 from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
-from gsmerge.compaction.files import Outputs, sized
+from gsmerge.compaction.files import Outputs, with_output_name
 from gsmerge.compaction.make_plan import load_networks
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.partition import gaussians_at_once
@@ -125,7 +125,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Describe in a document what :func:`gsmerge.compaction.files.compact_files` would make of a scene."""
-    scene, out, settings = load.scene, outputs.result, sized(settings, outputs)
+    scene, out, settings = load.scene, outputs.result, with_output_name(settings, outputs)
     _, unused = check_method(settings, scene)
     notes = [*load.notes, *unused, *views_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:

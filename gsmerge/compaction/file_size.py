@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from gsmerge.compaction.candidate import Candidate, shrink
+from gsmerge.compaction.candidate import Candidate, rescore
 from gsmerge.compaction.search import meet
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
@@ -60,7 +60,7 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
 
     candidate = meet(rebuild, candidate, choose_next)[-1]
     gaussians = drop_to_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names, rest)
-    return candidate if len(gaussians) == len(candidate.gaussians) else shrink(candidate, gaussians, prepared, plan)
+    return candidate if len(gaussians) == len(candidate.gaussians) else rescore(candidate, gaussians, prepared, plan)
 
 
 def measure_rest(

@@ -62,7 +62,7 @@ def compact_files(
     Returns the report, see :func:`gsmerge.compaction.report.report_document`. Raises SceneError if the scene cannot be
     read or the result cannot be written; UsageError if the settings need something that the scene does not have.
     """
-    start, out, settings = perf_counter(), outputs.result, sized(settings, outputs)
+    start, out, settings = perf_counter(), outputs.result, with_output_name(settings, outputs)
     format_ = output_format(out, levels=True, cameras=True)
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         temporary = add(out)
@@ -102,7 +102,7 @@ def compact_files(
     return document
 
 
-def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
+def with_output_name(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
     """Return the settings with the name of the output file, whose bytes a budget may count."""
     return replace(settings, budget=replace(settings.budget, output=outputs.result.name))
 

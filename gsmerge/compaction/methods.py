@@ -60,13 +60,13 @@ class _Superpixels(Method):
         return build(prepared, plan, count)
 
 
-SUPERPIXELS = _Superpixels(OURS, lambda *arguments: build(*arguments).gaussians)
+OWN_METHOD = _Superpixels(OURS, lambda *arguments: build(*arguments).gaussians)
 
 
 def find_method(options: CompactOptions) -> Method:
     """Load the method that the options name. Raises UsageError if a program that it runs is missing."""
     if options.method == OURS:
-        return SUPERPIXELS
+        return OWN_METHOD
     method: Method = load_plugin(METHODS, options.method)
     method.check()
     return method
@@ -81,9 +81,9 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
         kinds = (PrepareOptions, SegmentOptions, MatchOptions, DecodeOptions)  # settings that act on views
         unused = options.changed(name for kind in kinds for name in flat_settings(kind) if name not in COUNTS)
         notes = [f"these settings have no effect without cameras: {', '.join(unused)}"] if unused else []
-        return replace(SUPERPIXELS, prepare=partial(prepare, pixels=False)), notes
+        return replace(OWN_METHOD, prepare=partial(prepare, pixels=False)), notes
     method = find_method(options)
-    if method is SUPERPIXELS:
+    if method is OWN_METHOD:
         return method, []
     place = f"method {method.name}"
     if method.needs_photos and not scene.is_shown:

@@ -231,7 +231,7 @@ def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]
     if fidelity := choices.get("fidelity"):
         rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_views(fidelity))]
     if pruned := choices.get("pruned"):
-        rows += [("left out", "", f"{pruned:,}", "Gaussians that no view shows")]
+        rows += [("dropped", "", f"{pruned:,}", "Gaussians that no view shows")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     return [*rows, ("time", "", seconds_line(document), f"most in {stages}")]

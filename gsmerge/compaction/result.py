@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from weakref import ReferenceType
 
-from gsmerge.compaction.candidate import Candidate, shrink, with_moved_views
+from gsmerge.compaction.candidate import Candidate, rescore, with_moved_views
 from gsmerge.compaction.distance import describe_far, is_far
 from gsmerge.compaction.new_views import SPREAD, TRIAL_PIXELS, NewViews, Trial
 from gsmerge.compaction.outputs import write_result
@@ -149,7 +149,7 @@ def make_result(
         for parts, candidate in zip(part_scores, candidates, strict=True)
     ):
         plan = replace(plan, scored_views=own_views(prepared), samples=False)
-        best, *levels = (shrink(candidate, candidate.gaussians, prepared, plan) for candidate in candidates)
+        best, *levels = (rescore(candidate, candidate.gaussians, prepared, plan) for candidate in candidates)
         return make_result(best, levels, prepared, plan, search, trial)
     names = {**run.seconds, **search.seconds}
     seconds = {name: run.seconds.get(name, 0.0) + search.seconds.get(name, 0.0) for name in names}

@@ -77,7 +77,7 @@ def fit(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
-    """Run :func:`fit` on a job with its views from outside."""
+    """Fit the Gaussians that some photo shows; return them unfitted if most photos got worse."""
     options = job.options
     run, scored = prepare_fit(job), job.scored_photos(0) if job.held_out is None else job.held_out
     survey = survey_photos(gaussians, run)
