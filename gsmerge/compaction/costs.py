@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.curve import DROP_SHARES, DROP_STEPS, KNEE_SHARES, KNEE_STEPS, curve_counts
+from gsmerge.compaction.curve import curve_counts
 from gsmerge.facts.counts import LEVEL_FACTOR, CountLimits
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.runtime.record import RunPart
@@ -95,8 +95,7 @@ def expected_parts(
     tries = (USUAL_BUILDS_OF_RENDERS if rendered else USUAL_BUILDS) if has_target else 1
     parts = [costs.build(count)] * tries
     if has_curve and not (has_target or rendered):
-        shares, steps = (KNEE_SHARES, KNEE_STEPS) if max_drop is None else (DROP_SHARES, DROP_STEPS)
-        counts = curve_counts(shares, limits.default, limits.min_count, limits.max_count)
+        counts, steps = curve_counts(max_drop, limits.default, limits.min_count, limits.max_count)
         parts = [*(costs.build(tried, steps) for tried in counts), *parts]
     coarser = [count / LEVEL_FACTOR**level for level in range(1, levels)]
     return [*parts, *costs.end(coarser, costs.trial(count) if has_trial else None)]

@@ -25,11 +25,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians
 
-KNEE_STEPS = 60  # steps of each short fit: enough to find the knee
-DROP_STEPS = 300  # steps of each short fit for a largest loss of quality, where tenths of a dB count on clean scenes
 PROGRESS = "curve: what each count brings"
-DROP_SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # counts at which the curve is measured, of the usual count
-KNEE_SHARES = DROP_SHARES[1:5]  # the counts for finding only the knee
 SSIM_DB = 40.0  # dB equal to 1 of SSIM; SSIM counts, because 1 % of the Gaussians may beat 4 % in PSNR and still blur
 KNEE_SLOPE = 0.15  # dB of quality per doubling of the count; below it, more Gaussians gain too little
 
@@ -48,9 +44,15 @@ class CurvePoint:
         return self.psnr + SSIM_DB * self.ssim
 
 
-def curve_counts(shares: Sequence[float], usual: int, least: int, most: int) -> list[int]:
-    """Return rising counts for measuring a curve: ``shares`` of the usual count, within ``least`` and ``most``."""
-    return sorted({min(max(round(usual * share), least), most) for share in shares})
+def curve_counts(max_drop: float | None, usual: int, least: int, most: int) -> tuple[list[int], int]:
+    """Return rising counts for measuring a curve, within ``least`` and ``most``, and the steps of its short fits.
+
+    ``max_drop``: largest loss of quality, dB, that is searched for; None: the knee.
+    """
+    shares, steps = [1 / 8, 1 / 4, 1 / 2, 1.0], 60  # of the usual count; enough to find the knee
+    if max_drop is not None:
+        shares, steps = [1 / 16, *shares, 2.0], 300  # tenths of a dB count on clean scenes
+    return sorted({min(max(round(usual * share), least), most) for share in shares}), steps
 
 
 def measure_curve(

@@ -7,17 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, TypeVar
 
 from gsmerge.compaction.candidate import Candidate
-from gsmerge.compaction.curve import (
-    DROP_SHARES,
-    DROP_STEPS,
-    KNEE_SHARES,
-    KNEE_STEPS,
-    count_reaching,
-    count_within,
-    curve_counts,
-    curve_knee,
-    measure_curve,
-)
+from gsmerge.compaction.curve import count_reaching, count_within, curve_counts, curve_knee, measure_curve
 from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, choose_left_out, leave_out, mean_seen
 from gsmerge.compaction.scores import covers_all, may_leave_gaps, measure_input, measure_renders
 from gsmerge.facts.counts import LEVEL_FACTOR
@@ -270,8 +260,7 @@ def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut
     if prepared.reference.name == RENDERS:
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
-        shares, steps = (KNEE_SHARES, KNEE_STEPS) if drop is None else (DROP_SHARES, DROP_STEPS)
-        counts = curve_counts(shares, limits.default, limits.min_count, most)
+        counts, steps = curve_counts(drop, limits.default, limits.min_count, most)
         points = measure_curve(prepared, plan, build, steps, counts, left_out)
     choose(curve=[asdict(point) for point in points], curve_left_out=0 if left_out is None else len(left_out.photos))
     return curve_knee(points) if drop is None else count_within(points, drop)

@@ -108,9 +108,10 @@ def test_shares_are_exact(share: float) -> None:
 
 
 def test_rungs_rise_within_their_limits() -> None:
-    assert curve_counts((0.25, 0.5, 1.0, 2.0), 1000, 10, 5000) == [250, 500, 1000, 2000]
-    assert curve_counts((0.25, 0.5, 1.0, 2.0), 1000, 300, 900) == [300, 500, 900]
-    assert curve_counts((0.25, 1.0), 1000, 100, 100) == [100]
+    assert curve_counts(None, 1000, 10, 5000)[0] == [125, 250, 500, 1000]
+    assert curve_counts(0.2, 1000, 10, 5000)[0] == [62, 125, 250, 500, 1000, 2000]
+    assert curve_counts(None, 1000, 300, 900)[0] == [300, 500, 900]
+    assert curve_counts(None, 1000, 100, 100)[0] == [100]
 
 
 def test_levels_end_where_a_view_would_have_none() -> None:
