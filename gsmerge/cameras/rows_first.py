@@ -81,7 +81,7 @@ class RowSource:
 
 @dataclass(frozen=True)
 class Recovery:
-    """Rows that are pixels of the cameras of a grid, which are moved into the frame of the Gaussians."""
+    """Rows that are the pixels of a grid, with the grid's cameras moved into the frame of the Gaussians."""
 
     place: PlacedGrid
     layout: Layout

@@ -118,6 +118,7 @@ def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarra
     """Draw the input in v views from outside; return the limits ``[v,h,w]`` of :class:`Outside`."""
 
     def view_limits(view: int) -> np.ndarray:
+        """Return the depth of what the input shows in each pixel; 0: it is half transparent, inf: empty."""
         depths, transmittance = blend_depths(_tile(splats, views, view, near[view]), far[view])
         opacities = 1 - transmittance
         limits = np.where(opacities > SOLID_OPACITY, depths, 0)

@@ -240,14 +240,14 @@ def _confirm_colors(load: Loaded) -> Loaded:
     info, units = load.info, load.info.open_units
     if units is None or load.scene.images is None:
         return load
-    is_rgb = info.color_units is None  # which the photos are asked for
-    other = (read_as_rgb if is_rgb else read_as_harmonics)(load.scene, units)
+    tries_rgb = info.color_units is None  # else the file was read as RGB, and harmonics are tried
+    other = (read_as_rgb if tries_rgb else read_as_harmonics)(load.scene, units)
     if not has_nearer_colors(other, load.scene):
         return load
-    note = RGB_NOTE.format(units.name, "photos show it") if is_rgb else ""
+    note = RGB_NOTE.format(units.name, "photos show it") if tries_rgb else ""
     notes = (*([note] if note else []), *(text for text in load.notes if text != info.color_note))
     return replace(
-        load, scene=other, info=replace(info, color_units=units if is_rgb else None, color_note=note), notes=notes
+        load, scene=other, info=replace(info, color_units=units if tries_rgb else None, color_note=note), notes=notes
     )
 
 

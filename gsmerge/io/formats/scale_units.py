@@ -44,8 +44,8 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
     spacing, stored = width / float(np.sqrt(len(rows))), log(sizes)
     max_width = 0.25  # scales are wrong if half of the standard deviations exceed this share of the scene's width
     typical, is_vast = float(log(size)), size > max_width * width
-    # Bounds on half of the standard deviations, in units of the scene's width divided by the square root of the number
-    # of Gaussians. Sound files have 0.3 to 2. Files with linear scales, read as logarithms, have 10 to 1,000.
+    # Bounds on the median standard deviation, in units of the scene's width divided by the square root of the number of
+    # Gaussians. In sound files it is 0.3 to 2. Where linear scales are read as logarithms, it is 10 to 1,000.
     min_spacings, max_spacings = 0.01, 6.0
     is_likely = min_spacings * spacing <= typical <= max_spacings * spacing < size
     if is_likely and not arrays.are_logarithms(stored):
