@@ -37,9 +37,11 @@ from tiny_scene import (
 import gsmerge
 from gsmerge.cli.parameters import parse_pairs
 from gsmerge.errors import GsmergeError, SceneError, UsageError
-from gsmerge.io import read_cameras, read_gaussians, read_images
+from gsmerge.io import atomic_outputs, read_cameras, read_gaussians, read_images
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.read import read_sharp_camera
+from gsmerge.io.formats import tileset
+from gsmerge.io.formats.table import Contents
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.kernels.matrices import invert
 from gsmerge.networks.checkpoint import load_checkpoint
@@ -258,6 +260,13 @@ def write_sharp(folder: Path) -> None:
     )
 
 
+def write_tile(folder: Path) -> None:
+    """Write a tileset, whose ``tileset.glb`` holds a ``.spz``."""
+    with atomic_outputs() as add:
+        index = folder / "tileset.json"
+        tileset.write_output(add, index, add(index), Contents([SOME]))
+
+
 def write_levels(folder: Path, leaves: int = 1) -> None:
     write_set(folder / "lod-meta.json", [random_gaussians(n, n) for n in (6, 3)], leaves=leaves)
 
@@ -400,6 +409,8 @@ SOUNDS: dict[str, Sound] = {
     "sog": Sound("a.sog", write_some("a.sog"), check_gaussians),
     "splat": Sound("a.splat", write_some("a.splat"), check_gaussians),
     "glb": Sound("a.glb", write_some("a.glb"), check_gaussians),
+    "tile": Sound("tileset.glb", write_tile, check_gaussians),
+    "tileset": Sound("tileset.json", write_tile, check_gaussians, packed=True),
     "levels": Sound("lod-meta.json", write_levels, check_gaussians, packed=True),
     "levels of a tree": Sound("lod-meta.json", partial(write_levels, leaves=2), check_gaussians, rare=True,
                               packed=True),

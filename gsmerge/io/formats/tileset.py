@@ -66,12 +66,12 @@ def read_rows(path: Path) -> StoredRows:
         root = document["root"]
         name = PurePosixPath(root["content"]["uri"])
         is_one = not root.get("children") and name.suffix == ".glb" and len(name.parts) == 1
+        placed = [PLACED] * any(root.get("transform", [])[12:15])
     except (LookupError, TypeError, AttributeError):
         is_one = False
     if not is_one:
         raise SceneError(path, "expected a tileset with one tile, a .glb beside it, found another", "name its tiles")
     rows = glb.read_rows(path.with_name(name.name))
-    placed = [] if np.abs(root.get("transform", np.eye(4).reshape(-1)))[12:15].max() == 0 else [PLACED]
     return replace(rows, bytes_beside=path.with_name(name.name).stat().st_size, notes=(*rows.notes, *placed))
 
 

@@ -114,6 +114,8 @@ def test_frames_on_the_ellipsoid(place: str, position: tuple[float, ...], north:
     [
         [], {"root": {}}, {"root": {"content": {"uri": "a.b3dm"}}}, {"root": {"content": {"uri": "../a.glb"}}},
         {"root": {"content": {"uri": "a.glb"}, "children": [{}]}},
+        {"root": {"content": {"uri": "a.glb"}, "transform": {}}},
+        {"root": {"content": {"uri": "a.glb"}, "transform": 5}},
     ],
 )  # fmt: skip
 def test_other_tilesets_are_refused(tmp_path: Path, document: object) -> None:
