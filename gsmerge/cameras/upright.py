@@ -106,7 +106,7 @@ def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: i
 
 
 def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
-    """List stretches of the first and the last view, if views of ``num_pixels`` were fused one after another.
+    """List runs of rows of the first and of the last view where views of ``num_pixels`` were fused in order.
 
     The rows of the first view come first, and the rows of the last view last. Empty for too few or too many rows.
     """

@@ -318,22 +318,23 @@ def _splits(
     sources = scene.cameras if scene.has_own_pixels else cameras  # the points come from the pixels of these cameras
     points = context_points(scene, renderer.near, sources)
 
-    def split(views: Views, reference: str, masks: np.ndarray | None = None) -> _Split:
+    def make_split(views: Views, source: str, masks: np.ndarray | None = None) -> _Split:
+        """Return a split of views whose pictures are of a ``source``; hidden pixels do not count."""
         visible, scored = visible_pixels(points, views.cameras, renderer.near, sources), list(range(len(views.names)))
         if masks is not None:
             visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
             scored = [view for view in scored if masks[view].any()] or scored
-        return _Split(views, visible, None, reference, scored)
+        return _Split(views, visible, None, source, scored)
 
-    held_out = {} if targets is None else {"target": split(targets, PHOTOS)}
+    held_out = {} if targets is None else {"target": make_split(targets, PHOTOS)}
     if targets is not None and not renderer.options.context:
         return held_out
     if scene.images is not None:
         views = shrink_views(Views(scene.cameras, scene.images, scene.names), side)
-        context = split(views, reference, scene.masks)
+        context = make_split(views, reference, scene.masks)
     else:
         drawn = np.stack([renderer.image(inputs, cameras, i) for i in range(len(scene))])
-        context = replace(split(Views(cameras, drawn, scene.names), RENDERS, scene.masks), drawn=inputs)
+        context = replace(make_split(Views(cameras, drawn, scene.names), RENDERS, scene.masks), drawn=inputs)
     if scene.covered is not None:
         covered = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in scene.covered])
         context = replace(context, covered=covered)

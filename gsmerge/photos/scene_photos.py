@@ -308,6 +308,7 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
     """Make candidates of the files: small versions, resized and cropped to the pixels of a grid by ``fit``."""
 
     def read(photo: int) -> np.ndarray:
+        """Return a small version of a photo: the part that the proposal compares, and of it that of the grid."""
         try:
             small = decode_small(proposal.pool[photo], OFFSET_PIXELS)
         except SceneError:  # an unreadable photo is black and fits no view

@@ -105,7 +105,7 @@ class Case:
     name: str  # name on the command line
     words: str  # description of the change
     check: Check  # name of the property that must hold, see ``PROPERTIES``
-    needs: Needs = "anything"  # "pixels": one Gaussian per pixel; "photos": that and photos
+    needs: Needs = "anything"  # of a scene: one Gaussian per pixel ("pixels"), or also photos ("photos")
     change: Callable[[StressScene], StressScene] | None = None  # returns the changed scene; None: the scene stays
 
 

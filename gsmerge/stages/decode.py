@@ -184,9 +184,10 @@ def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> 
 def halve(
     features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Divide the members of groups into ``counts [g]`` children by halving.
+    """Divide the Gaussians of groups into ``counts [g]`` children by halving.
 
-    Returns the start of each child ``[n+1]`` in the members ``[m]``, the members, and the group ``[n]`` of each child.
+    Returns the start ``[n+1]`` of each child in a list of rows, that list ``[m]``, whose rows are those of ``members``,
+    and the group ``[n]`` of each child.
     """
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)

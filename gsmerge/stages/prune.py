@@ -45,6 +45,7 @@ def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gau
 def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> float:
     """Try limits; return the largest below which all Gaussians can be left out unnoticed, or 0 if there is none."""
     start_limit = 0.02  # limit of the first trial; Gaussians are left out if their largest blending weight is below it
+    # changes are unnoticed up to the limit ``low``, and not from ``high`` on
     splats, low, high, limit = make_splats(gaussians), 0.0, math.inf, start_limit
 
     def clip(_: int, image: np.ndarray, __: np.ndarray) -> np.ndarray:
@@ -64,10 +65,10 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
     trials = 6  # most limits that are tried
     min_decrease, max_increase = 0.8, 2.0  # bounds of the factor on a limit that is too large, and on one that is not
     for _ in range(trials):
-        change = measure_change(limit)
-        low, high = (low, limit) if change > ROUNDING else (limit, high)
+        is_noticed = (change := measure_change(limit)) > ROUNDING
+        low, high = (low, limit) if is_noticed else (limit, high)
         factor = math.sqrt(TARGET_CHANGE / max(change, 1e-9))  # the change grows about with the square of the limit
-        limit *= min(factor, min_decrease if change > ROUNDING else max_increase)
+        limit *= min(factor, min_decrease if is_noticed else max_increase)
         if low and (change > ENOUGH_CHANGE or not low < limit < high):
             break
     return low

@@ -215,6 +215,7 @@ def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray
     """Multiply intrinsics that are relative to the image size by that size; an unknown size counts as 1 x 1."""
     is_relative = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
     is_relative &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
+    # in a picture of a few pixels a focal length in pixels is as small as a relative one
     if not is_relative.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
         return Ks, sizes
     sizes = [size if min(size) > 0 else (1, 1) for size in sizes]
