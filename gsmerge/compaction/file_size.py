@@ -18,7 +18,6 @@ from gsmerge.types import Cameras, Gaussians
 BUILD_SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
 MOST_MEASURED, MAX_REBUILDS = 8, 2  # files that are measured to choose what is dropped; builds after the first one
 
-
 Rebuild = Callable[[int | None], Candidate]  # a count -> a candidate of all views, built, cleaned up and scored
 
 

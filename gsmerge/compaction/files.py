@@ -86,7 +86,7 @@ def compact_files(
         notes = format_notes(out, result.gaussians)
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
         contents = Contents(levels, comments, cameras, names, scene_title(files.ply), outputs.options)
-        written = add_output(add, out, temporary, contents)
+        written = add_output(add, out, temporary, contents, overwrite=outputs.overwrite)
         notes += frame_notes(out, contents)
         if cameras_path is not None:
             add_views(add, cameras_path, contents, overwrite=outputs.overwrite)

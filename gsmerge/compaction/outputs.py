@@ -18,6 +18,7 @@ from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.cameras.viewer_cameras import is_own_settings, viewer_cameras, viewer_cameras_path, viewer_settings
 from gsmerge.io.formats.arrays import RESULT_COMMENT, ExpectedScores, new_views_comment
 from gsmerge.io.formats.table import TILESET, Contents
+from gsmerge.settings.placement import AXES
 from gsmerge.types import Cameras, Gaussians
 
 # Cameras are the same up to this difference of their viewmats, relative to the largest translation. Their Ks may differ
@@ -25,18 +26,21 @@ from gsmerge.types import Cameras, Gaussians
 SAME = 1e-5
 
 
-def add_output(add: AddOutput, out: Path, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
+def add_output(
+    add: AddOutput, out: Path, temporary: Path, contents: Contents, *, overwrite: bool
+) -> dict[Path, list[Path]]:
     """Write an output as :data:`gsmerge.io.formats.table.WriteOutput`, and settings that start its viewers at a view.
 
-    Without cameras, a camera is placed for formats whose viewers look from it first. Of settings that are there already
-    only those that gsmerge wrote are replaced.
+    Without cameras, a camera is placed for formats whose viewers look from it first. Settings that are there already
+    stay, unless ``overwrite`` and gsmerge wrote them.
     """
     format_, gaussians = output_format(out, levels=True, cameras=True), contents.levels[0]
     shows = format_.first_view and contents.options.viewer_cameras
     if shows and len(contents.cameras) == 0:
         contents = replace(contents, cameras=place_viewpoints(gaussians)[:1])
     settings = out.with_name(format_.settings.format(stem=out.name.removesuffix(format_.ending)) or out.name)
-    if format_.settings and shows and (not settings.exists() or is_own_settings(settings)):
+    is_free = not settings.exists() or (overwrite and settings.is_file() and is_own_settings(settings))
+    if format_.settings and shows and is_free:
         add(settings).write_text(viewer_settings(contents.cameras, gaussians.means), encoding="utf-8")
     return format_.write(add, out, temporary, contents)
 
@@ -49,7 +53,7 @@ def frame_notes(out: Path, contents: Contents) -> list[str]:
     if len(contents.cameras) and (format_.first_view or format_ is TILESET):
         up = -contents.cameras.viewmats[:, 1, :3].mean(0)
         axis = int(np.abs(up).argmax())
-        name = f"{'-' * bool(up[axis] < 0)}{'xyz'[axis]}"
+        name = AXES[2 * axis + int(up[axis] < 0)]
         if name != "-y":
             problem = f"{name} is upward for the cameras, and -y for viewers of {format_.ending}"
             notes.append(f"{problem}: gsmerge convert --up -y turns the scene")
@@ -114,7 +118,7 @@ def write_contents(out: Path, contents: Contents, *, overwrite: bool) -> tuple[i
     format_, path = output_format(out, levels=True, cameras=True), viewer_cameras_path(out)
     is_beside = contents.options.viewer_cameras and len(contents.cameras) > 0 and not format_.has_cameras
     with atomic_outputs(overwrite=overwrite) as add:
-        written = add_output(add, out, add(out), contents)
+        written = add_output(add, out, add(out), contents, overwrite=overwrite)
         if is_beside:
             add_views(add, path, contents, overwrite=overwrite)
         num_bytes = sum(file.stat().st_size for files in written.values() for file in files)

@@ -93,7 +93,8 @@ def _cut(splats: Splats, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def split_at_edges(state: FitState, edges: Edges, count: int) -> FitState:
     """Split Gaussians along the edges and drop what lies beyond, until the rim is narrow or there are ``count``.
 
-    The returned state is for the end of a fit; it has no moments. The softest Gaussians are split first.
+    The returned state is for the end of a fit; it has no moments. The softest Gaussians are split first. If none is
+    split, the given state is returned.
     """
     x, fresh = state.x, np.flatnonzero(_cut(state.splats, edges)[2])
     rows, is_split = np.arange(len(x)), np.zeros(len(x), bool)
@@ -112,6 +113,8 @@ def split_at_edges(state: FitState, edges: Edges, count: int) -> FitState:
         rows = np.concatenate([rows, rows[fresh[soft[shown]]]])
         fresh = np.concatenate([fresh[soft], np.arange(len(is_split), len(x))])
         is_split = np.concatenate([is_split, np.ones(len(x) - len(is_split), bool)])
+    if not is_split.any():
+        return state
     split = state_of(x, state.splats.shN[rows])
     split.origins, split.min_sizes, split.fixed = state.origins[rows], state.min_sizes[rows], ~is_split
     cut_state(split, edges)

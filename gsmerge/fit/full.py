@@ -147,9 +147,10 @@ def end_fit(fit: FullFit) -> FitResult:
     is_limit = job.options.grows and not job.options.fills  # else the number is met, or renders show what lies beyond
     if is_limit and job.edges is not None and job.fixed is None:
         split = split_at_edges(ended, job.edges, job.count)
-        whole, parts = (float(photo_mses(gaussians_of(s.x, s.splats.shN), fit.half).mean()) for s in (ended, split))
-        # halves cover more than their parents; where large Gaussians overlap much, photos would be shown .5 dB worse
-        ended = split if parts <= SPLIT_LOSS * whole else ended
+        if split is not ended:
+            whole, parts = (float(photo_mses(gaussians_of(s.x, s.splats.shN), fit.half).mean()) for s in (ended, split))
+            # halves cover more than their parents; where large Gaussians overlap much, photos would lose .5 dB
+            ended = split if parts <= SPLIT_LOSS * whole else ended
     report = FitReport("full", True, fit.step, fit.before, after, "all steps done", viewmats, origins=ended.origins)
     return gaussians_of(ended.x, ended.splats.shN), report
 

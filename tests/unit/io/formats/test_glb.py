@@ -231,6 +231,11 @@ def test_settings_start_a_viewer_at_that_view_and_those_of_a_user_stay(scene: Sc
     settings.write_text(settings.read_text().replace("60", "61"))  # of an earlier result
     write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=True)
     assert json.loads(settings.read_text()) == document
+    path.unlink()
+    path.with_name("a.cameras.json").unlink()
+    write_result(
+        path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=False
+    )  # beside settings that stay
     settings.write_text("{}")
     write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=True)
     assert settings.read_text() == "{}"
