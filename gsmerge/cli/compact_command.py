@@ -21,6 +21,7 @@ from gsmerge.settings.reading import NONE
 from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
+    from gsmerge.compaction.outputs import Outputs
     from gsmerge.io.scene_files import SceneFiles
     from gsmerge.scene.exporters import ReadHints
     from gsmerge.scene.read import Loaded
@@ -45,27 +46,23 @@ PARAMETERS = (
 @opt.command(*PARAMETERS)
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
-    _compact(args)
+    _compact(args, *_find_input(args))
 
 
 @opt.command(*PARAMETERS, "open")
 def look(args: opt.Args) -> None:
     """Compact a scene, and open a page that compares it with the result: ``gsmerge SCENE``."""
-    scene, features = args.scenes[0], _features_in(args.scenes)
-    if not features:
-        _check_scenes(args)  # before the output has a name, so that a remedy names -o
-    default = default_output(scene if features else args.files(*args.scenes).base)
-    args.output = output_file(args.output or default, default.name)
+    source, out = _find_input(args)
     # The page cannot show joined files or Feature Gaussians, so it shows the result alone
-    shown = [args.output] if features or len(args.scenes) > 1 else [scene, args.output]
-    if os.path.exists(args.output) and not (args.overwrite or args.dry_run):
+    shown = [out] if isinstance(source, Path) or len(args.scenes) > 1 else [args.scenes[0], out]
+    if os.path.exists(out) and not (args.overwrite or args.dry_run):
         words = shlex.join(["gsmerge", "view", *map(str, shown)])
-        raise UsageError(f"{args.output}: exists already; {words} shows it, --overwrite makes it again")
+        raise UsageError(f"{out}: exists already; {words} shows it, --overwrite makes it again")
     loads = list["Loaded"]()
-    _compact(args, loads.append)
+    _compact(args, source, out, loads.append)
     from gsmerge.io.formats.table import VIEWED
 
-    if args.dry_run or args.output.suffix.lower() not in VIEWED:
+    if args.dry_run or out.suffix.lower() not in VIEWED:
         return
     from gsmerge.cli.view_command import view
 
@@ -76,41 +73,45 @@ def look(args: opt.Args) -> None:
     opt.call(view, before=before, after=after, **cameras, open=opens, quiet=args.silent, loaded=loaded)
 
 
-def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) -> None:
-    """Run ``compact``, and call ``on_read`` with the scene after reading it."""
-    start = perf_counter()
-    features = _features_in(args.scenes)
-    if features is not None:
-        _decode(args, features, start)
+def _find_input(args: opt.Args) -> tuple[SceneFiles | Path, Path]:
+    """Return the files of the scene, or the path of Feature Gaussians; and the path of the output."""
+    features = _find_features(args.scenes)
+    if features is None:
+        _check_scenes(args)
+        files = args.files(*args.scenes)
+    default = default_output(files.base if features is None else features)
+    return files if features is None else features, output_file(args.output or default, default.name)
+
+
+def _compact(
+    args: opt.Args, source: SceneFiles | Path, out: Path, on_read: Callable[[Loaded], None] | None = None
+) -> None:
+    """Run ``compact`` on a scene, or decode Feature Gaussians; ``on_read`` is called with the scene after reading."""
+    if isinstance(source, Path):
+        _decode(args, source, out)
         return
     hints = args.hints()
-    from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
-    from gsmerge.io.formats.table import find_format
-
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
     if engine.engine == "ray" and not args.dry_run:
         from gsmerge.runtime.work import require_ray
 
         require_ray()
-    _check_scenes(args)
-    files = args.files(*args.scenes)
-    default = default_output(files.base)
-    out = output_file(args.output or default, default.name)
-    settings = _choose_levels(args, settings, out)
-    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not find_format(out).has_cameras else None
-    _check_outputs(args, files, settings, writing, out, cameras)
-    if args.dry_run:
-        print_plan(args, files, settings, out, hints)
-        return
-    _warn_of_memory(files, settings, quiet=args.silent)
-    from gsmerge.compaction.files import Outputs, compact_files
+    from gsmerge.compaction.outputs import plan_outputs
 
-    outputs = Outputs(out, viewer_cameras=cameras, overwrite=args.overwrite, options=writing)
-    seconds_before = {"import": perf_counter() - start}
+    outputs = plan_outputs(out, writing, overwrite=args.overwrite)
+    settings = _choose_levels(args, settings, out)
+    _check_outputs(args, source, settings, outputs)
+    if args.dry_run:
+        print_plan(args, source, settings, outputs, hints)
+        return
+    _warn_of_memory(source, settings, quiet=args.silent)
+    from gsmerge.compaction.files import compact_files
+
+    seconds_before = {"import": perf_counter() - args.start}
     with separate_stdout(engine.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         document = compact_files(
-            files, settings, outputs, opacity=args.opacity, hints=hints, progress=progress,
+            source, settings, outputs, opacity=args.opacity, hints=hints, progress=progress,
             hashed=args.json, seconds_before=seconds_before, on_read=on_read or (lambda _: None),
         )  # fmt: skip
     _say_result(args, document, out, shown=on_read is not None)
@@ -119,7 +120,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
 def _choose_levels(args: opt.Args, settings: CompactOptions, out: Path) -> CompactOptions:
     """Choose the number of levels by the format of ``out``; UsageError if levels or budget do not fit the format."""
     from gsmerge.facts.counts import STREAMED_LEVELS
-    from gsmerge.io.formats.table import find_format, output_format
+    from gsmerge.io.formats.table import find_format
 
     format_ = find_format(out)
     if format_.levels == "inside" and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
@@ -127,27 +128,26 @@ def _choose_levels(args: opt.Args, settings: CompactOptions, out: Path) -> Compa
     if not format_.levels and settings.budget.levels > 1:
         levels, kind = settings.budget.levels, format_.about.partition(":")[0]
         raise UsageError(f"{out}: expected one level in {kind}, found --levels {levels}; drop --levels")
-    if settings.budget.in_bytes and not output_format(out, levels=True, cameras=True).each:
+    if settings.budget.in_bytes and not format_.each:
         raise UsageError(f"{out}: expected a --budget in Gaussians for this format, got {settings.budget.budget}")
     return settings
 
 
-def _check_outputs(
-    args: opt.Args, files: SceneFiles, settings: CompactOptions, writing: FileOptions, out: Path, cameras: Path | None
-) -> None:
-    """Raise an error if a file of the result, or its camera file ``cameras``, cannot be written."""
+def _check_outputs(args: opt.Args, files: SceneFiles, settings: CompactOptions, outputs: Outputs) -> None:
+    """Raise an error if a file of the result cannot be written, or if its format does not fit the options."""
     from gsmerge.io.formats.table import find_format
     from gsmerge.io.formats.write import level_output
 
+    out = outputs.result
     num_files = settings.budget.levels if find_format(out).levels == "apart" else 1
     levels = [level_output(out, level) for level in range(1, num_files)]
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
     # Without --overwrite the camera file may exist, from a result in another format
-    replaced_cameras = cameras if args.overwrite else None
-    outputs = (*with_beside(out), *levels, replaced_cameras)
-    check_outputs(outputs, (*input_files(files), *networks), overwrite=args.overwrite or args.dry_run)
-    check_format(out, writing)
-    if writing.columns == "full" and settings.budget.in_bytes:
+    replaced_cameras = outputs.viewer_cameras if args.overwrite else None
+    paths = (*with_beside(out), *levels, replaced_cameras)
+    check_outputs(paths, (*input_files(files), *networks), overwrite=args.overwrite or args.dry_run)
+    check_format(out, outputs.options)
+    if outputs.options.columns == "full" and settings.budget.in_bytes:
         raise UsageError(f"columns full: expected a --budget that is a number or a share, got {settings.budget.budget}")
 
 
@@ -177,8 +177,8 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
         raise TargetError("; ".join(filter(None, problems)))
 
 
-def _decode(args: opt.Args, path: Path, start: float) -> None:
-    """Decode the Feature Gaussians of a ``.gsm`` and write the result; ``start``: time when the command began."""
+def _decode(args: opt.Args, path: Path, out: Path) -> None:
+    """Decode the Feature Gaussians of a ``.gsm``, and write the result."""
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected Feature Gaussians as the only input, got {len(args.scenes)} inputs")
     args.require_scene(FEATURE_OPTIONS, path)
@@ -186,10 +186,9 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
     from gsmerge.states.files import decode_file, decoding_line
 
     decoding, writing = args.make(DecodeOptions, FileOptions, columns="needed")
-    out = output_file(args.output or default_output(path), default_output(path).name)
     check_outputs(with_beside(out), (path,), overwrite=args.overwrite or args.dry_run)
     check_format(out, writing)
-    before = {"import": perf_counter() - start}
+    before = {"import": perf_counter() - args.start}
     document = decode_file(
         path, out, decoding, writing, overwrite=args.overwrite, dry_run=args.dry_run, seconds_before=before,
     )  # fmt: skip
@@ -197,7 +196,7 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
     print_document(document, decoding_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)
 
 
-def _features_in(scenes: Sequence[Path]) -> Path | None:
+def _find_features(scenes: Sequence[Path]) -> Path | None:
     """Return the first path that is a ``.gsm`` of Feature Gaussians; None if there is none."""
     from gsmerge.io.formats.table import STATE_ENDING
 
@@ -243,12 +242,12 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
         say(problem, kind="warning", quiet=quiet)
 
 
-def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
+def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, outputs: Outputs, hints: ReadHints) -> None:
     """Print an estimate of the result that ``compact`` would make."""
     from gsmerge.compaction.estimate import plan_files, plan_lines
-    from gsmerge.compaction.files import Outputs, read_input
+    from gsmerge.compaction.files import read_input
 
     load = read_input(files, opacity=args.opacity, hints=hints)
     with opt.usage_errors():
-        document = plan_files(load, settings, Outputs(out, overwrite=args.overwrite))
+        document = plan_files(load, settings, outputs)
     print_document(document, plan_lines(document), as_json=args.json)

@@ -50,6 +50,7 @@ def convert(args: opt.Args) -> None:
     check_outputs(with_beside(output), (*inputs, *named), overwrite=args.overwrite)
     check_format(output, writing)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
+    from gsmerge.compaction.outputs import plan_outputs
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.runtime.memory import conversion_bytes, memory_problem
     from gsmerge.runtime.record import record_run
@@ -59,8 +60,8 @@ def convert(args: opt.Args) -> None:
         say(problem, kind="warning", quiet=args.silent)
     hints = args.hints()
     options = ConvertOptions(
-        inputs, output, args.cameras, images, args.opacity, hints.scales, hints.colors, cleaning, placement, writing,
-        overwrite=args.overwrite,
+        inputs, plan_outputs(output, writing, overwrite=args.overwrite), args.cameras, images, args.opacity,
+        hints.scales, hints.colors, cleaning, placement,
     )  # fmt: skip
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
         document = convert_files(options)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from functools import partial, wraps
 from inspect import Parameter, Signature
 from pathlib import Path
+from time import perf_counter
 from types import NoneType, SimpleNamespace, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 
@@ -56,6 +57,10 @@ SETTINGS = {
 class Args(SimpleNamespace):
     """Arguments and options of a command, by name; values of choices are plain strings."""
 
+    def __init__(self, **values: Any) -> None:
+        super().__init__(**values)
+        self.start = perf_counter()  # when the command began
+
     @property
     def silent(self) -> bool:
         """True if only data is printed, or nothing."""
@@ -68,7 +73,7 @@ class Args(SimpleNamespace):
 
     def require_scene(self, names: Collection[str], path: Path) -> None:
         """Raise UsageError for a given option outside ``names``, since the input ``path`` holds Feature Gaussians."""
-        for name, value in vars(self).items():
+        for name, value in self.given(OPTIONS).items():
             if value and name not in names and value != OPTIONS[name].default:
                 flag = f"--{name.replace('_', '-')}"
                 raise UsageError(

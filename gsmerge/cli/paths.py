@@ -32,7 +32,7 @@ def check_format(output: Path, options: FileOptions) -> None:
     """Raise UsageError if an output's ending is unknown, needs a missing package, or does not fit the options."""
     from gsmerge.io.formats.table import TILESET, output_format
 
-    format_ = output_format(output, levels=True, cameras=True)
+    format_ = output_format(output)
     if options.columns == "full" and not (format_.columns and options.normals):
         raise UsageError(f"columns full: expected a .ply output with normals, got {output.name}")
     if options.place is not None and format_ is not TILESET:
@@ -45,8 +45,7 @@ def with_beside(output: Path) -> list[Path]:
     """List an output and the file that its format writes beside it under a fixed name."""
     from gsmerge.io.formats.table import find_format
 
-    beside = find_format(output).beside
-    return [output, *([output.with_name(beside.format(stem=output.stem))] if beside else [])]
+    return [path for path in (output, find_format(output).beside_path(output)) if path is not None]
 
 
 def check_outputs(

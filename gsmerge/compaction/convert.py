@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.outputs import frame_notes, write_contents
+from gsmerge.compaction.outputs import Outputs, frame_notes, write_outputs
 from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.errors import Doubt, SceneError, UsageError, name_notes
 from gsmerge.facts.counts import LEVEL_FACTOR, STREAMED_LEVELS
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.frame import scene_frame
-from gsmerge.io import GaussianFile, file_notes, output_format, read_cameras, read_gaussians
+from gsmerge.io import GaussianFile, file_notes, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, upward_axis
@@ -30,7 +30,6 @@ from gsmerge.measure.documents import document_head, note_entries
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, ColorChoice, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions
@@ -44,7 +43,7 @@ class ConvertOptions:
     """Files to convert, how to read them, and what to do with them."""
 
     inputs: Sequence[Path]  # Several inputs are joined in their order
-    output: Path  # Its name chooses the format
+    outputs: Outputs
     cameras: StrPath | None = None  # In the frame of the first input; None: the cameras inside or beside a result
     images: StrPath | None = None  # Photos of these cameras, to find the sky
     opacity: OpacityChoice = "auto"
@@ -52,8 +51,6 @@ class ConvertOptions:
     colors: ColorChoice = "auto"
     clean: CleanOptions = field(default_factory=CleanOptions)
     placement: PlacementOptions = field(default_factory=PlacementOptions)
-    writing: FileOptions = field(default_factory=FileOptions)
-    overwrite: bool = False
 
 
 def convert_files(options: ConvertOptions) -> dict[str, Any]:
@@ -62,7 +59,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     Returns the document of ``gsmerge convert``. Raises SceneError if a file cannot be read or written, or if no
     Gaussian remains; UsageError for an ending that cannot be written, and for dropping the sky without photos.
     """
-    format_ = output_format(options.output, levels=True, cameras=True)
+    outputs, format_ = options.outputs, options.outputs.format
     with use_threads():
         files, steps = list[GaussianFile](), len(options.inputs) + 1
         for path in options.inputs:
@@ -84,7 +81,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         if options.placement.moves and not 1e-30 < largest < 1e30:  # numbers in files have 32 bits
             problem = f"expected coordinates of 1e-30 to 1e30, the largest would be {largest:.0e}"
             raise UsageError(f"--scale, --translate: {problem}")
-    gaussians = pad_harmonics(gaussians, NUM_FULL) if options.writing.columns == "full" else gaussians
+    gaussians = pad_harmonics(gaussians, NUM_FULL) if outputs.options.columns == "full" else gaussians
     infos = [file.info for file in files]
     columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
     columns = columns[rows]
@@ -94,28 +91,26 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, dropped["unseen"], count, None if stored is None else stored.path)
     names = () if stored is None else stored.names
-    notes += format_notes(options.output, gaussians)
+    notes += format_notes(outputs.result, gaussians)
     comments, comment_notes = _join_comments(infos, format_, moves=options.placement.moves)
     notes += comment_notes
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
-    report_progress(f"convert: {options.output.name}", steps - 1, steps)
+    report_progress(f"convert: {outputs.result.name}", steps - 1, steps)
     levels = [gaussians]
     while format_.levels == "inside" and len(levels) < STREAMED_LEVELS and len(levels[-1]) >= LEVEL_FACTOR:
         levels.append(merge_neighbors(levels[-1], len(levels[-1]) // LEVEL_FACTOR))
-    contents = Contents(
-        levels, comments, moved, names, scene_title(options.inputs[0]), options.writing, extra_columns=columns
-    )
-    notes += frame_notes(options.output, contents)
-    num_bytes, camera_path = write_contents(options.output, contents, overwrite=options.overwrite)
-    facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
+    notes += frame_notes(outputs, moved)
+    contents = Contents(levels, comments, moved, names, scene_title(options.inputs[0]), extra_columns=columns)
+    num_bytes, camera_path = write_outputs(outputs, contents), outputs.viewer_cameras if len(moved) else None
+    facts = {"path": str(outputs.result), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
     inputs = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     input_cameras = None if stored is None else str(stored.path)
-    old = viewer_cameras_path(options.output)
+    old = viewer_cameras_path(outputs.result)
     if camera_path is None and not format_.has_cameras and old.is_file():
         notes.append(f"{old} is of an earlier file of that name, not of this one: delete it")
     document = document_head() | {"inputs": inputs, "cameras": input_cameras, "dropped": dropped, "output": facts}
-    return document | {"viewer_cameras": camera_path, **note_entries(notes)}
+    return document | {"viewer_cameras": camera_path and str(camera_path), **note_entries(notes)}
 
 
 def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -> tuple[list[str], list[str]]:

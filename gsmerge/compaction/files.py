@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact_scene
-from gsmerge.compaction.outputs import add_output, add_views, frame_notes, refuse_other_cameras
+from gsmerge.compaction.outputs import Outputs, add_outputs, frame_notes, refuse_other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError
-from gsmerge.io import atomic_outputs, output_format
-from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
+from gsmerge.io import atomic_outputs
+from gsmerge.io.formats.arrays import RESULT_COMMENT, result_comments
 from gsmerge.io.formats.columns import UNUSED, list_names
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import format_notes
@@ -27,19 +26,8 @@ from gsmerge.scene.content_hash import doubt_changed, list_changed, read_stats
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.files import FileOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """Files that a run writes: all, or none."""
-
-    result: Path  # Its name chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it
-    viewer_cameras: Path | None = None  # May exist already with the same content, beside a result in another format
-    overwrite: bool = False
-    options: FileOptions = field(default_factory=FileOptions)
 
 
 def compact_files(
@@ -63,14 +51,14 @@ def compact_files(
     read or the result cannot be written; UsageError if the settings need something that the scene does not have.
     """
     start, out, settings = perf_counter(), outputs.result, with_output_name(settings, outputs)
-    format_ = output_format(out, levels=True, cameras=True)
+    format_ = outputs.format
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         temporary = add(out)
         load = read_input(files, opacity=opacity, hints=hints, hashed=hashed)
         on_read(load)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
-        cameras_path = outputs.viewer_cameras if len(load.scene) else None
+        cameras_path = outputs.viewer_cameras if views else None
         if cameras_path is not None and cameras_path.exists() and not outputs.overwrite:  # before the work is done
             refuse_other_cameras(cameras_path, load.scene.cameras[views], names, moved=True)
         read = perf_counter()
@@ -80,17 +68,11 @@ def compact_files(
             raise SceneError(files.ply, nothing, "check its scales and opacities")
         result = _padded(result) if outputs.options.columns == "full" else result
         compacted, results = perf_counter(), (result, *result.coarser)
-        comments, expected = [RESULT_COMMENT, *load.comments], result.report.new_views
-        if expected is not None:
-            comments.append(new_views_comment(expected))
-        notes = format_notes(out, result.gaussians)
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
-        contents = Contents(levels, comments, cameras, names, scene_title(files.ply), outputs.options)
-        written = add_output(add, out, temporary, contents, overwrite=outputs.overwrite)
-        notes += frame_notes(out, contents)
-        if cameras_path is not None:
-            add_views(add, cameras_path, contents, overwrite=outputs.overwrite)
-        notes += doubt_changed(load.stats)
+        comments = result_comments(result.report.new_views, load.comments)
+        contents = Contents(levels, comments, cameras, names, scene_title(files.ply))
+        written = add_outputs(add, outputs, temporary, contents)
+        notes = [*format_notes(out, result.gaussians), *frame_notes(outputs, cameras), *doubt_changed(load.stats)]
         document = report_document(
             result.report, recognised=load.recognised, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},

@@ -4,54 +4,87 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import place_viewpoints
-from gsmerge.io import output_format
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.cameras.viewer_cameras import is_own_settings, viewer_cameras, viewer_cameras_path, viewer_settings
-from gsmerge.io.formats.arrays import RESULT_COMMENT, ExpectedScores, new_views_comment
-from gsmerge.io.formats.table import TILESET, Contents
+from gsmerge.io.formats.table import TILESET, Contents, Format, find_format, output_format
+from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import AXES
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras
 
 # Cameras are the same up to this difference of their viewmats, relative to the largest translation. Their Ks may differ
 # by this share, or by a hundred times this number of pixels
 SAME = 1e-5
 
 
-def add_output(
-    add: AddOutput, out: Path, temporary: Path, contents: Contents, *, overwrite: bool
-) -> dict[Path, list[Path]]:
-    """Write an output as :data:`gsmerge.io.formats.table.WriteOutput`, and settings that start its viewers at a view.
+@dataclass(frozen=True)
+class Outputs:
+    """The files of an output: all are written, or none."""
 
-    Without cameras, a camera is placed for formats whose viewers look from it first. Settings that are there already
-    stay, unless ``overwrite`` and gsmerge wrote them.
+    result: Path  # Its name chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it
+    viewer_cameras: Path | None = None  # May exist already with the same content, beside a result in another format
+    overwrite: bool = False
+    options: FileOptions = field(default_factory=FileOptions)
+
+    @property
+    def format(self) -> Format:
+        """Return the format of the result; UsageError if the name has no ending that can be written."""
+        return output_format(self.result)
+
+
+def plan_outputs(result: Path, options: FileOptions | None = None, *, overwrite: bool = False) -> Outputs:
+    """Name the files of an output: cameras lie beside the result if its format has none, unless options say no."""
+    options = options or FileOptions()
+    is_beside = options.viewer_cameras and not find_format(result).has_cameras
+    return Outputs(result, viewer_cameras_path(result) if is_beside else None, overwrite, options)
+
+
+def write_outputs(outputs: Outputs, contents: Contents) -> int:
+    """Write the files of an output; return the bytes of the result with its levels."""
+    with atomic_outputs(overwrite=outputs.overwrite) as add:
+        written = add_outputs(add, outputs, add(outputs.result), contents)
+        num_bytes = sum(file.stat().st_size for files in written.values() for file in files)
+    outputs.format.finish(outputs.result)
+    return num_bytes
+
+
+def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
+    """Write the files of an output as part of :func:`atomic_outputs`; return the temporary files of each level.
+
+    ``temporary``: the file that was added for the result. Viewers of some formats look from the first camera of a file,
+    or of settings beside it. For these a camera is placed if there is none. Settings that are there already stay,
+    unless ``overwrite`` and gsmerge wrote them.
     """
-    format_, gaussians = output_format(out, levels=True, cameras=True), contents.levels[0]
-    shows = format_.first_view and contents.options.viewer_cameras
-    if shows and len(contents.cameras) == 0:
-        contents = replace(contents, cameras=place_viewpoints(gaussians)[:1])
-    settings = out.with_name(format_.settings.format(stem=out.name.removesuffix(format_.ending)) or out.name)
-    is_free = not settings.exists() or (overwrite and settings.is_file() and is_own_settings(settings))
-    if format_.settings and shows and is_free:
-        add(settings).write_text(viewer_settings(contents.cameras, gaussians.means), encoding="utf-8")
-    return format_.write(add, out, temporary, contents)
+    format_, gaussians, has_views = outputs.format, contents.levels[0], len(contents.cameras) > 0
+    contents = replace(contents, options=outputs.options)
+    if outputs.viewer_cameras is not None and has_views:
+        _add_cameras(add, outputs.viewer_cameras, contents, overwrite=outputs.overwrite)
+    if format_.first_view and outputs.options.viewer_cameras:
+        if not has_views:
+            contents = replace(contents, cameras=place_viewpoints(gaussians)[:1])
+        settings = format_.settings_path(outputs.result)
+        if settings is not None and (
+            not settings.exists() or (outputs.overwrite and settings.is_file() and is_own_settings(settings))
+        ):
+            add(settings).write_text(viewer_settings(contents.cameras, gaussians.means), encoding="utf-8")
+    return format_.write(add, outputs.result, temporary, contents)
 
 
-def frame_notes(out: Path, contents: Contents) -> list[str]:
+def frame_notes(outputs: Outputs, cameras: Cameras) -> list[str]:
     """Note that viewers of a format do not show the scene upright, or where it lies on the globe."""
-    format_, notes = output_format(out, levels=True, cameras=True), list[str]()
-    if format_ is TILESET and contents.options.place is None:
+    format_, notes = outputs.format, list[str]()
+    if format_ is TILESET and outputs.options.place is None:
         notes.append("without a place the scene lies in the middle of the earth: --set place=LON,LAT,HEIGHT")
-    if len(contents.cameras) and (format_.first_view or format_ is TILESET):
-        up = -contents.cameras.viewmats[:, 1, :3].mean(0)
+    if len(cameras) and (format_.first_view or format_ is TILESET):
+        up = -cameras.viewmats[:, 1, :3].mean(0)
         axis = int(np.abs(up).argmax())
         name = AXES[2 * axis + int(up[axis] < 0)]
         if name != "-y":
@@ -60,7 +93,7 @@ def frame_notes(out: Path, contents: Contents) -> list[str]:
     return notes
 
 
-def add_views(add: AddOutput, path: Path, contents: Contents, *, overwrite: bool) -> None:
+def _add_cameras(add: AddOutput, path: Path, contents: Contents, *, overwrite: bool) -> None:
     """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has other cameras.
 
     If the file has these cameras already, to within rounding, it stays unchanged, because results in several formats
@@ -90,37 +123,3 @@ def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: b
         )
         return bool(same_poses and np.allclose(stored.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME))
     return False
-
-
-def write_result(
-    out: Path,
-    levels: Sequence[Gaussians],
-    cameras: Cameras,
-    names: Sequence[str],
-    new_views: ExpectedScores | None,
-    *,
-    overwrite: bool,
-) -> Path:
-    """Write the levels of a result, the finest first, with its cameras; return its path.
-
-    The name chooses the format. Raises UsageError if no format has this ending.
-    """
-    format_ = output_format(out, levels=True, cameras=True)
-    comments = [RESULT_COMMENT, *([] if new_views is None else [new_views_comment(new_views)])]
-    stored_levels = [level.numpy() for level in (levels if format_.levels else levels[:1])]
-    contents = Contents(stored_levels, comments, cameras, names, out.stem)
-    write_contents(out, contents, overwrite=overwrite)
-    return out
-
-
-def write_contents(out: Path, contents: Contents, *, overwrite: bool) -> tuple[int, str | None]:
-    """Write an output, and its cameras beside it if its format has none; return its bytes and their path."""
-    format_, path = output_format(out, levels=True, cameras=True), viewer_cameras_path(out)
-    is_beside = contents.options.viewer_cameras and len(contents.cameras) > 0 and not format_.has_cameras
-    with atomic_outputs(overwrite=overwrite) as add:
-        written = add_output(add, out, add(out), contents, overwrite=overwrite)
-        if is_beside:
-            add_views(add, path, contents, overwrite=overwrite)
-        num_bytes = sum(file.stat().st_size for files in written.values() for file in files)
-    format_.finish(out)
-    return num_bytes, str(path) if is_beside else None

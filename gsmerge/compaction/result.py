@@ -12,12 +12,14 @@ from weakref import ReferenceType
 from gsmerge.compaction.candidate import Candidate, rescore, with_moved_views
 from gsmerge.compaction.distance import describe_far, is_far
 from gsmerge.compaction.new_views import SPREAD, TRIAL_PIXELS, NewViews, Trial
-from gsmerge.compaction.outputs import write_result
+from gsmerge.compaction.outputs import plan_outputs, write_outputs
 from gsmerge.compaction.report import CompactReport, compared_psnr
 from gsmerge.compaction.scores import PartScores, measure_parts, score_input
 from gsmerge.compaction.search import SearchFacts
 from gsmerge.errors import Doubt
 from gsmerge.facts.prepare import Prepared
+from gsmerge.io.formats.arrays import result_comments
+from gsmerge.io.formats.table import Contents
 from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.plan import Plan, own_views
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
@@ -87,9 +89,11 @@ class CompactResult:
             >>> result.save("demo/small.sog", overwrite=True).name
             'small.sog'
         """
-        cameras, levels = self.cameras.numpy(), [level.gaussians for level in (self, *self.coarser)]
-        names = self.names or number_views(len(cameras))
-        return write_result(Path(path), levels, cameras, names, self.report.new_views, overwrite=overwrite)
+        cameras, levels = self.cameras.numpy(), [level.gaussians.numpy() for level in (self, *self.coarser)]
+        outputs = plan_outputs(Path(path), overwrite=overwrite)
+        names, comments = self.names or number_views(len(cameras)), result_comments(self.report.new_views)
+        write_outputs(outputs, Contents(levels, comments, cameras, names, outputs.result.stem))
+        return outputs.result
 
     @check_arguments
     def show(self, scene: Scene | StrPath | None = None) -> Page:

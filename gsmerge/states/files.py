@@ -11,10 +11,10 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.files import read_input
-from gsmerge.compaction.outputs import write_contents
+from gsmerge.compaction.outputs import plan_outputs, write_outputs
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.atomic import common_mode
-from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.arrays import result_comments
 from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.locks import lock_file
@@ -165,8 +165,8 @@ def decode_file(
         raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
     cameras = features.frame.leave_cameras(features.cameras)
     notes = format_notes(out, gaussians)
-    contents = Contents([gaussians], [RESULT_COMMENT], cameras, features.names, scene_title(path), writing)
-    num_bytes, _ = write_contents(out, contents, overwrite=overwrite)
+    contents = Contents([gaussians], result_comments(None), cameras, features.names, scene_title(path))
+    num_bytes = write_outputs(plan_outputs(out, writing, overwrite=overwrite), contents)
     seconds = {**(seconds_before or {}), "read": read_end - start, "decode": decode_end - read_end}
     seconds["write"] = perf_counter() - decode_end
     return document | {

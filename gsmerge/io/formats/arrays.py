@@ -111,6 +111,11 @@ class ExpectedScores:
         return self.low, self.high
 
 
+def result_comments(scores: ExpectedScores | None, kept: Sequence[str] = ()) -> list[str]:
+    """Return the header comments of a result: its mark, comments ``kept`` from the input, and the expected scores."""
+    return [RESULT_COMMENT, *kept, *([] if scores is None else [new_views_comment(scores)])]
+
+
 def new_views_comment(scores: ExpectedScores) -> str:
     """Return the header comment of a result on the expected scores of new views."""
     gain = f"gain {scores.low:.2f} to {scores.high:.2f} dB"

@@ -30,7 +30,7 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
     """Note how far a file's rounding moves Gaussians, and the remedy; empty if renders do not change visibly."""
     if len(gaussians) == 0:
         return []
-    format_, columns = output_format(path, levels=True, cameras=True), gaussians.numpy()
+    format_, columns = output_format(path), gaussians.numpy()
     extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # from them formats choose their steps
     rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // ROUNDING_GAUSSIANS + 1), *extremes]))
     means, (x, y, z) = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0).T
@@ -57,7 +57,7 @@ def round_as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
     """
     if not rounding_notes(path, gaussians):
         return gaussians
-    format_ = output_format(path, levels=True, cameras=True)
+    format_ = output_format(path)
     if format_.read is None:
         return replace(gaussians, means=format_.round_means(gaussians.numpy().means.astype(np.float64)))
     with TemporaryDirectory() as folder:

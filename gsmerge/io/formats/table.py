@@ -93,6 +93,15 @@ class Format:
         name = Path(path).name
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
+    def settings_path(self, output: Path) -> Path | None:
+        """Return the path of the settings for viewers beside an output; None if viewers of this format read none."""
+        stem = output.name.removesuffix(self.ending)
+        return output.with_name(self.settings.format(stem=stem)) if self.settings else None
+
+    def beside_path(self, output: Path) -> Path | None:
+        """Return the path of the file that is always written beside an output; None if there is none."""
+        return output.with_name(self.beside.format(stem=output.stem)) if self.beside else None
+
 
 _page = lazy_functions("gsmerge.pages")
 # Bytes of a Gaussian, for harmonics of degree 0 to 3
@@ -207,21 +216,19 @@ def may_hold_gaussians(path: Path) -> bool:
     return (holds is None and path.suffix.lower() in SCENE_SUFFIXES) or (holds is not None and holds(path))
 
 
-def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
+def output_format(path: StrPath, *, alone: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: allow an index with files beside it. ``cameras``: allow a page, which has cameras.
+    ``alone``: allow only formats of a single file with Gaussians alone: no index with files beside it, and no page.
     """
     by_name = next((row for row in FORMATS if row.names(path)), None)
-    is_index = by_name is not None and by_name.ending[0] != "."
-    if by_name is not None and ((is_index and not levels) or (by_name.has_cameras and not cameras)):
+    if alone and by_name is not None and (by_name.has_cameras or by_name.ending[0] != "."):
         by_name = None
     if by_name is None or by_name.max_degree < 0:
         read_only = "" if by_name is None else f"{by_name.ending} can be read but not written; "
-        inside = [row.ending for row in FORMATS if row.has_cameras and row.ending[0] == "."]
-        endings = join_words((*OUTPUT_FORMATS, *(inside if cameras else [])))
-        index = f", or the name {INDEX} or {TILESET.ending}" if levels else ""
-        folder = ", or a folder" if cameras else ""
-        raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{index}{folder}")
+        pages = [row.ending for row in FORMATS if row.has_cameras and row.ending[0] == "."]
+        endings = join_words(OUTPUT_FORMATS if alone else (*OUTPUT_FORMATS, *pages))
+        others = "" if alone else f", or the name {INDEX} or {TILESET.ending}, or a folder"
+        raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{others}")
     by_name.require()
     return by_name

@@ -17,7 +17,7 @@ from gsmerge.values.arguments import check_arguments
 
 def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
     """Note which harmonics a format leaves out, and more Gaussians than readers take; UsageError for its ending."""
-    format_, notes = output_format(path, levels=True, cameras=True), list[str]()
+    format_, notes = output_format(path), list[str]()
     if sh_degree > format_.max_degree:
         notes.append(format_.lost.format(ending=format_.ending, degree=format_.max_degree))
     if count > format_.most:
@@ -28,13 +28,13 @@ def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
 
 def level_output(output: Path, level: int) -> Path:
     """Return the path of a coarser level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
-    stem_length = len(output.name) - len(output_format(output).ending)
+    stem_length = len(output.name) - len(output_format(output, alone=True).ending)
     return output.with_name(f"{output.name[:stem_length]}.level{level}{output.name[stem_length:]}")
 
 
 def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write each level to a separate file, as :data:`gsmerge.io.formats.table.WriteOutput`."""
-    written, format_ = {path: [temporary]}, output_format(path)
+    written, format_ = {path: [temporary]}, output_format(path, alone=True)
     ending = format_.ending
     for level in range(1, len(contents.levels)):
         written[level_output(path, level)] = [add(level_output(path, level))]
@@ -86,7 +86,7 @@ def write_gaussians(
         >>> gaussians = gsmerge.compact("demo", effort="draft", budget=300).gaussians
         >>> gsmerge.write_gaussians("demo/small.splat", gaussians, overwrite=True)
     """
-    format_ = output_format(ending or path)
+    format_ = output_format(ending or path, alone=True)
     if format_.encode is None:
         degree = min(gaussians.sh_degree, format_.max_degree)
         _write_ply(path, gaussians, overwrite, degree, comments, normals)

@@ -11,7 +11,8 @@ from messages import noted
 from tiny_scene import Tiny
 
 import gsmerge
-from gsmerge.compaction.files import Outputs, compact_files
+from gsmerge.compaction.files import compact_files
+from gsmerge.compaction.outputs import Outputs
 from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import read_gaussians, write_ply
 from gsmerge.io.formats.ply import file_bytes

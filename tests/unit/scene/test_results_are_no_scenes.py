@@ -13,7 +13,8 @@ from tiny_scene import Tiny, write_inria
 
 from gsmerge.batch.find import find_scenes
 from gsmerge.cli import main
-from gsmerge.compaction.files import Outputs, compact_files, read_input
+from gsmerge.compaction.files import compact_files, read_input
+from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError
 from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import read_ply, write_gaussians, write_ply

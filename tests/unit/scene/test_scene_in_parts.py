@@ -13,7 +13,8 @@ from tiny_scene import Tiny
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.compaction.files import Outputs, compact_files
+from gsmerge.compaction.files import compact_files
+from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
 from gsmerge.io.scene_files import find_scene_files

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,14 @@ import scenes
 from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
-from gsmerge.compaction.outputs import write_result
+from gsmerge.compaction.outputs import plan_outputs, write_outputs
 from gsmerge.errors import list_doubts
 from gsmerge.geometry.transforms import multiply_quats, project, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.cameras.viewer_cameras import order_views
 from gsmerge.io.formats.glb import holds_gaussians
 from gsmerge.io.formats.read import file_notes
+from gsmerge.io.formats.table import Contents
 from gsmerge.kernels.elementary import cos, sin
 
 NAME = "KHR_gaussian_splatting"
@@ -64,6 +66,12 @@ def save_glb(
     }  # fmt: skip
     put(path, document, content)
     return document
+
+
+def write_scene(path: Path, scene: Scene, *, overwrite: bool = False) -> None:
+    """Write Gaussians and cameras of a scene as a result."""
+    outputs = plan_outputs(path, overwrite=overwrite)
+    write_outputs(outputs, Contents([scene.gaussians], cameras=scene.cameras, names=scene.names))
 
 
 def put(path: Path, document: Document, content: bytes) -> None:
@@ -174,7 +182,8 @@ def test_bytes_beyond_the_stated_length(scene: Scene, tmp_path: Path, num_more: 
 
 def test_a_viewers_first_picture_is_that_of_the_middle_view(scene: Scene, tmp_path: Path) -> None:
     """A camera node projects points as the view does, whose pixels are those of a picture of glTF's camera."""
-    path = write_result(tmp_path / "a.glb", [scene.gaussians], scene.cameras, scene.names, None, overwrite=False)
+    path = tmp_path / "a.glb"
+    write_scene(path, scene)
     document, _ = _read_document(path)
     nodes = [node for node in document["nodes"] if "camera" in node]
     assert [node["name"] for node in nodes] == [scene.names[view] for view in order_views(scene.cameras)]
@@ -200,7 +209,7 @@ def _read_document(path: Path) -> tuple[Document, int]:
 def test_without_cameras_viewers_start_at_a_placed_one(ending: str, scene: Scene, tmp_path: Path) -> None:
     """It sees the scene, and it is not written as if it were a photo's."""
     path = tmp_path / f"a{ending}"
-    write_result(path, [scene.gaussians], scene.cameras[:0], (), None, overwrite=False)
+    write_scene(path, replace(scene, cameras=scene.cameras[:0], names=(), pixels=None, images=None))
     assert not path.with_name("a.cameras.json").exists()
     if ending == ".glb":
         (node,) = (node for node in _read_document(path)[0]["nodes"] if "camera" in node)
@@ -215,7 +224,7 @@ def test_without_cameras_viewers_start_at_a_placed_one(ending: str, scene: Scene
 
 def test_settings_start_a_viewer_at_that_view_and_those_of_a_user_stay(scene: Scene, tmp_path: Path) -> None:
     path, settings = tmp_path / "a.sog", tmp_path / "a.settings.json"
-    write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=False)
+    write_scene(path, scene)
     (camera,) = json.loads(settings.read_text())["cameras"]
     view = order_views(scene.cameras)[0]
     position, target = (np.array(camera["initial"][name]) * (-1, -1, 1) for name in ("position", "target"))
@@ -229,13 +238,11 @@ def test_settings_start_a_viewer_at_that_view_and_those_of_a_user_stay(scene: Sc
     assert document["startMode"] == "animTrack"
     assert track["keyframes"]["values"]["position"] == 2 * camera["initial"]["position"]
     settings.write_text(settings.read_text().replace("60", "61"))  # of an earlier result
-    write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=True)
+    write_scene(path, scene, overwrite=True)
     assert json.loads(settings.read_text()) == document
     path.unlink()
     path.with_name("a.cameras.json").unlink()
-    write_result(
-        path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=False
-    )  # beside settings that stay
+    write_scene(path, scene)  # beside settings that stay
     settings.write_text("{}")
-    write_result(path, [scene.gaussians], scene.cameras, scene.names, None, overwrite=True)
+    write_scene(path, scene, overwrite=True)
     assert settings.read_text() == "{}"

@@ -157,7 +157,7 @@ def test_an_index_names_no_chunk_of_another(
 def test_without_the_program_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, str(tmp_path / "none"))
     with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.CONVERTER_PACKAGE}"):
-        output_format("lod-meta.json", levels=True)
+        output_format("lod-meta.json")
     with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.CONVERTER_PACKAGE}"):
         write_levels(tmp_path / "scene" / "lod-meta.json", [corners()])
     assert list(tmp_path.iterdir()) == []
@@ -165,10 +165,10 @@ def test_without_the_program_one_line_says_how_to_get_it(tmp_path: Path, monkeyp
 
 def test_the_name_chooses_the_format_where_levels_are_written(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, sys.executable)  # any program that exists
-    assert output_format("scene/lod-meta.json", levels=True).ending == "lod-meta.json"
-    for name, levels in {"scene/lod-meta.json": False, "my-lod-meta.json": True, "LOD-meta.json": True}.items():
+    assert output_format("scene/lod-meta.json").ending == "lod-meta.json"
+    for name, alone in {"scene/lod-meta.json": True, "my-lod-meta.json": False, "LOD-meta.json": False}.items():
         with refuses(UsageError, name, ".ply", ".glb"):
-            output_format(name, levels=levels)
+            output_format(name, alone=alone)
 
 
 def test_check_reads_all_levels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

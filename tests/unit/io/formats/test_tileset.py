@@ -13,10 +13,9 @@ from messages import noted, refuses
 
 from gsmerge import Gaussians, read_gaussians, write_gaussians
 from gsmerge.compaction.convert import ConvertOptions, convert_files
-from gsmerge.compaction.outputs import frame_notes
+from gsmerge.compaction.outputs import Outputs, frame_notes, plan_outputs
 from gsmerge.errors import SceneError
 from gsmerge.io.formats.spz import spz_bytes
-from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.tileset import globe_matrix, measure
 from gsmerge.settings.files import FileOptions
 from gsmerge.types import NO_CAMERAS
@@ -37,7 +36,7 @@ def convert(gaussians: Gaussians, folder: Path, place: str | None = None) -> Pat
     """Write a tileset into a folder."""
     write_gaussians(folder / "a.ply", gaussians)
     out = folder / "web" / "tileset.json"
-    convert_files(ConvertOptions([folder / "a.ply"], out, writing=FileOptions(place=place)))
+    convert_files(ConvertOptions([folder / "a.ply"], Outputs(out, options=FileOptions(place=place))))
     return out
 
 
@@ -68,7 +67,9 @@ def test_a_place_on_the_globe(room: Gaussians, tmp_path: Path) -> None:
     np.testing.assert_array_equal(matrix, globe_matrix("10,50,100"))
     unplaced = json.loads(convert(room, tmp_path / "b").read_text())["root"]["transform"]
     np.testing.assert_array_equal(unplaced, np.diag([-1, -1, 1, 1]).reshape(-1))
-    again = convert_files(ConvertOptions([tmp_path / "web" / "tileset.json"], tmp_path / "copy" / "tileset.json"))
+    again = convert_files(
+        ConvertOptions([tmp_path / "web" / "tileset.json"], plan_outputs(tmp_path / "copy" / "tileset.json"))
+    )
     assert noted(again["notes"], "place", "kept")
 
 
@@ -81,11 +82,11 @@ def test_places_that_are_none(place: str) -> None:
 def test_what_viewers_see_on_its_side_is_noted(room: Gaussians, tmp_path: Path) -> None:
     cameras = scenes.arc(2)
     turned = replace(cameras, viewmats=cameras.viewmats[:, [1, 0, 2, 3]])
-    assert frame_notes(tmp_path / "a.glb", Contents([room], (), cameras)) == []
-    (note,) = frame_notes(tmp_path / "a.glb", Contents([room], (), turned))
+    assert frame_notes(Outputs(tmp_path / "a.glb"), cameras) == []
+    (note,) = frame_notes(Outputs(tmp_path / "a.glb"), turned)
     assert "--up -y" in note
-    assert len(frame_notes(tmp_path / "tileset.json", Contents([room], (), turned))) == 2
-    assert frame_notes(tmp_path / "a.ply", Contents([room], (), turned)) == []
+    assert len(frame_notes(Outputs(tmp_path / "tileset.json"), turned)) == 2
+    assert frame_notes(Outputs(tmp_path / "a.ply"), turned) == []
 
 
 def test_its_size_is_at_most_what_a_budget_counts(room: Gaussians, tmp_path: Path) -> None:

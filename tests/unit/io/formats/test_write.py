@@ -132,10 +132,10 @@ def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
 
 def test_names_ask_for_formats() -> None:
     for name, ending in (("a.ply", ".ply"), ("A.SPZ", ".spz"), ("x/b.splat", ".splat")):
-        assert output_format(name).ending == ending
+        assert output_format(name, alone=True).ending == ending
     for name in ("a", "a.ksplat", "ply", "a.ply.gz", "spz/a"):
         with refuses(UsageError, name, join_words(OUTPUT_FORMATS)):
-            output_format(name)
+            output_format(name, alone=True)
 
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
