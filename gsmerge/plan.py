@@ -1,7 +1,7 @@
 """The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
 
-Every choice is a function here. :func:`choose_for_scene` runs before a scene is cut into blocks, and again as part of
-:func:`decide`, which makes the plan of a piece from the options that :func:`fill_options` has completed. Each stage
+Every choice is a function here. :func:`make_plan` makes all of them for a prepared scene or block.
+:func:`choose_for_scene` makes those that need no computation, also for estimates and for a scene in blocks. Each stage
 gets its own part of the plan, and no stage knows the options of another.
 """
 
@@ -22,9 +22,9 @@ from gsmerge.fit import photo_scale, start_share
 from gsmerge.photos.row_colors import RENDERS
 from gsmerge.photos.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.raster.photos import scored_tiles
-from gsmerge.runtime.record import note
+from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO
-from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, STEPS, USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
     SHARE,
@@ -35,9 +35,9 @@ from gsmerge.settings.stages import (
     MatchOptions,
     SegmentOptions,
 )
+from gsmerge.stages.fit_pairs import choose_power
 from gsmerge.stages.pair_merge import POWERS
 from gsmerge.stages.segment import SharedTree, SuperpixelChoices
-from gsmerge.types import Scene
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
@@ -170,7 +170,23 @@ class FilledOptions:
         return replace(self.options, segment=superpixels)
 
 
-def fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
+def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
+    """Make all decisions that the options leave open.
+
+    This also loads the networks, because decisions need them. ``checkpoint``: networks to use instead of those that the
+    options name. Raises UsageError if the scene or the networks do not allow what the options ask for.
+    """
+    check_pictures(prepared, options)
+    with stage("prepare"):
+        checkpoint = checkpoint or load_networks(options, prepared.size)
+        plan = _decide(prepared, _fill_options(prepared, options), checkpoint)
+        if not plan.merges_pairs:
+            return plan
+        count = plan.limits.count or plan.limits.default
+        return replace(plan, power=choose_power(count, prepared, plan.fit, plan.seed))
+
+
+def _fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
     """Fill in the settings that the options leave open and the scene decides; notes give the reasons."""
     size, agreement = prepared.size, prepared.agreement
     filled = resolve_budget(size, options, agreement)
@@ -182,7 +198,7 @@ def fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
     return FilledOptions(options, replace(filled, decode=decode), segment, clean)
 
 
-def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | None) -> Plan:
+def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | None) -> Plan:
     """Make all decisions about a run."""
     size, asked, options, segment = prepared.size, filled.asked, filled.options, filled.segment
     keeps = keeps_fidelity(size, asked)
@@ -235,7 +251,6 @@ def cuts_views(options: CompactOptions, size: SceneSize) -> bool:
 class SceneChoices:
     """Decisions about a whole scene that need no computation; a run, its estimate and its blocks share them."""
 
-    blocks: int  # Blocks in which the scene is compacted; at most so many, if they follow from the views alone
     decode: DecodeOptions  # Gaussians per group
     limits: CountLimits  # Limits of the number of Gaussians
     match: MatchMethod  # How Gaussians are merged across views
@@ -275,7 +290,7 @@ def choose_for_scene(
     # Settings of superpixels ask for superpixels, except for their number, which only says how many Gaussians there are
     is_shown = scene.num_views > 0 and (not scene.rendered or options.changes_superpixels)
     pairs = options.method == OURS and networks == "none" and not is_shown
-    return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit, keeps, pairs)
+    return SceneChoices(decode, limits, match, networks, fit, keeps, pairs)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
@@ -343,11 +358,6 @@ def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
         raise UsageError("drop sky: expected photos, which show where the sky is; name them with --images")
 
 
-def stands_alone(scene: Scene, options: CompactOptions) -> bool:
-    """Return whether a scene is merged by positions and colours only: it has no views, and no option needs any."""
-    return len(scene) == 0 and not options.replaces_stages
-
-
 def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     """Return the name of the checkpoint to load: the one that was asked for, or the shipped one if it improves results.
 
@@ -360,9 +370,30 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     return "shipped" if gains_from_networks else "none"
 
 
-def heads_alone(options: CompactOptions) -> bool:
-    """Return whether only the heads of the networks run: with networks by ``auto``, at an effort that does so."""
-    return options.checkpoint == "auto" and not EFFORTS[options.effort].refines
+def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
+    """Load the networks that a run uses; None: the run uses closed formulas alone.
+
+    Raises SceneError if networks are required and cannot be used, UsageError if they do not fit the options.
+    """
+    if not cuts_views(options, size):
+        if options.checkpoint not in CHECKPOINTS:  # refuse a damaged file, although nothing would use it
+            from gsmerge.networks.checkpoint import load_checkpoint
+
+            load_checkpoint(options.checkpoint)
+        return None
+    name = choose_networks(options, size)
+    if name == "none":  # as in most runs, which then need not import the modules of networks
+        return None
+    from gsmerge.networks.checkpoint import find_checkpoint
+
+    checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
+    for text in notes:
+        note(text)
+    if checkpoint is not None:
+        if options.checkpoint == "auto" and not EFFORTS[options.effort].refines:
+            checkpoint = replace(checkpoint, networks=checkpoint.networks.heads_alone())
+        check_networks(checkpoint, options)
+    return checkpoint
 
 
 def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:

@@ -17,9 +17,8 @@ from weakref import ReferenceType, ref
 import numpy as np
 
 from gsmerge.compaction.candidate import Candidate, score
-from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
+from gsmerge.compaction.costs import CountChoice, RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.file_size import Rebuild, meet_bytes
-from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import can_try, try_new_views
 from gsmerge.compaction.result import CompactResult, make_result
@@ -31,7 +30,7 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.photos.row_colors import RENDERS
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan, choose_for_scene
+from gsmerge.plan import Plan, choose_blocks, choose_for_scene, make_plan
 from gsmerge.runtime.record import (
     Progress,
     Record,
@@ -99,22 +98,20 @@ def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Pro
         scene = as_scene(scene)
         if options.clean.crop is not None:
             scene = crop_scene(scene.numpy(), options.clean.crop)
-        result = _compact_scene(scene, options)
+        result = _compact_once(scene, options)
+        if result.report.is_far and not (options.decides_count or options.replaces_stages):
+            result = _compact_simpler(scene, options, result)
         if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
             result = result.to_single()
         return replace(result, scene=source, names=scene.names)
 
 
-def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
-    """Compact a scene; if the result is worse than its input, go on in the next simpler way, with a note.
+def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult) -> CompactResult:
+    """Compact a scene again in simpler ways, each with a note, until the result is not worse than its input.
 
-    Raises TargetError if no result is as good as the input. The result stays, with a warning, where options decide the
-    number of Gaussians or replace the method.
+    ``result``: the first result, which is worse. Raises TargetError if all of them are.
     """
-    result = _compact_once(scene, options)
     cause = result.report.worse
-    if not result.report.is_far or options.decides_count or options.replaces_stages:
-        return result
     for words, change in SIMPLER:
         simpler = change(options)
         if simpler == options:
@@ -132,17 +129,16 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
 
 def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene: in blocks if its views are cut into several, otherwise in one piece."""
-    size = measure_size(scene)
-    choices = choose_for_scene(size, options)  # the decisions that need no computation
-    budget = options.budget
+    size, budget = measure_size(scene), options.budget
     if budget.number is not None and budget.number > size.num_gaussians:
         note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
-    if choices.blocks > 1:
+    num_blocks = choose_blocks(size, options)
+    if num_blocks > 1:
         from gsmerge.compaction.blocks import compact_in_blocks, cut_views
 
-        blocks, covisibility = cut_views(scene, options, choices.blocks)
+        blocks, covisibility = cut_views(scene, options, num_blocks)
         if len(blocks) > 1:
-            return compact_in_blocks(scene, options, choices, blocks, covisibility)
+            return compact_in_blocks(scene, options, choose_for_scene(size, options), blocks, covisibility)
     method = choose_method(options, scene)  # ours, ours for scenes without cameras, or a baseline
     prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses
     return compact_prepared(prepared, method, options).to(scene.gaussians.device)
@@ -159,12 +155,9 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
         return candidate
 
     costs, has_trial = measure_costs(prepared, plan), plan.new_views and can_try(prepared)
-    parts = expected_parts(
-        costs, plan.limits, plan.limits.default, has_target=plan.target_psnr is not None,
-        has_curve=plan.auto_count or plan.max_drop is not None, max_drop=plan.max_drop,
-        rendered=prepared.reference.name == RENDERS, levels=plan.levels, has_trial=has_trial,
-    )  # fmt: skip
-    expect_parts(parts)
+    has_target, has_curve = plan.target_psnr is not None, plan.auto_count or plan.max_drop is not None
+    choice = CountChoice(has_target, has_curve, plan.max_drop, rendered=prepared.reference.name == RENDERS)
+    expect_parts(expected_parts(costs, plan.limits, plan.limits.default, choice, has_trial=has_trial))
     search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
     best = run_search(search, method.build, rebuild, prepared)
     best = meet_bytes(best, rebuild, prepared, plan)

@@ -78,24 +78,31 @@ class RunCosts:
         return IMPORT_SECONDS + work / (1 + THREAD_GAIN * max(0, min(threads, num_views) - 1))
 
 
+@dataclass(frozen=True)
+class CountChoice:
+    """How a run chooses the number of Gaussians; by default, the options state it."""
+
+    has_target: bool = False  # Numbers are tried until a PSNR is met
+    has_curve: bool = False  # The scene's curve is measured first, unless a PSNR has to be met
+    max_drop: float | None = None  # Largest loss (dB) that is searched for on the curve; None: its knee
+    rendered: bool = False  # Renders of the input stand for photos, which a curve needs
+
+
 def mean_inside(scene: Scene) -> float:
     """Measure the mean share of a scene's Gaussians that lie in a view, on a sample; 1 without views."""
     return float(np.mean(shares_inside(scene, INSIDE_GAUSSIANS) or [1.0]))
 
 
 def expected_parts(
-    costs: RunCosts, limits: CountLimits, count: float, *, has_target: bool, has_curve: bool, max_drop: float | None,
-    rendered: bool, levels: int, has_trial: bool,
-) -> list[RunPart]:  # fmt: skip
-    """Return the parts of a run for a result of ``count`` Gaussians.
-
-    ``has_target``: counts are tried until a PSNR is met. ``has_curve``: the scene's curve is measured first, down to
-    a loss of ``max_drop`` dB. ``rendered``: renders of the input stand for photos.
-    """
-    tries = (USUAL_BUILDS_OF_RENDERS if rendered else USUAL_BUILDS) if has_target else 1
-    parts = [costs.build(count)] * tries
-    if has_curve and not (has_target or rendered):
-        counts, steps = curve_counts(max_drop, limits.default, limits.min_count, limits.max_count)
+    costs: RunCosts, limits: CountLimits, count: float, choice: CountChoice, *, has_trial: bool
+) -> list[RunPart]:
+    """Return the parts of a run for a result of ``count`` Gaussians; ``has_trial``: a trial estimates new views."""
+    builds = 1
+    if choice.has_target:
+        builds = USUAL_BUILDS_OF_RENDERS if choice.rendered else USUAL_BUILDS
+    parts = [costs.build(count)] * builds
+    if choice.has_curve and not (choice.has_target or choice.rendered):
+        counts, steps = curve_counts(choice.max_drop, limits.default, limits.min_count, limits.max_count)
         parts = [*(costs.build(tried, steps) for tried in counts), *parts]
-    coarser = [count / LEVEL_FACTOR**level for level in range(1, levels)]
+    coarser = [count / LEVEL_FACTOR**level for level in range(1, costs.settings["levels"])]
     return [*parts, *costs.end(coarser, costs.trial(count) if has_trial else None)]

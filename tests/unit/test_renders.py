@@ -12,7 +12,6 @@ import unaligned_scenes
 
 from gsmerge import Cameras, CompactOptions, Scene, compact, render
 from gsmerge.compaction.estimate import estimate
-from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.place_cameras import (
     FEW_RENDERED_VIEWS,
     MOST_OUTSIDE,
@@ -28,7 +27,7 @@ from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
 from gsmerge.fit.report import FitReport
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.pipeline import build
-from gsmerge.plan import choose_for_scene
+from gsmerge.plan import choose_for_scene, make_plan
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Decoded, Gaussians, Region
 

@@ -20,7 +20,7 @@ from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.photos.row_colors import ROW_COLORS
 from gsmerge.photos.views import subset
-from gsmerge.plan import choose_for_scene
+from gsmerge.plan import choose_blocks
 from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES
 from gsmerge.settings.fit import GROW_STEPS
@@ -139,7 +139,7 @@ def test_all_photos_decide_whether_blocks_are_worse() -> None:
 
 
 def count_blocks(scene: Scene, **settings: Any) -> int:
-    return choose_for_scene(measure_size(scene), CompactOptions().with_settings(settings)).blocks
+    return choose_blocks(measure_size(scene), CompactOptions().with_settings(settings))
 
 
 def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from made_gaussians import random_gaussians
 
 from gsmerge import CompactOptions
-from gsmerge.compaction.costs import IMPORT_SECONDS, RunCosts, expected_parts
+from gsmerge.compaction.costs import IMPORT_SECONDS, CountChoice, RunCosts, expected_parts
 from gsmerge.compaction.estimate import estimate
 from gsmerge.facts.counts import count_limits
 from gsmerge.facts.scene_size import SceneSize
@@ -16,20 +16,19 @@ from gsmerge.types import Cameras, Scene
 
 VIEW = 480 * 320
 ALONE = Scene(random_gaussians(20_000, 0), Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1), None, None, ())
-USUAL: dict[str, Any] = {
-    "has_target": False, "has_curve": False, "max_drop": None, "rendered": False, "levels": 1, "has_trial": False,
-}  # fmt: skip
+ONCE = CountChoice()
 
 
-def seconds(views: int = 12, *, steps: int = 240, count: int = 50_000, threads: int = 1, **changes: Any) -> float:
-    """Wall time of a run, with settings of ``compact`` and with arguments of ``expected_parts``."""
-    parts = {name: changes.pop(name) for name in tuple(changes) if name in USUAL}
+def seconds(
+    views: int = 12, *, steps: int = 240, count: int = 50_000, threads: int = 1, choice: CountChoice = ONCE,
+    has_trial: bool = False, **changes: Any,
+) -> float:  # fmt: skip
+    """Wall time of a run, with settings of ``compact``."""
     options = CompactOptions().with_settings({"checkpoint": "none"} | changes)
     size = SceneSize(views * VIEW, views, 320, 480, True, rendered=False)
     costs = RunCosts(options.to_dict(), views * VIEW, VIEW, 0.5, steps)
-    expected = expected_parts(
-        costs, count_limits(size, options.segment, options.decode, options.budget), count, **USUAL | parts
-    )
+    limits = count_limits(size, options.segment, options.decode, options.budget)
+    expected = expected_parts(costs, limits, count, choice, has_trial=has_trial)
     return costs.seconds(expected, views, threads)
 
 
@@ -39,8 +38,10 @@ def test_more_work_takes_longer() -> None:
     assert seconds(steps=0, method="random") < usual < seconds(recipe="paper", checkpoint="paper")
     assert usual < min(seconds(24), seconds(steps=1000), seconds(count=10**6))
     assert seconds(steps=0, count=1) == seconds(steps=0, count=10**6)
-    for changes in ({"has_curve": True}, {"has_target": True}, {"levels": 3}, {"has_trial": True}):
-        assert usual < seconds(**changes) < 4 * usual
+    for choice in (CountChoice(has_curve=True), CountChoice(has_target=True)):
+        assert usual < seconds(choice=choice) < 4 * usual
+    for longer in (seconds(levels=3), seconds(has_trial=True)):
+        assert usual < longer < 4 * usual
     assert seconds(2) > seconds(2, threads=2) == seconds(2, threads=16)
 
 

@@ -11,7 +11,6 @@ import scenes
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.compact import build_cleaned
-from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.move_poses import CHANCE, move_poses
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
@@ -25,6 +24,7 @@ from gsmerge.geometry.transforms import (
     quat_to_rotmat,
 )
 from gsmerge.geometry.transforms import without_common_motion as without_common
+from gsmerge.plan import make_plan
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
 

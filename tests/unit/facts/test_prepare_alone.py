@@ -11,11 +11,11 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
+from gsmerge.compaction.methods import stands_alone
 from gsmerge.facts.place_cameras import HELD_OUT, place_viewpoints
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.fit import FitOptions, fit_scene
 from gsmerge.geometry.transforms import project
-from gsmerge.plan import stands_alone
 from gsmerge.runtime.record import record_run
 from gsmerge.stages.fit_pairs import merge_pairs
 

@@ -6,8 +6,8 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, Scene
-from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.prepare import prepare
+from gsmerge.plan import make_plan
 from gsmerge.stages.segment import SuperpixelChoices, segment_scene
 
 SHARE = {"superpixels": "5%"}
