@@ -79,11 +79,11 @@ def fit(start: Decoded, prepared: Prepared, plan: Plan) -> Fitted:
 
 
 def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Plan) -> Fitted:
-    """Drop the Gaussians that no view sees, and fill gaps between the views with new Gaussians instead.
+    """Drop the Gaussians that no view sees, and put new ones into gaps between the views in their place.
 
-    Gaps are filled only after a long fit that was accepted, and only if all of the scene counts, not a region of it. If
-    nothing is to be dropped, only the Gaussians whose places they take are. Merged pairs, trials and an unchanged input
-    stay complete.
+    Gaps are filled only after a long fit that was accepted, and only if all of the scene counts, not a region of it. A
+    plan that fills the budget, or that drops nothing, keeps unseen Gaussians, except as many as are new. Merged pairs,
+    trials and an unchanged input stay complete.
     """
     scene, is_unchanged = prepared.scene, start.is_input and fitted.report is None
     is_long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
@@ -94,7 +94,7 @@ def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Pla
     added = seen[:0]
     if has_gaps:
         added = fill_between(seen, fitted.cameras, fitted.outside, len(unseen), beyond=plan.fit.beyond)
-    if plan.fit.fills or not plan.prunes:  # the rest of the budget goes to Gaussians that no view sees
+    if plan.fit.fills or not plan.prunes:
         added = Gaussians.concat([unseen[: len(unseen) - len(added)], added])
     written = Gaussians.concat([seen, added])
     most = start.count if plan.fit.grows else len(start.gaussians)

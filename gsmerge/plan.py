@@ -158,7 +158,7 @@ class Plan:
 class FilledOptions:
     """Options whose open settings were filled in from facts about the scene."""
 
-    asked: CompactOptions  # The options as they were given
+    original: CompactOptions  # The options of the caller
     options: CompactOptions  # With K, and a budget that the scene can make use of
     segment: SegmentOptions  # With numbers that depend on effort and scene
     clean: CleanOptions  # Without the sky, if no photo shows where it is
@@ -200,9 +200,9 @@ def _fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
 
 def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | None) -> Plan:
     """Make all decisions about a run."""
-    size, asked, options, segment = prepared.size, filled.asked, filled.options, filled.segment
-    keeps = keeps_fidelity(size, asked)
-    target = FIDELITY_PSNR if keeps and size.rendered else asked.budget.target_psnr
+    size, original, options, segment = prepared.size, filled.original, filled.options, filled.segment
+    keeps = keeps_fidelity(size, original)
+    target = FIDELITY_PSNR if keeps and size.rendered else original.budget.target_psnr
     has_repeats = len(prepared.scene) < len(prepared.input_scene)
     num_input = prepared.input_scene.num_gaussians if has_repeats else None  # to which shares of a budget refer
     choices = choose_for_scene(size, filled.counted, num_input=num_input, keeps=keeps)
@@ -230,12 +230,12 @@ def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | 
         auto_count=budget.auto,
         levels=budget.levels,
         output=budget.output,
-        size=file_size(asked.budget),
+        size=file_size(original.budget),
         scored_views=_choose_scored_views(prepared, EFFORTS[options.effort] if samples else None),
         samples=samples,
         seed=options.seed,
         checkpoint=checkpoint,
-        settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
+        settings=replace(options, budget=original.budget).to_dict() | {"fit_steps": fit.steps},
         free_poses=options.prepare.poses == "free",
         # without a fit no photo has been seen, so the score on own photos holds for new views, too
         new_views=fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views,
@@ -295,18 +295,19 @@ def choose_for_scene(
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     """Return the number of blocks for a scene; UsageError if it cannot be cut into the number that was asked for."""
-    shared = [] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]
-    problems = [*_uncut_settings(options), *shared]
-    asked = wanted_blocks(options, scene.num_gaussians, scene.num_views)
+    problems = _uncut_settings(options)
+    if not scene.has_own_pixels:
+        problems.append("a scene whose views have no Gaussians of their own")
+    count = wanted_blocks(options, scene.num_gaussians, scene.num_views)
     if options.blocks.blocks == "auto":
-        asked = 1 if problems else min(scene.num_views, asked)
-    if asked <= 1:
+        count = 1 if problems else min(scene.num_views, count)
+    if count <= 1:
         return 1
     if problems:
-        raise UsageError(f"blocks {asked}: expected one piece (--set blocks=none) with {problems[0]}")
-    if asked > scene.num_views:
-        raise UsageError(f"blocks {asked}: expected at most one for each of {scene.num_views} views")
-    return asked
+        raise UsageError(f"blocks {count}: expected one piece (--set blocks=none) with {problems[0]}")
+    if count > scene.num_views:
+        raise UsageError(f"blocks {count}: expected at most one for each of {scene.num_views} views")
+    return count
 
 
 def usual_blocks(num_gaussians: int, num_views: int) -> int:
@@ -321,10 +322,10 @@ def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 
 
     ``num_views``: 0 if there are few views.
     """
-    asked = options.blocks.blocks
-    if asked == "auto":
+    blocks = options.blocks.blocks
+    if blocks == "auto":
         return 1 if _uncut_settings(options) else usual_blocks(num_gaussians, num_views)
-    return 1 if asked == "none" else int(asked)
+    return 1 if blocks == "none" else int(blocks)
 
 
 def _uncut_settings(options: CompactOptions) -> list[str]:
@@ -471,10 +472,11 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     decode = options.decode
     if decode.k != AUTO:
         return decode
-    asked = options.budget.quality is not None or options.changed_counts
-    fits = options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
-    lone = scene.has_own_pixels and scene.num_cameras == 1
-    return replace(decode, k=LONE_K if lone and not (asked or options.replaces_stages or fits) else USUAL_K)
+    decides_count = options.budget.quality is not None or options.changed_counts
+    has_long_fit = options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
+    has_one_camera = scene.has_own_pixels and scene.num_cameras == 1
+    needs_more = has_one_camera and not (decides_count or options.replaces_stages or has_long_fit)
+    return replace(decode, k=LONE_K if needs_more else USUAL_K)
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:

@@ -64,11 +64,11 @@ REASONS = {
         opt.option("name", str, "Name of each result; {stem}, {parent}, {index} and {k} are replaced.",
                    default="{stem}.ply", metavar="NAME"),
     ),
-    opt.changed("overwrite", False, help="Compact all scenes again. Also replace files in the folder that were not "
-                "written by a batch with these settings."),
+    opt.change_option("overwrite", False, help="Compact all scenes again. Also replace files in the folder that were "
+                "not written by a batch with these settings."),
     "strict dry_run seed",
-    opt.changed("threads", help="Number of threads of each scene.", show_default="processors by jobs"),
-    opt.changed("json", False, help="Print one line of JSON per scene on stdout."),
+    opt.change_option("threads", help="Number of threads of each scene.", show_default="processors by jobs"),
+    opt.change_option("json", False, help="Print one line of JSON per scene on stdout."),
 )  # fmt: skip
 def batch(args: opt.Args) -> None:
     """Compact many scenes, each on its own. A failure stops no other scene, and a second call continues."""
@@ -175,10 +175,10 @@ class Totals:
     def add(self, record: Mapping[str, Any]) -> None:
         """Count the record of one scene."""
         report = record["report"]
-        found = {"doubt": "; also ".join(record["doubts"]), "lacking": "", **record}
+        reasons = {"doubt": "; also ".join(record["doubts"]), "lacking": "", **record}
         if report and not report["input"]["num_photos"] and {*record["doubts"]} <= {report["worse"]}:
-            found["lacking"] = _describe_lack(report)
-        for name, reason in found.items():
+            reasons["lacking"] = _describe_lack(report)
+        for name, reason in reasons.items():
             if reason and name in REASONS:
                 self.reasons[name].append((record["scene"], reason))
         self.counts[record["status"]] += 1

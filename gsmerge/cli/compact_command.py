@@ -67,7 +67,7 @@ def look(args: opt.Args) -> None:
     from gsmerge.cli.view_command import view
 
     before, *after = shown
-    cameras = {} if len(shown) == 1 else args.given(("cameras", "images", "masks", "protect", "hint"))
+    cameras = {} if len(shown) == 1 else args.get_given(("cameras", "images", "masks", "protect", "hint"))
     loaded = replace(loads[0], notes=()) if after else None  # its notes have been printed already
     opens = args.open and not args.json
     opt.call(view, before=before, after=after, **cameras, open=opens, quiet=args.silent, loaded=loaded)

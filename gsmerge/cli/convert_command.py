@@ -27,9 +27,9 @@ class PhotoOptions(Settings):
                  "Files or folders of Gaussians, such as a .ply, .spz or .sog. Several files in one coordinate frame "
                  "are joined. The last path is the output, and its name sets the format, also .html (a page to send), "
                  "lod-meta.json, or a folder."),
-    opt.changed("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
+    opt.change_option("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
-    opt.changed("hint", help="How the files store opacity, scales and colours, if it is not recognised: "
+    opt.change_option("hint", help="How the files store opacity, scales and colours, if it is not recognised: "
                 "opacity=logit or raw, scales=log or linear, colors=sh or rgb."),
     opt.settings_option(FileOptions, PhotoOptions, CleanOptions, PlacementOptions, example="normals=false"),
     "up scale rotate translate sh_degree crop drop overwrite",

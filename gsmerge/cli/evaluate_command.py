@@ -52,7 +52,7 @@ def evaluate(args: opt.Args) -> None:
     files, outputs = args.files(args.before), args.output or []
     if args.quiet and not (outputs or args.json):
         raise UsageError("--quiet: expected -o or --json with it, since otherwise nothing is shown or written")
-    _check_files(args, outputs, input_files(files))
+    _check_output_files(args, outputs, input_files(files))
     from gsmerge.measure.documents import to_json
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
     from gsmerge.measure.scores import evaluation_csv, evaluation_document, evaluation_lines
@@ -70,7 +70,7 @@ def evaluate(args: opt.Args) -> None:
         evaluation = evaluate_scene(
             pair.scene, pair.gaussians, pair.held_out, options, cameras=pair.cameras, progress=progress
         )
-    document = evaluation_document(evaluation, _facts(pair), notes)
+    document = evaluation_document(evaluation, _describe_files(pair), notes)
     writers = {".json": to_json, ".csv": evaluation_csv}
     write_texts({path: writers[path.suffix](document) for path in outputs})
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
@@ -78,7 +78,7 @@ def evaluate(args: opt.Args) -> None:
     say_notes(evaluation.notes, quiet=args.silent)
 
 
-def _check_files(args: opt.Args, outputs: Sequence[Path], inputs: Sequence[Path]) -> None:
+def _check_output_files(args: opt.Args, outputs: Sequence[Path], inputs: Sequence[Path]) -> None:
     """Raise UsageError if an output cannot be written."""
     for path in outputs:
         if path.suffix not in SUFFIXES:
@@ -86,7 +86,7 @@ def _check_files(args: opt.Args, outputs: Sequence[Path], inputs: Sequence[Path]
     check_outputs(outputs, (*inputs, *args.after, args.targets, args.target_images), reports=True)
 
 
-def _facts(pair: BeforeAfter) -> dict[str, dict[str, Any]]:
+def _describe_files(pair: BeforeAfter) -> dict[str, dict[str, Any]]:
     """Collect facts about each file by name."""
     from gsmerge.measure.evaluate import INPUT
 

@@ -29,7 +29,6 @@ def extend(args: opt.Args) -> None:
     """Compact new views and add them to a state, from which gsmerge compact makes a result at any time."""
     from gsmerge.io.formats.table import STATE_ENDING
 
-    start = perf_counter()
     if args.state.suffix.lower() != STATE_ENDING:
         raise UsageError(f"{args.state}: expected a state whose name ends in {STATE_ENDING}")
     hints, scenes = args.hints(), args.scenes
@@ -44,7 +43,7 @@ def extend(args: opt.Args) -> None:
             raise UsageError(f"{args.state}: expected a state other than the input; name another file")
     documents, trial_state = list[dict[str, Any]](), None  # a dry run passes the state on, since it writes nothing
     for files in batches:
-        before = {"import": perf_counter() - start} if not documents else {}
+        before = {"import": perf_counter() - args.start} if not documents else {}
         with stage_progress(quiet=args.silent) as progress:
             document, state = extend_file(
                 args.state, files, settings, opacity=args.opacity, hints=hints, progress=progress,

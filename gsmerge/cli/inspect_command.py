@@ -26,7 +26,7 @@ def inspect(args: opt.Args) -> None:
         return
     if args.cameras is not None or args.images is not None:
         raise UsageError("--cameras and --images: expected one scene with them")
-    _check_files(args)
+    _print_checks(args)
 
 
 def _inspect_scene(args: opt.Args, path: Path) -> None:
@@ -51,7 +51,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
         raise SceneError(path, "; ".join(problems))
 
 
-def _check_files(args: opt.Args) -> None:
+def _print_checks(args: opt.Args) -> None:
     """Print a line for each file; SceneError if ``compact`` refuses one."""
     from gsmerge.inspection.file_checks import FileCheck, check_content
     from gsmerge.measure.documents import document_head, note_entries

@@ -66,14 +66,14 @@ class Args(SimpleNamespace):
         """True if only data is printed, or nothing."""
         return bool(self.quiet or self.json)
 
-    def given(self, names: Iterable[str]) -> dict[str, Any]:
+    def get_given(self, names: Iterable[str]) -> dict[str, Any]:
         """Return the subset of the named options that the user gave."""
         values = vars(self)
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def require_scene(self, names: Collection[str], path: Path) -> None:
         """Raise UsageError for a given option outside ``names``, since the input ``path`` holds Feature Gaussians."""
-        for name, value in self.given(OPTIONS).items():
+        for name, value in self.get_given(OPTIONS).items():
             if value and name not in names and value != OPTIONS[name].default:
                 flag = f"--{name.replace('_', '-')}"
                 raise UsageError(
@@ -93,7 +93,7 @@ class Args(SimpleNamespace):
     def values(self, *kinds: type, but: Collection[str] = ()) -> dict[str, Any]:
         """Collect the settings of the classes ``kinds`` that the user gave, by flat name, except those in ``but``."""
         settings = {name: setting for kind in kinds for name, setting in flat_settings(kind).items() if name not in but}
-        options = self.given(settings)
+        options = self.get_given(settings)
         pairs = parse_pairs("--set", vars(self).get("set") or (), settings)
         for name in options.keys() & pairs.keys():
             raise UsageError(f"--set {name}: expected this setting once, got --{name.replace('_', '-')} too")
@@ -199,7 +199,7 @@ def usage_errors() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Declared:
+class Declaration:
     """An argument or an option of a command."""
 
     name: str
@@ -235,16 +235,16 @@ class Declared:
 
 def _declare(
     name: str, kind: Any, info: Any, parse: Callable[[str], Any] | None, default: Any, flags: tuple[str, ...] = ()
-) -> Declared:
+) -> Declaration:
     """Declare an argument or option; ``kind`` is the type of its values, ``list[...]`` if it takes several."""
     kinds = [one for one in get_args(kind) if one is not NoneType] if isinstance(kind, UnionType) else [kind]
     single = get_args(kinds[0])[0] if get_origin(kinds[0]) is list else kinds[0]
     shape = single if single is bool else list[str] if single is not kinds[0] else str
     parse = parse or (parse_path if single is Path else str)
-    return Declared(name, shape, info, parse, default, flags)
+    return Declaration(name, shape, info, parse, default, flags)
 
 
-def argument(name: str, kind: Any, metavar: str, help: str, default: Any = REQUIRED) -> Declared:
+def argument(name: str, kind: Any, metavar: str, help: str, default: Any = REQUIRED) -> Declaration:
     """Declare a positional argument of a command."""
     return _declare(name, kind, typer.Argument(metavar=metavar, help=_escape(help)), None, default)
 
@@ -253,7 +253,7 @@ def option(
     name: str, kind: Any, help: str, *flags: str, default: Any = None, wording: str | None = None,
     metavar: str | None = None, parser: Callable[[str], Any] | None = None, min: float | None = None,
     max: float | None = None, **more: Any,
-) -> Declared:  # fmt: skip
+) -> Declaration:  # fmt: skip
     """Declare an option of a command; ``kind`` bool makes a switch, a tuple lists the possible values.
 
     By default ``flags`` are derived from the name. ``wording`` is the default in words, if the library decides it.
@@ -275,7 +275,7 @@ def option(
 
 def setting_option(
     name: str, *flags: str, metavar: str | None = None, wording: str | None = None, **more: Any
-) -> Declared:
+) -> Declaration:
     """Declare an option for a setting of the library, with its help and values; ``more`` goes to :func:`option`."""
     declared = SETTINGS[name]
     flags = flags or (f"--{name.replace('_', '-')}",)
@@ -286,19 +286,19 @@ def setting_option(
     return option(name, str, declared.help, *flags, metavar=metavar, wording=wording, **more)
 
 
-def switch(name: str, help: str, *short: str, **more: Any) -> Declared:
+def switch(name: str, help: str, *short: str, **more: Any) -> Declaration:
     """Declare a switch: an option without a value, off by default."""
     return option(name, bool, help, f"--{name.replace('_', '-')}", *short, default=False, **more)
 
 
-def panel(title: str, *parameters: Declared) -> tuple[Declared, ...]:
+def panel(title: str, *parameters: Declaration) -> tuple[Declaration, ...]:
     """Group options under a title in the help."""
     for parameter in parameters:
         parameter.info.rich_help_panel = title
     return parameters
 
 
-def changed(name: str, default: Any = None, **changes: Any) -> Declared:
+def change_option(name: str, default: Any = None, **changes: Any) -> Declaration:
     """Copy a declared option and change it for one command: its default, ``help``, ``show_default``, ..."""
     info = copy(OPTIONS[name].info)
     vars(info).update(changes)
@@ -310,9 +310,9 @@ def _escape(help: str) -> str:
     return re.sub(r"\[(?=[a-z])", r"\\[", help.replace("`", ""))
 
 
-def command(*parameters: str | Declared) -> Callable[[Callable[[Args], None]], Callable[..., None]]:
+def command(*parameters: str | Declaration) -> Callable[[Callable[[Args], None]], Callable[..., None]]:
     """Decorate a command with its parameters, in the order of the help; a text lists names of declared options."""
-    listed: dict[str, Declared] = {}
+    listed: dict[str, Declaration] = {}
     for parameter in (*parameters, "progress json quiet"):
         for name in parameter.split() if isinstance(parameter, str) else [parameter.name]:
             listed.setdefault(name, OPTIONS[name] if isinstance(parameter, str) else parameter)
@@ -341,7 +341,7 @@ def call(function: Callable[..., None], **values: Any) -> None:
     function.__wrapped__(Args(**{name: one.default for name, one in parameters} | values))  # type: ignore[attr-defined]
 
 
-def settings_option(*kinds: type | LazyFunction, example: str = "match=aabb") -> Declared:
+def settings_option(*kinds: type | LazyFunction, example: str = "match=aabb") -> Declaration:
     """Declare ``--set`` for the settings of ``kinds``; a class that takes long to import is given as a LazyFunction."""
 
     def show(values: list[str] | None) -> list[str] | None:
@@ -350,7 +350,7 @@ def settings_option(*kinds: type | LazyFunction, example: str = "match=aabb") ->
         print("\n".join(_settings_lines(listed_settings(kinds))))
         raise typer.Exit
 
-    return changed(
+    return change_option(
         "set",
         help=f"Any other setting, such as {example}; may be repeated. --set help lists all.",
         callback=show,
@@ -463,6 +463,6 @@ _TABLE = (
 OPTIONS = {parameter.name: parameter for parameters in _TABLE for parameter in parameters}
 
 
-def output(help: str, wording: str | None = None, default: Any = None) -> Declared:
+def output(help: str, wording: str | None = None, default: Any = None) -> Declaration:
     """Declare ``-o/--output`` of a command, a file or a folder; ``default`` may be REQUIRED."""
-    return changed("output", default, help=help, show_default=wording or default is not REQUIRED)
+    return change_option("output", default, help=help, show_default=wording or default is not REQUIRED)

@@ -81,7 +81,7 @@ def render(args: opt.Args) -> None:
     else:
         check_folder(args.output, inputs, overwrite=args.overwrite)
     hints = args.hints(max_side=MAX_SIDE) if kind == "views" else args.hints()
-    arguments = args.given(("views", "path", "frames", "size", "background"))
+    arguments = args.get_given(("views", "path", "frames", "size", "background"))
     drawing = drawings.DRAWINGS[kind](
         drawings.DrawOptions(files, args.scenes, framing, args.output, args.opacity, hints, **arguments)
     )

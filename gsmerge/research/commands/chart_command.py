@@ -126,7 +126,7 @@ def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     figures = make_figures(Results(records))
     drawings = draw_figures(figures, out / CHARTS)
     words = ["gsmerge", "lab", "chart", *(args.scenes or ()), "--output", str(out)]  # the equivalent command line
-    for name, value in args.given(("grid", "set", "targets")).items():
+    for name, value in args.get_given(("grid", "set", "targets")).items():
         for element in value if isinstance(value, list) else [value]:
             words += [f"--{name}", element]
     page = make_chart_page(records, figures, drawings, shlex.join(words))
