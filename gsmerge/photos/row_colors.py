@@ -42,8 +42,8 @@ T = TypeVar("T")
 def add_row_colors(scene: Scene, *, has_photos: bool = False) -> PicturedScene:
     """Use the colours of each view's own Gaussians as the photos of a canonical scene, with a note.
 
-    ``has_photos``: the scene has photos that do not count. An earlier note says so, so that this note is made only if
-    drawings are used.
+    ``has_photos``: the scene has photos, which do not count. Then an earlier note has said so, and this function makes
+    a note only if drawings are used.
     """
     shape = len(scene), scene.cameras.height, scene.cameras.width
     images, masks = np.zeros((*shape, 3), np.float32), np.full(shape, False)
@@ -79,10 +79,10 @@ def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T], mask:
     kinds = camera_kinds(scene.cameras)
     groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]
     groups = [views for views in groups if mask is None or mask[views].any()]
-    return list(in_turn(lambda views: use(views, _picture_rows_of(scene, views)), groups))
+    return list(in_turn(lambda views: use(views, _picture_camera(scene, views)), groups))
 
 
-def _picture_rows_of(scene: Scene, views: np.ndarray) -> RowPicture:
+def _picture_camera(scene: Scene, views: np.ndarray) -> RowPicture:
     """Draw the Gaussians of all ``views`` of one camera, and choose for each pixel their colours or the drawing."""
     layers = subset(scene, views.tolist())
     if len(layers.gaussians) == 0:
