@@ -44,7 +44,7 @@ def pick_views(num_views: int, max_count: int) -> list[int]:
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
     """Return the index of the candidate nearest to the middle of each two consecutive ``contexts``.
 
-    Both are positions of views in a video. Two contexts without a candidate between them are left out.
+    Both are positions along the capture. Two contexts without a candidate between them are left out.
     """
     midpoints = []
     for low, high in pairwise(sorted(contexts)):
