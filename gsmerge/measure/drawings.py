@@ -67,7 +67,7 @@ class DrawOptions:
     output: Path  # a picture, a video, or a folder for pictures
     opacity: OpacityChoice = "auto"
     hints: ReadHints = NO_HINTS
-    views: int | str | None = None  # largest number of views, or the name of one view; None: all views, four of a panel
+    views: int | str | None = None  # largest number of views, or the name of one view; None: all, but four in a panel
     path: str | None = None  # text of gsmerge.measure.camera_path.parse_camera_path, or a file of cameras
     frames: int | None = None  # frames of a path; None: SECONDS long, of a spline at least VIEW_FRAMES for each view
     size: tuple[int, int] | None = None  # width and height of a picture; None: the size of the cameras
@@ -327,7 +327,7 @@ def find_view(view: str, names: Sequence[str]) -> int:
 def picture_stems(names: Sequence[str]) -> list[str]:
     """Choose a file name without ending for each view, all different.
 
-    They are the names of the images, or, if two are equal, whole paths joined by ``_``, or, if these are, numbers.
+    They are the names of the images. If two are equal, they are whole paths joined by ``_``, and otherwise numbers.
     """
     paths = []
     for name in names:

@@ -394,7 +394,7 @@ def _add_qualities(
     """Add to a view's score the quality of a render over all pixels, over seen pixels, and over ``covered`` pixels."""
     photo, seen = split.views.images[view], split.visible[view]
     share = None if covered is None else float(covered.mean())
-    covered_mask = covered if share is not None and share < WHOLE_SHARE else None  # a little less counts as all
+    covered_mask = covered if share is not None and share < WHOLE_SHARE else None  # None: all pixels
     full, masked, covered_quality = _measure_qualities(image, photo, (None, seen, covered_mask))
     full, masked = _add_lpips((full, masked), image, photo, seen, nets)
     score = replace(score, full=full, masked=masked)

@@ -175,8 +175,8 @@ def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarr
 def mean_fog(counts: np.ndarray) -> Fog:
     """Make the figures of a :class:`Fog` from the sums and numbers of pixels ``[pictures,6,2]`` of several pictures.
 
-    They are those of :func:`sum_pixels` and :func:`count_spikes`. Each sum is divided by its number of pixels, over all
-    pictures, but veils first in each picture.
+    The sums are those of :func:`sum_pixels` and :func:`count_spikes`. Each is divided by its number of pixels, over all
+    pictures together. Veils are divided in each picture, and then averaged.
     """
     near, far, holes, _, *spikes = (total / count if count else None for total, count in counts.sum(0).tolist())
     veils = [total / count for total, count in counts[:, 3].tolist() if count]

@@ -169,8 +169,8 @@ class Assigner:
         Noise of the drawings lowers the scores of all photos and moves their parts. The thresholds therefore follow
         from the scores and parts of the proposed photos themselves.
 
-        Where names are ``exact``, a photo is confirmed if its score is high and no other assignment raises it. Other
-        photos are confirmed by their parts.
+        Where names are ``exact``, a photo is confirmed if its score is high and no other assignment scores higher.
+        Other photos are confirmed by their parts.
         """
         out, confirmed = list[Assignment | None]([None] * len(named)), [False] * len(named)
         named_pairs = [(view, photo) for view, photo in enumerate(named) if photo is not None]

@@ -149,7 +149,7 @@ def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Ch
 
 
 def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: FitColors) -> np.ndarray:
-    """Change photos ``[v,h,w,3]``: each half of the blocks by the change that ``fit`` finds for the other half."""
+    """Change each half of the blocks of photos ``[v,h,w,3]`` by the change that ``fit`` finds for the other half."""
     out, block_side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
     y, x = ((np.arange(size) / block_side).astype(int) for size in photos.shape[1:3])
     black_squares = (y[:, None] + x) % 2 == 1  # of the chess board

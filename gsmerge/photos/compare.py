@@ -204,11 +204,11 @@ def find_matching_views(
 
 
 def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> bool:
-    """Return whether a linear map of colours, but no tone curve, explains how the photos of ``views`` differ.
+    """Return whether a linear map of colours, but no tone curve, explains how the photos differ from Gaussians.
 
     The map may lead from photos to Gaussians, or from Gaussians to photos, for example to grey ones. Photos of another
     scene do not have another look: a single colour explains them as well as the map, or they do not match their views
-    even after it.
+    even after it. Only ``views`` are compared.
     """
     view_pairs = pairs[views]
     if _is_mapped(view_pairs):

@@ -57,7 +57,7 @@ class PartFit:
         return round(scale * self.shape[0]), round(scale * self.shape[1])
 
     def describe(self, size: Size, *, bars: bool) -> str:
-        """Say which part of photos of a ``size`` is used; ``bars``: what is cut off are bars."""
+        """Say in a note which part of photos of a ``size`` is used; ``bars`` means that only bars are cut off."""
         before, part = "{} x {}".format(*size), part_size(size, self.part)
         after, ratio = "{} x {}".format(*part), self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
         if bars:
@@ -75,8 +75,9 @@ WHOLE_FIT = PartFit()
 def list_parts(size: Size, shape: Size | None, inner: Part) -> list[PartFit]:
     """List the parts of photos of a ``size`` that views may show, likely ones first.
 
-    ``inner`` is the part inside of bars. Views have the aspect ratio of ``shape``. Parts with another aspect ratio come
-    last, and are stretched. With None, views may have any aspect ratio, and no part is stretched.
+    ``inner`` is the part inside of bars. Views have the aspect ratio of ``shape``. Of parts with another aspect ratio,
+    only the whole and its halves are listed; they come last, and are stretched. With None, views may have any aspect
+    ratio, and no part is stretched.
     """
     counts = product(range(1, _TILES + 1), repeat=2)  # columns and lines of tiles
     tiles = [(x / m, y / n, (x + 1) / m, (y + 1) / n) for m, n in counts for y, x in product(range(n), range(m))]

@@ -244,9 +244,9 @@ def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], 
 def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple[Masks, list[str]]:
     """Return the masks that are used, and notes on the share of the photos that they leave out.
 
-    If masks leave out nearly everything, masks that the user named are an SceneError, and others are not used. If masks
-    that the user did not name leave out most pixels that show Gaussians, the note is a doubt, since they may be
-    inverted.
+    Masks that leave out nearly everything are not used, and raise a SceneError if the user named them. If a folder of
+    masks that the user did not name leaves out most pixels that show Gaussians, the note is a doubt, since the masks
+    may be inverted.
     """
     counts = masks.counts
     if counts is None:

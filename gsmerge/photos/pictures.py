@@ -115,9 +115,9 @@ def show_views(scene: Scene, side: int | None = None, frame: Frame | None = None
 
 
 def _show_rows(scene: Scene, side: int) -> ViewPictures:
-    """Make pictures from the colours of the views' own Gaussians, at most ``side`` pixels on the longer side.
+    """Make pictures from the colours of the views' own Gaussians, one of every few pixels.
 
-    They are those of pixels at equal steps.
+    The longer side has at most ``side`` pixels.
     """
     grid = _sample_grid(scene.cameras, side)
     rows = scene.get_pixels().fronts[grid]

@@ -74,7 +74,7 @@ class ScenePhotos:
 
     @property
     def file_size(self) -> Size | None:
-        """Size of the used part of most upright photos; of equally frequent sizes the largest. None without files."""
+        """Most frequent size of the used part of upright photos, the largest of several. None without files."""
         sizes = [
             part_size(_upright_size(path, turn), self.part)
             for path, turn in zip(self.paths, self.turns, strict=True)
@@ -201,7 +201,7 @@ def _find_photos_near(files: SceneFiles, camera_file: CameraFile) -> tuple[Path,
 
 
 def _describe_missing_file(folder: Path, name: str) -> str:
-    """Say that a file does not exist; if another format that is not read has its stem, name that file, too."""
+    """Say that a file does not exist; also name a file of the same stem whose format is not read, if there is one."""
     inner, same_stem = PurePath(name), set[str]()
     for place in {folder, folder if inner.is_absolute() or ".." in inner.parts else folder / inner.parent}:
         with suppress(OSError, ValueError):
@@ -290,6 +290,7 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
         return None
     (width, height), _ = Counter(sizes[path] for path in paths if path is not None).most_common(1)[0]
     shape = f"the aspect ratio of {width} x {height}"
+    # the photos with another aspect ratio, and their sizes as text
     others = {path: "{} x {}".format(*size) for path, size in sizes.items() if not same_shape(size, (width, height))}
     camera_sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
     # a size of 1 pixel means that the camera has no size
@@ -307,13 +308,13 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
 
 
 def _upright_size(path: Path, turn: int) -> Size:
-    """Read the size of a photo, and return it as it is after the turn."""
+    """Read the size of a photo, and return the size after the turn."""
     width, height = image_size(path)
     return (height, width) if turn % 2 else (width, height)
 
 
 def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
-    """Make candidates of the files of a proposal. They are read small, and fitted to a grid by ``fit`` if given."""
+    """Make candidates of the files of a proposal. Photos are read small, and fitted to a grid by ``fit`` if given."""
 
     def read(photo: int) -> np.ndarray:
         """Read a small version of a photo, and cut out the part that is used."""

@@ -108,7 +108,7 @@ class Comparer:
 
 
 def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
-    """Make filters for photos that are stored turned by some number of ``quarters`` of a turn, mirrored or not."""
+    """Make filters for photos that are stored turned by one of these numbers of quarter turns, mirrored or not."""
     orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
     products, weights, lengths = [], [], []
     for picture, weight in zip(small.pictures, small.weights, strict=True):
@@ -165,7 +165,7 @@ def signed_ranks(gains: np.ndarray) -> float:
 def stands_out(gains: np.ndarray) -> bool:
     """Return True if gains ``[n]`` are above zero by more than :data:`NOISE_MARGIN` standard deviations of their noise.
 
-    The gains must be held out: the views, or the parts of views, in which they are measured were not used to fit what
-    causes them.
+    The gains must be held out: the change that causes them was fitted without the views, or the parts of views, in
+    which they are measured.
     """
     return signed_ranks(gains) > NOISE_MARGIN

@@ -19,7 +19,7 @@ BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of a scene 
 
 
 def even_views(num_views: int, count: int) -> list[int]:
-    """Return ``count`` view ids at equal intervals, with the first and the last view; the middle one if it is 1."""
+    """Return ``count`` view ids at equal intervals, with the first and the last; for a ``count`` of 1 the middle one."""
     if not 1 <= count <= num_views:
         raise ValueError(f"views: expected 1 to {num_views}, got {count}")
     if count == 1:
@@ -63,9 +63,9 @@ def camera_kinds(cameras: Cameras) -> np.ndarray:
 
 
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
-    """Return the ids of the views that repeat no earlier view, and for every view the index among these of its equal.
+    """Return the ids of distinct views, which equal no earlier view, and for every view which of these it equals.
 
-    Two views are equal if camera, photo, masks and Gaussians are.
+    The second list has indices into the first. Two views are equal if camera, photo, masks and Gaussians are.
     """
     kinds = camera_kinds(scene.cameras)
     distinct, indices = list[int](), list[int]()
