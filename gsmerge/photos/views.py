@@ -19,7 +19,7 @@ BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of a scene 
 
 
 def even_views(num_views: int, count: int) -> list[int]:
-    """Return ``count`` view ids at equal intervals, with the first and the last; for a ``count`` of 1 the middle one."""
+    """Return ``count`` view ids at equal intervals, with the first and the last; the middle one for ``count = 1``."""
     if not 1 <= count <= num_views:
         raise ValueError(f"views: expected 1 to {num_views}, got {count}")
     if count == 1:

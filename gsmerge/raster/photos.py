@@ -255,7 +255,7 @@ def score_photos(
 ) -> PhotoScore:
     """Score renders of Gaussians against the photos of ``views``.
 
-    Only one of ``every`` so many tiles is scored, see :func:`scored_tiles`. ``covered`` has a mask ``[h,w]`` of the
+    Of each ``every`` tiles one is scored, see :func:`scored_tiles`. ``covered`` has a mask ``[h,w]`` of the
     covered pixels for each of the views. By default a pixel is covered if its opacity is above a half. ``settings`` are
     options of :func:`photo_errors`.
     """
@@ -307,10 +307,10 @@ def _scored_pixels(photos: Photos, view: int, every: int) -> np.ndarray | None:
 
 
 def scored_tiles(view: int, width: int, height: int, every: int) -> np.ndarray | None:
-    """Return the mask ``[tile_height,tile_width]`` of one of ``every`` so many tiles of a view; None: all tiles.
+    """Return the mask ``[tile_height,tile_width]`` of the tiles of a view that are scored; None: all tiles.
 
-    Of a small view more tiles are selected, at least ``LEAST_TILES``. The tiles are spread evenly, and differ from view
-    to view.
+    Of each ``every`` tiles one is scored. Of a small view more are, at least ``LEAST_TILES``. The tiles are spread
+    evenly, and differ from view to view.
     """
     tile_height, tile_width = -(-height // TILE), -(-width // TILE)
     every = min(every, tile_height * tile_width // LEAST_TILES)

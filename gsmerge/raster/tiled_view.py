@@ -301,7 +301,7 @@ def tile_view(
 
     Tiles have 16 x 16 pixels. Only tiles with a True ``tiles [tile_height,tile_width]`` have to be complete. ``band``
     has the first and last + 1 line of tiles; the result is a view of these lines alone. ``columns`` has the first and
-    last + 1 column of tiles; all other tiles may be empty.
+    last + 1 column of tiles; all other tiles are empty.
 
     The size of the result depends on the number of visible Gaussians, not on n. Raises ValueError if a size or a number
     is out of range.
