@@ -1,4 +1,4 @@
-"""Make cameras along a path for videos, or one outside camera, from the cameras of a scene; all in float64."""
+"""Make cameras from those of a scene: along a path for videos, or one outside the capture. All are in float64."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from gsmerge.measure.fog import FOG_CAMERAS
 from gsmerge.types import Cameras
 
 PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
-CURVE_PIECES = 64  # straight pieces between two cameras; the length of a curve is measured along them
+CURVE_PIECES = 64  # straight pieces of a curve between two cameras, along which its length is measured
 ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
-# Least and largest extent of an orbit to the sides, and up and down, as shares of the distance to its centre. With the
-# least a single photo still looks right. The largest turns the view by 14 degrees to each side.
+# Least and largest extent of an orbit to each side, and up and down, as shares of the distance to its centre. With the
+# least, a scene of a single photo still looks right. The largest turns the view by 14 degrees to each side
 HORIZONTAL, VERTICAL = (0.06, 0.25), (0.03, 0.125)
 
 
@@ -36,7 +36,7 @@ class CameraPath:
 
     Args:
         kind: "orbit" or "spline".
-        turn: Degrees that an orbit turns to each side; None: by the scene's cameras, see :func:`orbit`.
+        turn: Degrees that an orbit turns to each side; None: chosen from the scene's cameras, see :func:`orbit`.
         back: Distance behind the path, as a share of the viewing depth.
     """
 
@@ -65,7 +65,7 @@ def parse_camera_path(text: str) -> CameraPath | None:
 
 
 def _parse_number(text: str | None, expected: str, most: float) -> float | None:
-    """Parse a number above 0 and at most ``most``; None for no text."""
+    """Parse a number above 0 and at most ``most``; None without a text. ValueError for others, as ``expected`` says."""
     if text is None:
         return None
     try:
@@ -78,7 +78,7 @@ def _parse_number(text: str | None, expected: str, most: float) -> float | None:
 
 
 def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) -> Cameras:
-    """Make the ``count`` cameras of a path through or about the cameras of a scene.
+    """Make the ``count`` cameras of a path, which leads through the cameras of a scene or around their middle.
 
     Args:
         path: Kind of the path, and its distance from the cameras.
@@ -104,10 +104,10 @@ def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
 
 
 def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]:
-    """Place a camera outside the capture: turn the middle camera about the points ``[n,3]`` and step back.
+    """Make a camera outside the capture: turn the middle camera about a point in front of it, and step back.
 
-    Returns one of the cameras of :mod:`gsmerge.measure.fog`, and its distance, in world units, from the pivot of its
-    turn.
+    The point is at the depth of ``means [n,3]``. Returns the camera, which is one of those of
+    :mod:`gsmerge.measure.fog`, and its distance from the point in world units.
     """
     back, turn = FOG_CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
@@ -116,7 +116,7 @@ def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]
 
 
 def viewing_depth(cameras: Cameras, means: np.ndarray) -> float:
-    """Measure the median depth, world units, of the points ``[n,3]`` that the middle camera shows."""
+    """Return the median depth, in world units, of those of the points ``means [n,3]`` that the middle camera shows."""
     return middle_depth(means, cameras[[median_camera(cameras)]])
 
 
@@ -129,8 +129,8 @@ def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None)
     """Turn the middle camera about the point ``depth`` in front of it, to the sides and up and down.
 
     Frames are evenly spaced and form a loop. The picture keeps the vertical of the middle camera. ``turn`` is in
-    degrees to each side; up and down the orbit turns by half of it. None: the median offset of the cameras from the
-    middle camera, clipped to the shares ``HORIZONTAL`` and ``VERTICAL`` of the depth.
+    degrees to each side; up and down the orbit turns by half of that. By default the orbit is as wide as the median
+    offset of the cameras from the middle camera, within the limits ``HORIZONTAL`` and ``VERTICAL``.
     """
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)
@@ -139,6 +139,7 @@ def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None)
     turns = np.degrees(arctan2(sines, np.sqrt(1 - sines**2))) if turn is None else turn * np.array([1, 0.5])
 
     def turn_middle(angles: np.ndarray) -> np.ndarray:
+        """Return the viewmats ``[n,4,4]`` at angles along the loop."""
         vectors = turns * np.stack([sin(angles), cos(angles)], 1)
         return np.stack([step_outside(viewmat, depth, 0, *vector) for vector in vectors])
 
@@ -148,11 +149,11 @@ def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None)
 
 
 def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
-    """Pass through all cameras in their order on a smooth curve, from the first to the last.
+    """Make cameras on a smooth curve that passes all cameras in their order, from the first to the last.
 
-    Frames are evenly spaced; a rotation counts as the distance by which it moves a point ``depth`` away. The curve is a
-    centripetal Catmull-Rom spline (Barry and Goldman 1988) of positions and quaternions; intrinsics change linearly.
-    ValueError if there are fewer than two different cameras.
+    Frames are evenly spaced. A rotation counts as the distance by which it moves a point that is ``depth`` away. The
+    curve is a centripetal Catmull-Rom spline (Barry and Goldman 1988) of positions and quaternions. Intrinsics change
+    linearly. ValueError if there are fewer than two different cameras.
     """
     rows, distinct = _pose_rows(cameras, depth)
     origin, rows, Ks = rows[0, :3].copy(), rows[distinct], cameras.Ks[distinct].astype(np.float64)
@@ -171,22 +172,23 @@ def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
 
 
 def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses as rows ``[c,7]`` whose distances measure pose differences, and a mask ``[c]`` of distinct poses.
+    """Return poses as rows ``[c,7]``, and a mask ``[c]`` of the poses that differ from the one before.
 
-    A row has the camera's position, and its quaternion times twice the depth. Each quaternion has the sign nearer to
-    the row before. A small rotation changes a row by the angle times the depth.
+    The distance of two rows measures how much their poses differ. A row has the camera's position, and its quaternion
+    times twice the depth, so that a small rotation changes a row by the angle times the depth. Of the two signs of a
+    quaternion, the one nearer to the row before is used.
     """
     quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64).swapaxes(1, 2))
     opposite = (quats[1:] * quats[:-1]).sum(1) < 0
     quats[1:] *= np.where(opposite, -1, 1).cumprod()[:, None]
     rows = np.concatenate([camera_centres(cameras.viewmats), 2 * depth * quats], 1)
     steps = _lengths(np.diff(rows, axis=0))
-    tolerance = 1e-9  # cameras count as one up to this distance, as a share of a path's length
+    tolerance = 1e-9  # poses count as equal up to this distance, as a share of a path's length
     return rows, np.concatenate([[True], steps > tolerance * max(steps.sum(), depth)])
 
 
 def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float) -> np.ndarray:
-    """Return the poses ``[m,7]`` of the spline through ``rows`` at ``knots``, at the given times."""
+    """Return the poses ``[m,7]`` at ``times`` of the spline that passes ``rows [c,7]`` at the times ``knots [c]``."""
     steps = np.diff(knots)[:, None]
     slopes = np.diff(rows, axis=0) / steps
     inner = (steps[1:] * slopes[:-1] + steps[:-1] * slopes[1:]) / (steps[1:] + steps[:-1])
@@ -201,14 +203,14 @@ def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float)
 
 
 def _pieces(knots: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the piece ``[m]`` of a spline that contains each time, and the position within the piece, 0 to 1."""
+    """Return the piece ``[m]`` of a spline that contains each time, and the place ``[m]`` within the piece, 0 to 1."""
     pieces = np.searchsorted(knots, times, side="right") - 1
     pieces = pieces.clip(0, len(knots) - 2)
     return pieces, (times - knots[pieces]) / np.diff(knots)[pieces]
 
 
 def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return the times at which the given shares of the length of a curve ``points [m,d]`` are reached."""
+    """Return when a curve with ``points [m,d]`` at ``times [m]`` has reached the given ``shares`` of its length."""
     distances = np.concatenate([np.zeros(1), _lengths(np.diff(points, axis=0)).cumsum()])  # along the curve
     return np.interp(shares * distances[-1], distances, times)
 
@@ -219,7 +221,7 @@ def _lengths(vectors: np.ndarray) -> np.ndarray:
 
 
 def _viewmats(rotations: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Make world-to-camera matrices ``[n,4,4]`` from rotations to camera axes and centres in the world."""
+    """Make world-to-camera matrices ``[n,4,4]`` from rotations ``[n,3,3]`` and camera centres ``[n,3]``."""
     out = np.tile(np.eye(4), (len(centres), 1, 1))
     out[:, :3, :3] = rotations
     out[:, :3, 3] = -(rotations * centres[:, None]).sum(-1)

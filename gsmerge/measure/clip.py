@@ -22,21 +22,22 @@ from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.io.image_names import CLIP_ENDS
 from gsmerge.kernels.elementary import sin
-from gsmerge.measure.preview import FACE, Picture, shorten_text
+from gsmerge.measure.preview import FACE, BytePicture, shorten_text
 from gsmerge.settings.pictures import GIF
 from gsmerge.types import StrPath
 
-# Code and name of the encoders for each ending; the first encoder that OpenCV has is used. Browsers play all but
-# MPEG-4. VP8 takes a third of the time of VP9 and 1.6 times the space.
+# Code and name of the encoders for each ending. The first one that OpenCV has is used. Browsers play all but MPEG-4.
+# VP8 takes a third of the time of VP9 and 1.6 times the space
 ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
-# Name, encoder, container and options of the program ffmpeg. Nearly every program plays H.264
+# Name of an encoding, and the encoder, container and options with which the program ffmpeg makes it. Nearly every
+# program plays H.264
 H264 = ("H.264", "libx264", "mp4", (
-    "-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709",  # as players expect of large frames
+    "-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709",  # the colours that players expect of large frames
     "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
 ))  # fmt: skip
 MAX_VIDEO_PIXELS = 1 << 23  # per frame, a little more than 3840 x 2160; encoders take 150 bytes per pixel
-MAX_GIF_PIXELS = 1 << 27  # of all frames together; more take over 400 MB of memory, and files too large to send
-GIF_SAMPLE = 1 << 20  # pixels from which the palette of a GIF is made
+MAX_GIF_PIXELS = 1 << 27  # of all frames together; more take over 400 MB of memory, and give files too large to send
+GIF_SAMPLE = 1 << 20  # approximate number of pixels from which the palette of a GIF is made
 OPENCV = "opencv-contrib-python-headless"
 FOLDER_HINT = "name a folder instead, for one picture a frame"
 LINE = 32  # height of a line of text at scale 1, pixels
@@ -46,11 +47,11 @@ LINE = 32  # height of a line of text at scale 1, pixels
 class Caption:
     """Text on a dark box in a frame."""
 
-    left: int
-    top: int
+    left: int  # pixels
+    top: int  # pixels
     text: np.ndarray  # [h,w,1] share of each pixel that is text, 0 to 1
 
-    def draw(self, picture: Picture) -> None:
+    def draw(self, picture: BytePicture) -> None:
         """Draw the caption into a picture."""
         height, width = self.text.shape[:2]
         box = picture[self.top : self.top + height, self.left : self.left + width]
@@ -62,8 +63,9 @@ class Caption:
 def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int) -> list[Caption]:
     """Place the captions of scenes side by side at the bottom of a frame, from left to right.
 
-    ``texts``: name, count and size of each scene. Count and size share a line if there is room, and otherwise have a
-    line each, or a line for each word. A name may be shortened; other lines that do not fit are left out.
+    ``texts`` are the name, the count and the size of each scene. If there is room, count and size share a line.
+    Otherwise each has its own line, or each word of the count has one. A name may be shortened. Other lines that do not
+    fit are left out.
     """
     scale, thickness = max(0.45, height / 900), max(1, round(height / 600))
     line_height = round(LINE * scale)
@@ -73,12 +75,13 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
         return int(cv2.getTextSize(text, FACE, scale, thickness)[0][0])
 
     def widest(rows: Sequence[Sequence[str]]) -> int:
+        """Return the width of the widest text but the names, which may be shortened."""
         return max(text_width(text) for row in rows for text in row[1:])
 
     rows: list[tuple[str, ...]] = [(name, f"{count}, {size}") for name, count, size in texts]
     if widest(rows) > max_width:
         rows = list(texts)
-    min_shrink = 0.6  # least factor on the size of captions that are too wide
+    min_shrink = 0.6  # captions that are too wide become smaller, but not by less than this factor
     if min_shrink * widest(rows) > 0.95 * max_width:
         rows = [(name, *count.split(), size) for name, count, size in texts]
     scale *= min(1.0, max(min_shrink, 0.95 * max_width / widest(rows)))
@@ -96,26 +99,27 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
 
 
 def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[int]]:
-    """Place the borders of ``count`` scenes in each frame: ``[frames,count+1]`` columns from 0 to ``width``.
+    """Return the borders of ``count`` scenes in each frame: ``[frames,count+1]`` columns of pixels from 0 to ``width``.
 
     The inner borders begin evenly spread, and move together to the right, to the left, and back.
     """
-    swipe_seconds = 6  # time in which a line moves to both sides and back
+    swipe_seconds = 6  # time in which a border moves to both sides and back
     rounds = max(1, round(frames / fps / swipe_seconds))
-    swipe_share = 0.9  # share of the distance to the next line or the border that a line moves
+    swipe_share = 0.9  # a border moves by this share of its distance from the next one
     shifts = swipe_share * sin(2 * np.pi * rounds * np.arange(frames) / frames)
     borders = (np.arange(count + 1) + shifts[:, None]) * width / count
     borders[:, 0], borders[:, -1] = 0, width
     return [list(map(int, row)) for row in borders.round()]
 
 
-def draw_swipe(pictures: Sequence[Picture], borders: Sequence[int], captions: Sequence[Caption]) -> Picture:
-    """Join columns of pictures from the same camera to one frame, each with its caption; draw lines at the ``borders``.
+def draw_swipe(pictures: Sequence[BytePicture], borders: Sequence[int], captions: Sequence[Caption]) -> BytePicture:
+    """Make a frame from columns of pictures of several scenes, each with its caption, and draw lines between them.
 
-    ``borders`` are one frame's row of :func:`swipe_places`.
+    All pictures are from one camera. ``borders`` are the frame's row of :func:`swipe_places`. The captions are drawn
+    into the pictures themselves.
     """
     frame = np.empty_like(pictures[0])
-    lines_per_width = 480  # width of a frame divided by the width of a line
+    lines_per_width = 480  # a line is as wide as a frame divided by this
     half = max(1, frame.shape[1] // (2 * lines_per_width))
     for picture, caption, left, right in zip(pictures, captions, borders[:-1], borders[1:], strict=True):
         caption.draw(picture)
@@ -127,7 +131,7 @@ def draw_swipe(pictures: Sequence[Picture], borders: Sequence[int], captions: Se
 
 
 class FfmpegWriter:
-    """Write frames with the program ffmpeg; has the methods of :class:`cv2.VideoWriter`."""
+    """Writes frames with the program ffmpeg. It has the methods of :class:`cv2.VideoWriter`."""
 
     def __init__(self, program: str, path: Path, shape: tuple[int, ...], fps: float) -> None:
         height, width, _ = shape
@@ -139,7 +143,7 @@ class FfmpegWriter:
     def write(self, frame: np.ndarray) -> None:
         """Add a frame ``[h,w,c]`` in the order blue, green, red."""
         assert self.process.stdin is not None
-        with suppress(BrokenPipeError):  # ffmpeg has ended; missing frames are noticed later
+        with suppress(BrokenPipeError):  # ffmpeg has ended too early; _check_frames will miss frames
             self.process.stdin.write(np.ascontiguousarray(frame).tobytes())
 
     def release(self) -> None:
@@ -149,7 +153,7 @@ class FfmpegWriter:
 
 
 def find_ffmpeg(encoder: str) -> str | None:
-    """Find a program ffmpeg on the PATH that has an encoder; None if there is none."""
+    """Find the program ffmpeg on the PATH; None if there is none, or if it does not have the ``encoder``."""
     program = shutil.which("ffmpeg")
     with suppress(OSError):
         if program is not None:
@@ -159,22 +163,20 @@ def find_ffmpeg(encoder: str) -> str | None:
 
 
 def stored_size(path: StrPath, width: int, height: int) -> tuple[int, int]:
-    """Return width and height of the frames in a clip; sides of videos are even, since two pixels share a colour."""
+    """Return width and height of the frames in a file; those of videos are even, since two pixels share a colour."""
     if Path(path).suffix.lower() == GIF:
         return width, height
     return width + width % 2, height + height % 2
 
 
-def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrite: bool = False) -> str:
+def write_clip(path: StrPath, frames: Iterable[BytePicture], fps: float, *, overwrite: bool = False) -> str:
     """Write pictures ``[h,w,3]`` of one size as a video or a GIF; return the name of its encoding.
 
     A ``.mp4`` has the encoding H.264 if :func:`find_ffmpeg` finds a program for it, otherwise the first encoding that
     OpenCV has. All frames of a GIF share a palette, and are in memory together. A video takes the memory of a few
-    frames.
+    frames. Its frames have the :func:`stored_size`: an odd side gets one more row or column, a copy of the last one.
 
-    The frames of a video have the :func:`stored_size`: an odd side gets one more row
-    or column, a copy of the last one. SceneError if there is no encoder for the ending of the name, or if the file
-    cannot be written completely.
+    SceneError if there is no encoder for the ending of the name, or if the file cannot be written completely.
     """
     path = Path(path)
     with atomic_output(path, overwrite=overwrite) as temporary:
@@ -190,7 +192,7 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
         writer, encoding = _open_writer(path, temporary, first_frame.shape, fps)
         written: list[Future[None]] = []
 
-        def encode(frame: Picture) -> None:
+        def encode(frame: BytePicture) -> None:
             writer.write(frame[..., ::-1])
 
         try:
@@ -200,10 +202,10 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
                         written[-1].result()
                     written.append(encoder.submit(encode, frame))
         except BaseException:
-            ending = Thread(target=writer.release, daemon=True)  # takes seconds, for a file that is removed
-            ending.start()
-            if os.name == "nt":  # where an open file cannot be removed
-                ending.join()
+            closing = Thread(target=writer.release, daemon=True)  # takes seconds, although the file is then removed
+            closing.start()
+            if os.name == "nt":  # Windows cannot remove an open file
+                closing.join()
             raise
         with _silent_stderr():
             writer.release()
@@ -213,12 +215,12 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
     return encoding
 
 
-def _write_gif(path: Path, frames: Sequence[Picture], fps: float) -> None:
+def _write_gif(path: Path, frames: Sequence[BytePicture], fps: float) -> None:
     """Write a GIF that repeats forever, with a palette from a sample of all frames."""
     step = 1 + len(frames) * frames[0].shape[0] * frames[0].shape[1] // GIF_SAMPLE
     sample = np.concatenate([frame.reshape(-1, 3)[i % step :: step] for i, frame in enumerate(frames)])
     palette = Image.fromarray(sample[None]).quantize(256, Image.Quantize.FASTOCTREE)
-    # No dithering, which flickers, costs 1.6 dB and takes a quarter more bytes
+    # Without dithering, which would flicker, cost 1.6 dB and take a quarter more bytes
     paletted = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first_frame, *later_frames = paletted
     first_frame.save(path, "GIF", save_all=True, append_images=later_frames, duration=round(1000 / fps), loop=0)
@@ -227,7 +229,10 @@ def _write_gif(path: Path, frames: Sequence[Picture], fps: float) -> None:
 def _open_writer(
     path: Path, temporary: Path, shape: tuple[int, ...], fps: float
 ) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
-    """Open a file for frames of a ``shape`` with the first available encoder; also return the encoding's name."""
+    """Open ``temporary`` for frames of a ``shape`` with the first available encoder; also return the encoding's name.
+
+    The encoder is chosen by the ending of ``path``, which messages name.
+    """
     height, width, _ = shape
     name, encoder, container, _ = H264
     if path.suffix.lower() == f".{container}" and (program := find_ffmpeg(encoder)):
@@ -249,7 +254,7 @@ def _open_writer(
 
 
 def _check_frames(path: Path, temporary: Path, count: int) -> None:
-    """Raise SceneError if frames of a video are missing, since encoders do not report a full disk."""
+    """Raise SceneError unless ``count`` frames of a video can be read, since encoders do not report a full disk."""
     with _silent_stderr():
         reader = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
         readable = 0
@@ -264,7 +269,7 @@ def _check_frames(path: Path, temporary: Path, count: int) -> None:
 
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Suppress messages of OpenCV and FFmpeg about encoders, by redirecting the descriptor of stderr."""
+    """Suppress messages that OpenCV and FFmpeg write to the descriptor of stderr."""
     try:
         stderr = os.dup(2)
     except OSError:  # stderr is closed, so nothing is printed

@@ -13,14 +13,14 @@ from gsmerge.types import Gaussians, Scene
 
 
 def extents(gaussians: Gaussians) -> dict[str, Any]:
-    """Measure positions and sizes of finite Gaussians, in world units; on a sample if there are many.
+    """Measure positions and sizes of Gaussians with finite values, in world units; on a sample if there are many.
 
     Returns:
-        ``box_low`` and ``box_high``: percentiles 1 and 99 of the positions per axis. ``diagonal``: length of the box's
-        diagonal. ``share_outliers``: share of positions outside the box enlarged ten times. ``share_floaters``: share
-        of isolated Gaussians and outliers. ``scale_median``: median of each Gaussian's largest scale. ``scale_max``:
-        largest scale of all. ``share_huge``: share of Gaussians whose largest scale is above a tenth of the diagonal.
-        All are 0 if there are no Gaussians.
+        ``box_low`` and ``box_high``: percentiles 1 and 99 of the positions, for each axis. ``diagonal``: length of this
+        box's diagonal. ``share_outliers``: share of positions outside the box enlarged ten times. ``share_floaters``:
+        share of isolated Gaussians and outliers. ``scale_median``: median of each Gaussian's largest scale.
+        ``scale_max``: largest scale of all. ``share_huge``: share of Gaussians whose largest scale is above a tenth of
+        the diagonal. All are 0 if there are no Gaussians.
     """
     names = ("diagonal", "share_outliers", "share_floaters", "scale_median", "scale_max", "share_huge")
     if len(gaussians) == 0:
@@ -29,7 +29,7 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
     points, largest = gaussians.means[::step].astype(np.float64), gaussians.scales.max(1)
     low, high = np.percentile(points, BOX_QUANTILES, axis=0)
     diagonal = np.linalg.norm(high - low)
-    huge_scale_share = 0.1  # scales above this share of the box's diagonal are huge; they show no detail
+    huge_scale_share = 0.1  # scales above this share of the box's diagonal are huge, since they show no detail
     values = (
         diagonal, beyond_scene(points).mean(), floater_share(gaussians), np.median(largest[::step]), largest.max(),
         (largest[::step] > huge_scale_share * diagonal).mean(),
@@ -39,11 +39,11 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def coverage(scene: Scene) -> list[dict[str, Any]]:
-    """Measure how much of each view the Gaussians cover. Layers count as views.
+    """Measure how much of each view the Gaussians cover; each layer counts as a view.
 
-    Returns three values for each view: its ``name``; ``share_of_pixels``, the share of pixels with a visible Gaussian
-    of their own, None if views have no Gaussians of their own; and ``share_of_gaussians``, the share of Gaussians whose
-    centre is inside the picture.
+    Returns three entries for each view: its ``name``; ``share_of_pixels``, the share of the pixels that have a visible
+    Gaussian of their own, None if views have no Gaussians of their own; and ``share_of_gaussians``, the share of all
+    Gaussians whose centre is inside the picture.
     """
     if len(scene) == 0:
         return []
@@ -51,15 +51,15 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
     pixels: list[float | None] = [None] * len(scene)
     if scene.has_own_pixels:
         grid, covered = scene.get_pixels(), scene.covered
-        visible = grid.shown if covered is None else covered
-        visible = visible & (scene.gaussians.opacities >= LEAST_OPACITY)[grid.fronts]
+        with_row = grid.shown if covered is None else covered
+        visible = with_row & (scene.gaussians.opacities >= LEAST_OPACITY)[grid.fronts]
         pixels = [float(view.mean()) for view in visible]
     keys = ("name", "share_of_pixels", "share_of_gaussians")
     return [dict(zip(keys, view, strict=True)) for view in zip(scene.names, pixels, shares, strict=True)]
 
 
 def shares_inside(scene: Scene, most: int) -> list[float]:
-    """Measure the share of Gaussians whose centres lie in each view, on a sample of at most ``most``."""
+    """Return, for each view, the share of Gaussians whose centres it shows, from a sample of at most ``most``."""
     rows = np.arange(0, scene.num_gaussians, max(1, -(-scene.num_gaussians // most)))
     points = scene.file_gaussians.means[rows].astype(np.float64)
     return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]

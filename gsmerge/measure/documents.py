@@ -1,4 +1,4 @@
-"""Helpers of all reports: the head of JSON documents, strict JSON, CSV, tables for people, seconds by stage."""
+"""Write the parts that all reports share: the head of JSON documents, JSON, CSV, tables for people, and seconds."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any
 from gsmerge.errors import Doubt, list_doubts
 from gsmerge.version import __version__
 
-SCHEMA_VERSION = 2  # of JSON documents; increases if a program that reads them has to change
-MIN_NAME = 12  # least width of a table's first column in a narrow terminal
+SCHEMA_VERSION = 2  # version of JSON documents; it increases if programs that read them have to change
+MIN_NAME = 12  # least width, in letters, of a table's first column in a narrow terminal
 
 
 def file_sha256(*paths: Path) -> str:
@@ -29,7 +29,7 @@ def file_sha256(*paths: Path) -> str:
 
 
 def document_head() -> dict[str, Any]:
-    """Return the first entries of every JSON document."""
+    """Return the first entries of every JSON document: version of the schema, and name and version of the program."""
     return {"schema_version": SCHEMA_VERSION, "tool": {"name": "gsmerge", "version": __version__}}
 
 
@@ -40,7 +40,7 @@ def note_entries(notes: Iterable[str]) -> dict[str, Any]:
 
 
 def note_lines(notes: Iterable[str]) -> list[str]:
-    """Return a line for each note; doubts are warnings, as in all commands."""
+    """Return a line for each note, with the word "warning" before doubts and "note" before others."""
     return [f"{'warning' if isinstance(note, Doubt) else 'note':11}{note}" for note in notes]
 
 
@@ -50,7 +50,7 @@ def to_json(document: Mapping[str, Any]) -> str:
 
 
 def finite(value: Any) -> Any:
-    """Convert to plain JSON types, with None in place of infinities and NaN."""
+    """Convert a value and all its parts to plain JSON types, with None in place of infinities and NaN."""
     if isinstance(value, Mapping):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -61,7 +61,7 @@ def finite(value: Any) -> Any:
 
 
 def csv_cell(value: Any) -> Any:
-    """Return a value for a CSV table: "" for None, and a quote before text that a spreadsheet would execute."""
+    """Return a value as it stands in a CSV table: "" for None, and a quote before text that a spreadsheet would run."""
     if value is None:
         return ""
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r", "\n") else value
@@ -79,13 +79,13 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 def text_table(
     rows: Sequence[Sequence[str]], indent: str = "", *, columns: int | None = None, least: Sequence[int] = ()
 ) -> list[str]:
-    """Format rows as lines for a terminal, with the first column left-aligned and others right-aligned.
+    """Format rows as lines of text, with the first column left-aligned and the others right-aligned.
 
-    ``columns``: width of the terminal; None: unlimited. A table that is too wide is reduced until it fits. First the
-    columns ``least``, by number and in this order, are left out. Then the first column is shortened in its middle, down
-    to ``MIN_NAME``. Then other columns are left out from the last on, except the first two.
+    ``columns`` is the width of the terminal in letters; None: unlimited. A table that is too wide is reduced until it
+    fits. First the columns with the numbers ``least`` are left out, in this order. Then the texts of the first column
+    are shortened to ``MIN_NAME``. Then other columns are left out from the last on, except the first two.
     """
-    max_width = 10_000  # columns of a table that is not printed on a terminal
+    max_width = 10_000  # width of a table that is not printed on a terminal
     widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (columns or max_width) - len(indent)
     shown = list(range(len(widths)))
     for place in (*least, *reversed(shown[2:])):
@@ -98,13 +98,16 @@ def text_table(
 
 
 def _cut(text: str, width: int) -> str:
-    """Shorten a text to ``width`` by cutting letters from its middle."""
+    """Shorten a text to ``width`` letters, with dots in place of its middle."""
     half = (width - 3) // 2
     return text if len(text) <= width else f"{text[: width - 3 - half]}...{text[-half:]}"
 
 
 def wrap_line(line: str, columns: int | None, hang: int = 2) -> list[str]:
-    """Break a line between words at ``columns`` (None: never), and indent all but its first part by ``hang``."""
+    """Break a line between words into lines of at most ``columns`` letters, and indent all but the first by ``hang``.
+
+    With None the line is not broken.
+    """
     if columns is None or len(line) <= columns:
         return [line]
     indent = " " * (hang if hang < columns // 2 else 2)
@@ -112,11 +115,11 @@ def wrap_line(line: str, columns: int | None, hang: int = 2) -> list[str]:
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Return the wall time by stage and in total, as all reports contain it."""
+    """Return the entries of a report for the wall time in ``seconds`` by stage and in total."""
     total = round(sum(seconds.values()), 4)
     return {"seconds": {name: round(value, 4) for name, value in seconds.items()}, "total_seconds": total}
 
 
 def seconds_line(document: Mapping[str, Any]) -> str:
-    """Return a report's total seconds as text; the document has those of each stage."""
+    """Return the total seconds of a report as text."""
     return f"{document['total_seconds']:.1f} s"

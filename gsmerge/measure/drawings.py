@@ -28,7 +28,14 @@ from gsmerge.measure.clip import (
     swipe_places,
     write_clip,
 )
-from gsmerge.measure.preview import Picture, contact_sheet, outside_pictures, save_picture, to_picture, view_pictures
+from gsmerge.measure.preview import (
+    BytePicture,
+    contact_sheet,
+    outside_pictures,
+    save_picture,
+    to_picture,
+    view_pictures,
+)
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.photos.views import pick_views, subset
 from gsmerge.raster import render_in_batches
@@ -46,7 +53,7 @@ from gsmerge.types import Cameras, Gaussians, StrPath
 SECONDS = 4  # least duration of a clip
 VIEW_FRAMES = 4  # least number of frames for each view of a spline
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
-GIF_SIDE = 640  # largest side of a GIF without the option size, pixels
+GIF_SIDE = 640  # largest side of a GIF if the option size is not given, pixels
 PLACED_SIZE = 1280, 720  # width and height of pictures from placed cameras, pixels
 
 
@@ -54,20 +61,20 @@ PLACED_SIZE = 1280, 720  # width and height of pictures from placed cameras, pix
 class DrawOptions:
     """Options of a drawing: scenes, hints for reading, kind of pictures, and output."""
 
-    files: SceneFiles  # Of the first scene
-    paths: Sequence[Path]  # Of all scenes, as the user named them
-    framing: SceneFiles  # Of the scene into whose frame the cameras are moved
-    output: Path  # A picture, a video, or a folder for pictures
+    files: SceneFiles  # files of the first scene
+    paths: Sequence[Path]  # paths of all scenes, as the user named them
+    framing: SceneFiles  # files of the scene into whose frame the cameras are moved
+    output: Path  # a picture, a video, or a folder for pictures
     opacity: OpacityChoice = "auto"
     hints: ReadHints = NO_HINTS
-    views: int | str | None = None  # Largest number of views, or the name of one view; None: all, in a panel four
-    path: str | None = None  # See :func:`gsmerge.measure.camera_path.parse_path`, or a file of cameras
-    frames: int | None = None  # Along the path; None: by SECONDS, for a spline at least VIEW_FRAMES for each view
-    size: tuple[int, int] | None = None  # Width and height of a picture; None: the size of the cameras
-    background: float = 0.0  # Grey level
+    views: int | str | None = None  # largest number of views, or the name of one view; None: all, but four in a panel
+    path: str | None = None  # text of gsmerge.measure.camera_path.parse_camera_path, or a file of cameras
+    frames: int | None = None  # frames of a path; None: SECONDS long, of a spline at least VIEW_FRAMES for each view
+    size: tuple[int, int] | None = None  # width and height of a picture; None: the size of the cameras
+    background: float = 0.0  # grey level in [0, 1]
 
     def choose(self, names: Sequence[str], most: int | None = None) -> list[int]:
-        """Choose the ids of views by the option ``views``, by default at most ``most`` views; None: all."""
+        """Choose the ids of the views to draw by the option ``views``; without it at most ``most`` views, or all."""
         if isinstance(self.views, str):
             return [find_view(self.views, names)]
         return pick_views(len(names), self.views or most or len(names))
@@ -78,7 +85,7 @@ class DrawOptions:
         return GIF_FPS if self.output.suffix.lower() == GIF else FPS
 
     def resize(self, cameras: Cameras) -> Cameras:
-        """Resize and crop the images of cameras to the size of the pictures."""
+        """Return the cameras with images, resized and cropped, of the size of the pictures."""
         if self.size is not None:
             return fill_cameras(cameras, *self.size)
         return shrink_cameras(cameras, GIF_SIDE) if self.output.suffix.lower() == GIF else cameras
@@ -88,10 +95,10 @@ class DrawOptions:
 class Drawing:
     """A prepared drawing: paths, facts, and a function that yields the pictures one by one."""
 
-    paths: list[Path]  # Of the pictures, or of the video
-    facts: dict[str, Any]  # For the report
-    draw: Callable[[int], Iterator[Picture]]  # Takes the number of threads; as many views are in memory
-    mode: int = 0o666  # The most rights of new files, those of the photos that are drawn
+    paths: list[Path]  # files of the pictures, or of the video
+    facts: dict[str, Any]  # facts for the report
+    draw: Callable[[int], Iterator[BytePicture]]  # number of threads -> pictures; as many views are in memory
+    mode: int = 0o666  # most rights of new files, which are those of the photos that are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +106,9 @@ class DrawnScenes:
     """Scenes to draw together, and the scene whose frame and views they share."""
 
     scenes: list[tuple[Path, Gaussians]]
-    sizes: list[int]  # Bytes of their files
+    sizes: list[int]  # bytes of their files
     notes: list[str]
-    load: Loaded  # The scene whose frame they share
+    load: Loaded  # the scene whose frame and views they share
 
     def counts(self) -> dict[str, int]:
         """Return the number of Gaussians of every scene by its path."""
@@ -114,11 +121,11 @@ class DrawnScenes:
         threads: int,
         near: float = 0.01,
         places: Sequence[Sequence[int]] | None = None,
-    ) -> Iterator[tuple[Picture, ...]]:
-        """Yield the 8-bit pictures of all scenes for each camera, with one view per thread in memory.
+    ) -> Iterator[tuple[BytePicture, ...]]:
+        """Yield, for each camera, the 8-bit pictures of all scenes, with one view per thread in memory.
 
-        ``places`` has a row of borders for each picture, see :func:`gsmerge.measure.clip.swipe_places`; scene i lies
-        between the borders i and i + 1. Columns outside a scene's borders may show the background only.
+        ``places`` has a row of borders for each picture, see :func:`gsmerge.measure.clip.swipe_places`. Scene i is
+        shown between the borders i and i + 1, so other columns of its picture may show the background only.
         """
         settings: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
         drawn = (
@@ -135,7 +142,10 @@ class DrawnScenes:
 
 
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
-    """Find the scene into whose frame the cameras are moved: the source of a compacted scene, else itself."""
+    """Find the scene into whose frame the cameras are moved: the source of a compacted scene, or the scene itself.
+
+    The source lies beside the compacted scene. ``cameras`` and ``images`` are the options of the user.
+    """
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if match is None or not (source := files.ply.with_name(f"{match[1]}.ply")).is_file():
         return files
@@ -144,21 +154,24 @@ def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | No
 
 
 def prepare_panel(options: DrawOptions) -> Drawing:
-    """Prepare one picture with the columns photo, before, after, ... and a row for each view and the outside view."""
-    group = _read(options, photos=True)
+    """Prepare one picture with a column for the photos and for each scene, and a row for each view.
+
+    The last row is a view from outside.
+    """
+    group = _read_scenes(options, photos=True)
     scene = group.load.scene
     cameras, photos, pictured = options.resize(scene.cameras), scene.images, scene.photo_views
     panel_views = 4  # rows of a panel
     ids = options.choose(scene.names, panel_views)
     names = [re.split(r"[\\/]", scene.names[i])[-1] for i in ids]
 
-    def draw(_: int) -> Iterator[Picture]:
+    def draw(_: int) -> Iterator[BytePicture]:
         named = [(path.name, gaussians) for path, gaussians in group.scenes]
         shown = None if photos is None else [photos[i] if i in pictured else None for i in ids]
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         rows = view_pictures(named, cameras[ids], shown, names, background=options.background)
-        # Without cameras of the scene, views are placed: the first half around it, the second half inside it
+        # Placed views, of a scene without cameras, are around it in the first half, and inside it in the second
         outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
         outside = outside_pictures(named, outer_cameras, photos=shown is not None, background=options.background)
         yield contact_sheet([*rows, outside])
@@ -168,14 +181,14 @@ def prepare_panel(options: DrawOptions) -> Drawing:
 
 
 def prepare_pictures(options: DrawOptions) -> Drawing:
-    """Prepare a picture for each camera, or for one camera if the output is no folder; scenes are side by side."""
-    group = _read(options, photos=False)
+    """Prepare a picture for each camera, with the scenes side by side; for one camera if the output is no folder."""
+    group = _read_scenes(options, photos=False)
     is_folder = options.output.suffix.lower() not in PICTURES
     ids = options.choose(group.load.scene.names) if is_folder or options.views else [0]
     views, stems = options.resize(group.load.scene.cameras[ids]), picture_stems(group.load.scene.names)
     names = [f"{path.name}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
-    def draw(threads: int) -> Iterator[Picture]:
+    def draw(threads: int) -> Iterator[BytePicture]:
         for drawn in group.draw(views, options, threads):
             yield contact_sheet([list(zip(names, drawn, strict=True))]) if len(drawn) > 1 else drawn[0]
 
@@ -184,8 +197,8 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
 
 
 def prepare_clip(options: DrawOptions) -> Drawing:
-    """Prepare a clip of the scenes along a path, with moving lines between them; a folder gets its frames."""
-    group, cameras, near, ids = _path_cameras(options)
+    """Prepare a clip along a path, with moving lines between the scenes; for a folder, prepare its frames."""
+    group, cameras, near, ids = _make_path(options)
     cameras = options.resize(cameras)
     paths = [path.absolute() for path, _ in group.scenes]
     repeats_names = len({path.name for path in paths}) < len(paths)
@@ -194,7 +207,7 @@ def prepare_clip(options: DrawOptions) -> Drawing:
         for path, (_, gaussians), size in zip(paths, group.scenes, group.sizes, strict=True)
     ]
 
-    def draw(threads: int) -> Iterator[Picture]:
+    def draw(threads: int) -> Iterator[BytePicture]:
         if len(texts) == 1:
             yield from (picture for (picture,) in group.draw(cameras, options, threads, near))
             return
@@ -218,7 +231,7 @@ def prepare_clip(options: DrawOptions) -> Drawing:
 
 
 def _check_frames(output: Path, width: int, height: int, count: int) -> None:
-    """Raise SceneError if the frames of a clip would take too much memory to encode."""
+    """Raise SceneError if the ``count`` frames of a clip would take too much memory to encode."""
     if width * height > MAX_VIDEO_PIXELS:
         problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels per frame of a video, found {width} x {height}"
         raise SceneError(output, problem, FOLDER_HINT)
@@ -227,17 +240,20 @@ def _check_frames(output: Path, width: int, height: int, count: int) -> None:
         raise SceneError(output, problem, "lower --size or --frames, or name a .mp4")
 
 
-def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
-    """Read the scenes, and make the cameras of a path; also return the near plane and the ids of its views."""
+def _make_path(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
+    """Read the scenes and make the cameras of a path.
+
+    Returns the scenes, the cameras, the near plane, and the ids of the views through which the path leads.
+    """
     assert options.path is not None
     path = parse_camera_path(options.path)
     file = None if path else Path(options.path)
     framing = options.framing
     has_own = framing.cameras is not None or framing.images is not None or read_sharp_camera(framing.ply) is not None
-    is_only_source = file is not None and not has_own  # the path is also the scene's camera file
+    is_only_source = file is not None and not has_own  # then the file of the path is also the scene's camera file
     if is_only_source:
         options = replace(options, framing=replace(options.framing, cameras=file))
-    group = _read(options, photos=False)
+    group = _read_scenes(options, photos=False)
     scene_cameras = group.load.scene.cameras
     cameras = scene_cameras if file is None or is_only_source else _place_file(file, group.load)
     assert not isinstance(options.views, str)
@@ -255,7 +271,7 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
 
 
 def _place_file(file: Path, load: Loaded) -> Cameras:
-    """Read the cameras of a path into the frame of a scene; cameras without a size get the scene's size."""
+    """Read the cameras of a path from a file into the frame of a scene; those without a size get the scene's size."""
     cameras = load.scene.cameras
     stored = read_cameras(file) if load.cameras is None else read_into_frame(load, file)[0]
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
@@ -264,8 +280,11 @@ def _place_file(file: Path, load: Loaded) -> Cameras:
 DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_clip}
 
 
-def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
-    """Read the scenes, and move the cameras into the frame of ``options.framing``."""
+def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
+    """Read the scenes, and the cameras of ``options.framing`` for all of them; with ``photos``, also read its photos.
+
+    Without cameras, views are placed around the scene, and with ``photos`` also inside it.
+    """
     files, framing, paths = options.files, options.framing, options.paths
     first_ply = read_gaussian_file(files, opacity=options.opacity, hints=options.hints)
     hints: dict[str, Any] = {"scales": options.hints.scales, "colors": options.hints.colors}
@@ -290,12 +309,12 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     scene = scene if inside else subset(scene, range(len(scene) // 2))
     scene = replace(scene, cameras=fill_cameras(scene.cameras, *PLACED_SIZE))
     placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
-    notes = (placed if text == NO_VIEWS else text for text in record.notes)  # that note concerns results
+    notes = (placed if text == NO_VIEWS else text for text in record.notes)  # NO_VIEWS speaks of results
     return replace(load, scene=scene, notes=(*load.notes, *notes))
 
 
 def find_view(view: str, names: Sequence[str]) -> int:
-    """Find a view by its name, with or without folders, ending and zeros in front; UsageError for none or several."""
+    """Find a view by its name, with or without folders, ending and leading zeros; UsageError for none or several."""
     stems, number = picture_stems(names), picture_stems([view])[0].lstrip("0")
     ids = [i for i, name in enumerate(names) if view in (name, Path(name).name, stems[i])]
     ids = ids or [i for i, stem in enumerate(stems) if stem.lstrip("0") == number]
@@ -306,7 +325,10 @@ def find_view(view: str, names: Sequence[str]) -> int:
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:
-    """Choose unique file names for views: names of images, or else paths joined by ``_``, or else numbers."""
+    """Choose a file name without ending for each view, all different.
+
+    They are the names of the images. If two are equal, they are whole paths joined by ``_``, and otherwise numbers.
+    """
     paths = []
     for name in names:
         words = [word for word in re.split(r"[\\/]+", name) if word not in ("", ".", "..")]
@@ -323,16 +345,16 @@ def picture_stems(names: Sequence[str]) -> list[str]:
 
 
 def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> dict[str, Any]:
-    """Draw and write the pictures, and make folders as needed; return facts that are known only after drawing."""
+    """Draw and write the pictures, and make folders as needed; return facts that are known only then."""
     total, fps = drawing.facts.get("frames", len(drawing.paths)), drawing.facts.get("fps")
 
-    def report_each(pictures: Iterator[Picture]) -> Iterator[Picture]:
+    def report_progress(pictures: Iterator[BytePicture]) -> Iterator[BytePicture]:
         for done, picture in enumerate(pictures, 1):
             yield picture
             progress("render", done, total)
 
     with use_threads() as at_once:
-        pictures = report_each(drawing.draw(at_once))
+        pictures = report_progress(drawing.draw(at_once))
         if fps is not None:
             return {"encoding": write_clip(drawing.paths[0], pictures, fps, overwrite=overwrite)}
         with atomic_outputs(overwrite=overwrite, mode=drawing.mode) as add:
@@ -342,7 +364,7 @@ def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> d
 
 
 def drawing_line(document: Mapping[str, Any]) -> str:
-    """Describe a finished drawing in one line."""
+    """Describe in one line the finished drawing of a report."""
     if "frames" in document:
         line = f"{document['frames']} frames of {document['width']} x {document['height']}"
         line += f", {document['frames'] / document['fps']:.1f} s" if "fps" in document else ""

@@ -1,4 +1,4 @@
-"""Measure the quality of compact scenes: compare their renders, and those of the input, with photos, view by view."""
+"""Measure the quality of compact scenes: compare renders of the results and of the input with photos, view by view."""
 
 from __future__ import annotations
 
@@ -29,19 +29,20 @@ from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_ga
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.arrays import ArrayFields, as_pictures
 
+# Note for photos that compact would change before it uses them
 MENDED = (
     "the photos of the input views differ from their Gaussians, or from each other, in tone, exposure or by objects"
     " that cover them; compact mends this, but the scores here use the photos as they are"
 )
-SPLITS = ("context", "target")  # input views, and held-out views
+SPLITS = ("context", "target")  # names of the two kinds of views: input views, and held-out views
 INPUT = "input"  # name of the scene itself among the results
 
-OnImage = Callable[[str, str, int, np.ndarray], None]  # result, split, number of the view, image
+OnImage = Callable[[str, str, int, np.ndarray], None]  # called with result, split, number of the view, image
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Similarity of an image to a reference; None for measures that were not taken."""
+    """Similarity of an image to a reference; a measure that was not taken is None."""
 
     psnr: float | None = None  # dB; inf for equal pictures
     ssim: float | None = None  # at most 1
@@ -61,15 +62,15 @@ class ViewScore:
     visible: float  # share of the pixels that the input views have seen
     full: Quality  # over all pixels
     masked: Quality  # over the pixels that the input views have seen (supplement A)
-    # Share of the pixels that the input covers, by a row of its own or an opacity of at least a half, and PSNR and SSIM
-    # over these pixels; None if the input was not measured.
+    # Share of the pixels that the input covers, with a row of its own or an opacity above a half; None if the input was
+    # not measured
     covered_share: float | None = None
-    covered: Quality = Quality()
+    covered: Quality = Quality()  # PSNR and SSIM over these pixels
 
 
 @dataclass(frozen=True)
 class ResultScores:
-    """Scores of one result."""
+    """Scores of one result in all views."""
 
     name: str  # as the caller gave it
     num_gaussians: int
@@ -88,13 +89,13 @@ class ResultScores:
         another split than "context" and "target".
         """
         views = self._select_views(split)
-        return _mean([score.full for score in views]), _mean([score.masked for score in views])
+        return _average([score.full for score in views]), _average([score.masked for score in views])
 
     def mean_covered(self, split: str) -> tuple[float | None, Quality]:
-        """Average, over a split's views, the share of pixels that the input covers, and the scores over them."""
+        """Average, over a split's views, the share of the pixels that the input covers, and the scores over these."""
         views = self._select_views(split)
         shares = [score.covered_share for score in views if score.covered_share is not None]
-        return float(np.mean(shares)) if shares else None, _mean([score.covered for score in views])
+        return float(np.mean(shares)) if shares else None, _average([score.covered for score in views])
 
     def _select_views(self, split: str) -> list[ViewScore]:
         """Return the scores of a split's views; ValueError for an unknown split."""
@@ -132,7 +133,7 @@ class Evaluation(ArrayFields):
 
     @property
     def doubts(self) -> list[str]:
-        """Those of the notes that say that a result is worse than the input, or that the figures mean little."""
+        """The notes that say that a result is worse than the input, or that the figures mean little."""
         return list_doubts(self.notes)
 
     def __repr__(self) -> str:
@@ -140,7 +141,10 @@ class Evaluation(ArrayFields):
         return f"Evaluation({scores}; against {self.reference})"
 
     def _rows(self) -> list[list[str]]:
-        """List the mean scores over the pixels that the input views have seen, of held-out views if there are any."""
+        """Return a table of the results' mean scores over the pixels that the input views have seen.
+
+        The scores are those of held-out views if there are any, otherwise those of input views.
+        """
         split = "target" if "target" in self.num_views else "context"
         scores = [(result, vars(result.mean(split)[1])) for result in self.results]
         names = [name for name in vars(Quality()) if any(quality[name] is not None for _, quality in scores)]
@@ -151,38 +155,35 @@ class Evaluation(ArrayFields):
 
 @dataclass(frozen=True, eq=False)
 class _Split:
-    """Views of one kind, with the masks and facts that their scores need."""
+    """Views of one split, with the masks and facts that their scores need."""
 
     views: Views
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
-    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: where its renders are opaque
-    reference: str  # words for the pictures: photos, or their replacement
-    scored: Sequence[int]  # ids of the views whose pictures are scored
-    drawn: Gaussians | None = None  # the input, if its renders replace photos
+    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: those where its renders are opaque
+    reference: str  # words for the pictures with which results are compared: photos, or their replacement
+    scored: Sequence[int]  # ids of the views that are scored
+    drawn: Gaussians | None = None  # the input, if its renders replace photos; otherwise None
 
     def move_to(self, cameras: Cameras | None) -> _Split:
-        """Move the views to the cameras of a result (None: keep them); renders of the input are not moved."""
+        """Return the split with the cameras of a result; it stays as it is for None, and if the input was drawn."""
         view_cameras = self.views.cameras if cameras is None or self.drawn is not None else cameras
         return replace(self, views=replace(self.views, cameras=view_cameras))
 
 
 @dataclass(frozen=True, eq=False)
 class _Renderer:
-    """Draws pictures with the same settings."""
+    """Renders views, always with the same settings, so that equal Gaussians give equal images."""
 
     near: float  # near plane, world units
     options: EvaluateOptions
 
     def draw(self, gaussians: Gaussians, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Render one view ``[h,w,3]``; equal Gaussians give equal images, since all renders use this method.
-
-        Also return a mask ``[h,w]`` of the pixels in which the Gaussians have an opacity of at least a half.
-        """
+        """Render one view ``[h,w,3]``; also return the mask ``[h,w]`` of the pixels with an opacity above a half."""
         drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.options.antialiased)
         return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED_TRANSMITTANCE)
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
-        """Render one view ``[h,w,3]``."""
+        """Render one view ``[h,w,3]``, and leave the mask out."""
         return self.draw(gaussians, cameras, view)[0]
 
 
@@ -242,7 +243,7 @@ def evaluate(
         renderer = _Renderer(near_plane(scene), options)
         progress("what the input views see", 0, 0)
         reference = PHOTOS if scene is original else ROW_COLORS
-        splits = _splits(scene, reference, inputs, targets, renderer)
+        splits = _make_splits(scene, reference, inputs, targets, renderer)
         scored = {INPUT: inputs, **outputs} if options.own else outputs
         has_fog = options.fog and bool(outputs)
         fog = measure_fog(scene.gaussians.numpy(), outputs, scene.cameras, renderer.near, progress) if has_fog else {}
@@ -259,17 +260,21 @@ def evaluate(
         ]
     scores = [
         ResultScores(
-            name, len(gaussians), len(gaussians) / max(len(inputs), 1), *_join(name, split_scores), fog.get(name, {})
+            name,
+            len(gaussians),
+            len(gaussians) / max(len(inputs), 1),
+            *_list_scores(name, split_scores),
+            fog.get(name, {}),
         )
         for name, gaussians in scored.items()
     ]
     counts = {name: len(split.scored) for name, split in splits.items()}
-    notes = (*lpips_notes, *_notes(splits, scores, mended=mended))
+    notes = (*lpips_notes, *_describe_scores(splits, scores, mended=mended))
     return Evaluation(tuple(scores), _name_reference(splits), counts, notes, options, scene.images)
 
 
 def _without_missing(options: EvaluateOptions) -> tuple[EvaluateOptions, tuple[str, ...]]:
-    """Leave out LPIPS networks that are not installed; return a note if none is installed."""
+    """Return the options without LPIPS networks that are not installed, and a note if none is installed."""
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
     nets = tuple(net for net in options.lpips if lpips_available(net))
@@ -278,7 +283,7 @@ def _without_missing(options: EvaluateOptions) -> tuple[EvaluateOptions, tuple[s
 
 
 def _name_reference(splits: Mapping[str, _Split]) -> str:
-    """Name the pictures that results are compared with: photos, or their replacement in the input views."""
+    """Say in words with which pictures results are compared: photos, or in the input views their replacement."""
     names = list(dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits))
     return f"{names[0]}, and {names[1]} in its own views" if len(names) > 1 else names[0]
 
@@ -288,15 +293,18 @@ def near_plane(scene: Scene) -> float:
     return NEAR_PLANE * scene_frame(scene).unit
 
 
-def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mended: bool) -> Iterator[str]:
-    """Yield notes on results that are clearly worse than the input, and on figures that may mislead."""
+def _describe_scores(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mended: bool) -> Iterator[str]:
+    """Yield notes on results that are clearly worse than the input, and on figures that may mislead.
+
+    ``mended``: compact changes the photos before it uses them, but they are scored unchanged.
+    """
     photos = "context" in splits and splits["context"].reference == PHOTOS
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
     if photos and INPUT in psnrs and not mended:
         losses = (describe_loss(name, psnrs[INPUT], psnr, OWN_PHOTOS) for name, psnr in psnrs.items())
         yield from (Doubt(loss) for loss in losses if loss is not None)
     yield from filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog))
-    min_seen_share = 0.1  # if input views have seen less of the held-out pixels, the frames of coordinates may differ
+    min_seen_share = 0.1  # if the input views have seen less of the held-out views, these may be in another world
     if "target" not in splits:
         yield "no held-out views were given; on input views, fitted results score better than on new views"
     elif (share := splits["target"].visible.mean()) < min_seen_share:
@@ -306,12 +314,12 @@ def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mend
         yield MENDED
 
 
-def _splits(
+def _make_splits(
     scene: Scene, reference: str, inputs: Gaussians, targets: Views | None, renderer: _Renderer
 ) -> dict[str, _Split]:
-    """Return the input and held-out views by split, with their visible pixels.
+    """Return the input views and the held-out views by the name of the split, with the pixels that count.
 
-    The pictures of input views are those of the scene, which ``reference`` names, or renders of the input.
+    The pictures of input views are those of the scene, for which ``reference`` is the word, or renders of the input.
     """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
@@ -319,7 +327,7 @@ def _splits(
     points = context_points(scene, renderer.near, sources)
 
     def make_split(views: Views, source: str, masks: np.ndarray | None = None) -> _Split:
-        """Return a split of views whose pictures are of a ``source``; hidden pixels do not count."""
+        """Return a split of views whose pictures are called ``source``; pixels outside ``masks`` do not count."""
         visible, scored = visible_pixels(points, views.cameras, renderer.near, sources), list(range(len(views.names)))
         if masks is not None:
             visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
@@ -349,7 +357,11 @@ def _score_split(
     renderer: _Renderer,
     on_image: OnImage,
 ) -> dict[str, list[tuple[float, ViewScore]]]:
-    """Draw and score all results, one view after the other; return seconds and score of each view by result."""
+    """Draw and score all results, one view after the other.
+
+    Returns, for each result, the seconds of drawing and the score of each view. ``cameras`` are those of results with
+    other poses.
+    """
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))
     moved = {name: split.move_to(cameras.get(name)) for name in results}
@@ -366,12 +378,12 @@ def _score_split(
                 covered = opaque
             score = ViewScore(kind, names[view], float(split.visible[view].mean()), Quality(), Quality())
             if view in split.scored:
-                score = _score_view(score, image, split, view, covered, nets)
+                score = _add_qualities(score, image, split, view, covered, nets)
             scores[name].append((seconds, score))
     return scores
 
 
-def _score_view(
+def _add_qualities(
     score: ViewScore,
     image: np.ndarray,
     split: _Split,
@@ -379,26 +391,31 @@ def _score_view(
     covered: NDArray[np.bool_] | None,
     nets: Sequence[str],
 ) -> ViewScore:
-    """Add to a score the quality of a render over all pixels, over the seen pixels, and over the ``covered`` pixels."""
+    """Add to a view's score the quality of a render over all pixels, over seen pixels, and over ``covered`` pixels."""
     photo, seen = split.views.images[view], split.visible[view]
     share = None if covered is None else float(covered.mean())
-    inside = covered if share is not None and share < WHOLE_SHARE else None
-    full, masked, covered_quality = _qualities(image, photo, (None, seen, inside))
+    covered_mask = covered if share is not None and share < WHOLE_SHARE else None  # None: all pixels
+    full, masked, covered_quality = _measure_qualities(image, photo, (None, seen, covered_mask))
     full, masked = _add_lpips((full, masked), image, photo, seen, nets)
     score = replace(score, full=full, masked=masked)
     return score if share is None else replace(score, covered_share=share, covered=covered_quality)
 
 
-def _join(
+def _list_scores(
     name: str, split_scores: Sequence[Mapping[str, Sequence[tuple[float, ViewScore]]]]
 ) -> tuple[float, tuple[ViewScore, ...]]:
-    """Return the median seconds and the scores of a result over the views of all splits."""
+    """Return the median seconds of drawing and the scores of a result in the views of all splits."""
     rows = [row for scores in split_scores for row in scores[name]]
     return float(np.median([seconds for seconds, _ in rows])), tuple(score for _, score in rows)
 
 
-def _qualities(image: np.ndarray, photo: np.ndarray, masks: Sequence[NDArray[np.bool_] | None]) -> list[Quality]:
-    """Measure PSNR and SSIM of an image over the pixels in each mask; None: all. An empty mask has no measures."""
+def _measure_qualities(
+    image: np.ndarray, photo: np.ndarray, masks: Sequence[NDArray[np.bool_] | None]
+) -> list[Quality]:
+    """Measure PSNR and SSIM of an image over the pixels in each mask, where None stands for all pixels.
+
+    For an empty mask no measure is taken.
+    """
     pixels = [None if mask is None or mask.all() else mask for mask in masks]
     shown = [mask for mask in pixels if mask is None or mask.any()]
     scores = iter(zip(psnr_within(image, photo, shown), ssim_within(image, photo, shown), strict=True))
@@ -422,8 +439,8 @@ def _add_lpips(
     return full, full if seen.all() else add(pair[1], seen) if seen.any() else pair[1]
 
 
-def _mean(scores: Sequence[Quality]) -> Quality:
-    """Average each measure over the scores that have it."""
+def _average(scores: Sequence[Quality]) -> Quality:
+    """Average each measure over the ``scores`` that have it."""
     means: dict[str, float | None] = {}
     for measure in fields(Quality):
         values = [getattr(score, measure.name) for score in scores]

@@ -2,8 +2,8 @@
 
 Photos score a scene from their own viewpoints only, but a person who views the scene first steps back and turns. Then
 Gaussians in gaps between the views show as haze, and Gaussians of wrong depth as veils before surfaces. Gaps in
-surfaces show as holes. Long thin Gaussians, which made the texture of one view, show as strokes. The measure
-needs no photos, only the input and the cameras of its views; docs/guide/evaluate.md defines it for readers.
+surfaces show as holes. Long thin Gaussians, which gave one view its texture, show as strokes. Photos are not needed,
+only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to users.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from gsmerge.types import Cameras, Gaussians
 VIEWS = 3  # evenly spread input views from which the cameras start
 # Steps back, as shares of the median depth of a view, and turns about the point in its middle, degrees, by kind
 FOG_CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
-ALL = "all"  # kind of all these cameras together
-FOG_PIXELS = 480  # largest longer side of the pictures, pixels
-# Opacities: the input is empty below, solid above; a result has a hole below
+ALL = "all"  # name for all these cameras together
+FOG_PIXELS = 480  # longer side of the pictures is at most this, pixels
+# Opacities: the input is empty below FOG_EMPTY and solid above FOG_SOLID; a result has a hole below FOG_OPEN
 FOG_EMPTY, FOG_SOLID, FOG_OPEN = 0.05, 0.9, 0.5
 EROSION_PIXELS = 17  # side, in pixels, of the square that erodes empty regions
 VEIL_SHARE = 0.7  # a result has a veil where its depth is below this share of the input's depth
-VEILED = 0.08  # a result whose worst veil is larger gets a note
-# Spikes are Gaussians at least RATIOS times as long as their second axis, and longer (3 sigma) than the share LONG of
-# the width. They are visible where a channel changes by more than CHANGED without them
+VEILED = 0.08  # share of the pixels; a result whose worst veil is larger gets a note
+# Spikes are Gaussians whose longest axis is at least RATIOS times the second one, and (at 3 sigma) longer than the
+# share LONG of the picture's width. They are visible where a channel changes by more than CHANGED without them
 RATIOS, LONG, CHANGED = (5.0, 3.0), 0.05, 0.05
 FOG_NEAR_PLANE = 0.25  # near plane of the depths of both scenes, as a share of the view's median depth
 
 
 @dataclass(frozen=True)
 class Fog:
-    """Fog, veils, holes and spikes of a result from outside, compared with its input.
+    """Fog, veils, holes and spikes of a result, seen from outside and compared with its input.
 
-    A figure is None if no pixel can be measured.
+    A figure is None if there is no pixel on which it can be measured.
 
     Args:
         fog_near: Mean opacity, in [0, 1], where the input is empty.
@@ -84,8 +84,9 @@ def measure_fog(
 ) -> dict[str, dict[str, Fog]]:
     """Measure fog, veils, holes and spikes of results, by name, from outside the ``cameras`` of a ``reference`` scene.
 
-    Returns a :class:`Fog` by name of the result and kind of camera (those of :data:`FOG_CAMERAS`, and "all"). Its
-    figures are means over the pixels of all pictures of the kind. ``near``: near plane of the pictures, in world units.
+    Returns a :class:`Fog` for each name of a result and kind of camera: the kinds of :data:`FOG_CAMERAS`, and "all".
+    Its figures are means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, in
+    world units.
     """
     reference_splats = make_splats(reference)
     splats = {name: make_splats(result) for name, result in results.items()}
@@ -107,7 +108,7 @@ def measure_fog(
 
 
 def describe_fog(name: str, fog: Fog) -> str | None:
-    """Describe haze and veils of a result from outside; None if far fog is at most 0.05 and the worst veil 0.08."""
+    """Describe haze and veils that a result shows from outside; None if both are small (``HAZE`` and ``VEILED``)."""
     faults = []
     if (fog.fog_far or 0) > HAZE:
         faults.append(f"haze where the input shows nothing (far fog {fog.fog_far:.2f}; compact --fit none makes less)")
@@ -130,7 +131,10 @@ def fog_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, C
 
 
 def draw_depths(splats: Splats, camera: Cameras, near: float, nearest: float) -> OutsidePicture:
-    """Draw opacities beyond ``near``, and opacities and depths beyond ``nearest`` (world units), in one camera."""
+    """Draw opacities beyond ``near``, and opacities and depths beyond ``nearest``, in one camera.
+
+    Both are near planes in world units.
+    """
     views = [
         tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=plane)
         for plane in (near, nearest)
@@ -140,7 +144,10 @@ def draw_depths(splats: Splats, camera: Cameras, near: float, nearest: float) ->
 
 
 def sum_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
-    """Return sums over pixels, and numbers of measured pixels, ``[4,2]``: near fog, far fog, holes and veil."""
+    """Return ``[4,2]``: for near fog, far fog, holes and veil, the sum over pixels and the number of measured pixels.
+
+    ``expected`` is the input, and ``actual`` is the result.
+    """
     empty, solid = (expected.opacities < FOG_EMPTY).astype(np.uint8), expected.opacities > FOG_SOLID
     far_share = 0.1  # fog is far if it is farther than this share of the width from every pixel that the input shows
     sides = EROSION_PIXELS, max(EROSION_PIXELS, 2 * round(far_share * empty.shape[1]) + 1)
@@ -153,7 +160,7 @@ def sum_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
 
 
 def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarray:
-    """Return, for each of ``RATIOS``, how many pixels change without spikes, and how many there are: ``[2,2]``."""
+    """Return ``[2,2]``: for each of ``RATIOS``, the number of pixels that change without spikes, and of all pixels."""
     _, second, longest = np.sort(gaussians.scales, 1).T
     depths = camera_depths(gaussians.means.astype(np.float64), camera.viewmats[0])
     long = 3 * longest * camera.Ks[0, 0, 0] > LONG * camera.width * np.maximum(depths, near)
@@ -166,9 +173,10 @@ def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarr
 
 
 def mean_fog(counts: np.ndarray) -> Fog:
-    """Divide the sums of :func:`sum_pixels` and :func:`count_spikes`, ``[pictures,6,2]``, by the numbers of pixels.
+    """Make the figures of a :class:`Fog` from the sums and numbers of pixels ``[pictures,6,2]`` of several pictures.
 
-    Veils are divided in each picture, and then averaged.
+    The sums are those of :func:`sum_pixels` and :func:`count_spikes`. Each is divided by its number of pixels, over all
+    pictures together. Veils are divided in each picture, and then averaged.
     """
     near, far, holes, _, *spikes = (total / count if count else None for total, count in counts.sum(0).tolist())
     veils = [total / count for total, count in counts[:, 3].tolist() if count]

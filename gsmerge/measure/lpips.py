@@ -41,8 +41,8 @@ class _Conv:
     size: int = 3  # pixels per side of the kernel
     stride: int = 1
     padding: int = 1
-    pool: int = 0  # pixels per side of the max pooling before it, stride 2; 0: none
-    compared: bool = True  # if True, its features enter the distance
+    pool: int = 0  # pixels per side of a max pooling with stride 2 before the convolution; 0: no pooling
+    compared: bool = True  # True: its features enter the distance
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class _Architecture:
     """Location of a network's weights, and its layers up to the last one that is compared."""
 
     file: str
-    trunk: str
-    min_size: int  # least pixels per side; the last layer then still has one pixel
+    trunk: str  # key of the convolutions in the file
+    min_size: int  # least pixels per side of an image, with which the last layer still has one pixel
     convs: tuple[_Conv, ...]
 
 
@@ -69,9 +69,10 @@ _ARCHITECTURES = {
 
 @dataclass(frozen=True, eq=False)
 class Convolution:
-    """One convolution of an LPIPS network.
+    """One convolution of an LPIPS network with its values.
 
-    ``kernel [out,h,w,in]``, ``bias [out]``; ``weights [out]`` of squared feature differences, None if not compared.
+    ``kernel`` is ``[out,h,w,in]``, and ``bias`` is ``[out]``. ``weights [out]`` are those of the squared differences of
+    its features; None if these are not compared.
     """
 
     conv: _Conv
@@ -107,11 +108,11 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
     if mask is not None:
         first = np.where(pixel_mask(mask, first)[..., None], first, second)
     path, values = require_lpips(net), np.ascontiguousarray(second, np.float32)
-    layers = _load(path, net)
+    layers = _load_layers(path, net)
     small = values.shape[0] * values.shape[1] <= MAX_CACHED_PIXELS
     compute = _cached_features if small else _cached_features.__wrapped__
     features = compute(values.tobytes(), values.shape, path, net)
-    return _weighted(_unit_features(first.astype(np.float32), layers), features, layers)
+    return _sum_differences(_unit_features(first.astype(np.float32), layers), features, layers)
 
 
 def lpips_available(net: str = "vgg") -> bool:
@@ -133,7 +134,7 @@ def min_size(net: str) -> int:
 
 
 def _architecture(net: str) -> _Architecture:
-    """Look up the layers of ``net``; ValueError if it is unknown."""
+    """Return the architecture of ``net``; ValueError if it is unknown."""
     if net not in _ARCHITECTURES:
         raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")
     return _ARCHITECTURES[net]
@@ -146,13 +147,16 @@ def read_layers(net: str) -> tuple[Convolution, ...]:
         GsmergeError: If the package with the weights is not installed.
         SceneError: If the file of weights does not have the expected content.
     """
-    return _load(require_lpips(net), net)
+    return _load_layers(require_lpips(net), net)
 
 
-def _weighted(
+def _sum_differences(
     units: Iterable[np.ndarray], reference_units: Iterable[np.ndarray], layers: tuple[Convolution, ...]
 ) -> float:
-    """Weight squared differences of unit features, average over pixels, and sum (equation 1 of Zhang et al.)."""
+    """Return the distance of two images from their unit features, layer by layer (equation 1 of Zhang et al.).
+
+    It is the sum over layers and channels of the mean over pixels of the weighted squared differences.
+    """
     distance = 0.0
     compared = [layer.weights for layer in layers if layer.weights is not None]
     for weights, unit, reference_unit in zip(compared, units, reference_units, strict=True):
@@ -161,27 +165,27 @@ def _weighted(
     return distance
 
 
-@lru_cache(maxsize=MAX_CACHED)  # consecutive calls often have the same reference, for one network or both
+@lru_cache(maxsize=MAX_CACHED)  # successive calls often have the same reference, for one network or both
 def _cached_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
-    """Compute the features of a reference, given as float32 bytes with a shape, and cache them."""
+    """Compute and cache the unit features of a reference, whose float32 values are passed as bytes with a shape."""
     values = np.frombuffer(reference, np.float32).reshape(shape)
-    return list(_unit_features(values, _load(path, net)))
+    return list(_unit_features(values, _load_layers(path, net)))
 
 
 def _unit_features(image: np.ndarray, layers: tuple[Convolution, ...]) -> Iterator[np.ndarray]:
-    """Compute features ``[h,w,c]``, of unit length at every pixel, for each layer that is compared."""
+    """Yield the features ``[h,w,c]`` of each layer that is compared, scaled to unit length at every pixel."""
     features = (2 * image - 1 - INPUT_SHIFT) / INPUT_SCALE
     for layer in layers:
         if layer.conv.pool:
-            features = _pool(features, layer.conv.pool)
+            features = _max_pool(features, layer.conv.pool)
         features = _convolve(features, layer)
         if layer.weights is not None:
             lengths = np.sqrt(np.square(features).sum(-1, keepdims=True))
             yield features / (lengths + EPSILON)
 
 
-def _pool(picture: np.ndarray, size: int) -> np.ndarray:
-    """Return the largest value of every second window of ``size`` x ``size`` pixels."""
+def _max_pool(picture: np.ndarray, size: int) -> np.ndarray:
+    """Return the largest value in every second window of ``size`` x ``size`` pixels, down and across."""
     height, width = (2 * ((n - size) // 2) + 1 for n in picture.shape[:2])
     corners = [(y, x) for y in range(size) for x in range(size)]
     return reduce(np.maximum, [picture[y : y + height : 2, x : x + width : 2] for y, x in corners])
@@ -215,43 +219,43 @@ def _find_weights(net: str) -> Path | None:
 
 
 @lru_cache(maxsize=2)
-def _load(path: Path, net: str) -> tuple[Convolution, ...]:
-    """Load the layers of ``net`` from its file; SceneError if it is not a pickle of the expected float arrays."""
+def _load_layers(path: Path, net: str) -> tuple[Convolution, ...]:
+    """Load the layers of ``net`` from a file; SceneError if that is not a pickle of the expected float arrays."""
     try:
-        return _layers(_Unpickler(io.BytesIO(path.read_bytes())).load(), _architecture(net))
+        return _make_layers(_Unpickler(io.BytesIO(path.read_bytes())).load(), _architecture(net))
     except (pickle.UnpicklingError, EOFError, AttributeError, LookupError, TypeError, ValueError) as e:  # other content
         problem = f"expected the weights of LPIPS ({net}), got a file that cannot be used ({e})"
         raise SceneError(path, problem, f"install it again: {INSTALL} --force-reinstall") from e
 
 
-def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Convolution, ...]:
-    """Convert flax's nested dictionaries, whose kernels are ``[h,w,in,out]``, to layers."""
+def _make_layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Convolution, ...]:
+    """Make layers from the nested dictionaries of flax, whose kernels are ``[h,w,in,out]``."""
     layers: list[Convolution] = []
     inputs, compared = 3, 0
     for i, conv in enumerate(architecture.convs):
         entry, out = tree[architecture.trunk][f"Conv_{i}"], conv.channels
-        kernel = _values(entry["kernel"], (conv.size, conv.size, inputs, out)).transpose(3, 0, 1, 2)
+        kernel = _check_values(entry["kernel"], (conv.size, conv.size, inputs, out)).transpose(3, 0, 1, 2)
         weights = None
         if conv.compared:
-            weights = _values(tree[f"NetLinLayer_{compared}"]["Conv_0"]["kernel"], (1, 1, out, 1)).flatten()
+            weights = _check_values(tree[f"NetLinLayer_{compared}"]["Conv_0"]["kernel"], (1, 1, out, 1)).flatten()
             compared += 1
-        layers.append(Convolution(conv, np.ascontiguousarray(kernel), _values(entry["bias"], (out,)), weights))
+        layers.append(Convolution(conv, np.ascontiguousarray(kernel), _check_values(entry["bias"], (out,)), weights))
         inputs = out
     return tuple(layers)
 
 
-def _values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a stored float32 array; ValueError if it is something else, or has another shape."""
+def _check_values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return ``stored``; ValueError unless it is a float32 array of the ``shape``."""
     if not isinstance(stored, np.ndarray) or stored.shape != shape or stored.dtype != np.float32:
         raise ValueError(f"expected a float32 array of shape {list(shape)}, found something else")
     return stored
 
 
 class _Unpickler(pickle.Unpickler):
-    """Unpickler of plain containers and NumPy's arrays that refuses all other names."""
+    """Unpickler that reads plain containers and NumPy's arrays, and refuses all other objects."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the NumPy object of a name; UnpicklingError for any other name."""
+        """Return the object of a name if arrays of NumPy need it; UnpicklingError for all other names."""
         if (module, name) not in _NAMES:
             raise pickle.UnpicklingError(f"refused to load {module[:40]}.{name[:40]}")
         return _NAMES[module, name]

@@ -1,4 +1,4 @@
-"""Draw pictures for people: scenes from the same cameras side by side."""
+"""Draw pictures that show people several scenes from the same cameras, side by side."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr, psnr_words
 from gsmerge.types import Cameras, Gaussians
 
-Picture = NDArray[np.uint8]  # [h,w,3], sRGB
+BytePicture = NDArray[np.uint8]  # [h,w,3], sRGB
 FACE = cv2.FONT_HERSHEY_SIMPLEX
 MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # largest side that a format or its encoder takes, pixels
-# Height of the label above a picture, pixels. It doubles at twice the width LABEL_WIDTH, triples at three times the
-# width, ...
+# Height of the label above a picture, pixels. It is multiplied by the number of times that LABEL_WIDTH fits into the
+# width of the picture
 LABEL_HEIGHT, LABEL_WIDTH = 22, 640
 LABEL_LEVEL = 32  # grey level of labels, and of cells without a photo
 GAP_PIXELS = 4  # pixels between pictures
 OUTSIDE_VIEW = "step back"  # name of the outside view
 
 
-def to_picture(image: np.ndarray) -> Picture:
+def to_picture(image: np.ndarray) -> BytePicture:
     """Convert a picture ``[h,w,3]``, float in [0, 1], to 8 bits."""
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
 
 
-def save_picture(path: Path, picture: Picture, *, overwrite: bool = True) -> None:
-    """Write a picture ``[h,w,3]`` in the format of the file name."""
+def save_picture(path: Path, picture: BytePicture, *, overwrite: bool = True) -> None:
+    """Write a picture ``[h,w,3]`` in the format of the file name; SceneError if a side is too long for it."""
     max_side, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
     if max(height, width) > max_side:
         problem = f"expected at most {max_side:,} pixels per side of a {path.suffix}, got {width} x {height}"
@@ -45,7 +45,7 @@ def save_picture(path: Path, picture: Picture, *, overwrite: bool = True) -> Non
         temporary.write_bytes(data.tobytes())
 
 
-def label(picture: Picture, text: str) -> Picture:
+def label(picture: BytePicture, text: str) -> BytePicture:
     """Put a dark band with one line of text above a picture; shorten the text to fit."""
     factor = max(1, picture.shape[1] // LABEL_WIDTH)
     scale = 0.42 * factor
@@ -58,7 +58,8 @@ def label(picture: Picture, text: str) -> Picture:
 def shorten_text(text: str, width: int, scale: float, thickness: int) -> str:
     """Shorten a text that OpenCV would draw wider than ``width`` pixels.
 
-    Its last parts, after commas with spaces, are left out. If the first part is too wide, dots replace its middle.
+    Parts of the text, which commas separate, are left out from the last on. If the first part alone is too wide, dots
+    replace its middle.
     """
 
     def fits(text: str) -> bool:
@@ -77,13 +78,13 @@ def view_pictures(
     photos: Sequence[np.ndarray | None] | None = None,
     names: Sequence[str] | None = None,
     **drawing: Any,
-) -> list[list[tuple[str, Picture]]]:
-    """Render each scene in every view, in rows that begin with the photo if there is one.
+) -> list[list[tuple[str, BytePicture]]]:
+    """Render each scene in every view; return a row of pictures for each view, each with a line of text.
 
-    Every picture comes with a line of text. For a scene, the text has the name, the number of Gaussians, and the PSNR
-    against the whole photo ``[h,w,3]``, or, if ``photos`` is None, the PSNR against the first scene. For a photo, the
-    text has the name of the view. A view whose photo is None begins with a dark picture. ``drawing`` is passed to
-    :func:`gsmerge.render`.
+    A row begins with the photo ``[h,w,3]``, or with a dark picture if the photo is None. If ``photos`` is None, it
+    begins with the first scene. The text of a photo has the name of the view. The text of a scene has its name, the
+    number of its Gaussians, and the PSNR against the photo or, if ``photos`` is None, against the first scene.
+    ``drawing`` is passed to :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
@@ -104,10 +105,10 @@ def view_pictures(
 
 def outside_pictures(
     scenes: Sequence[tuple[str, Gaussians]], cameras: Cameras, *, photos: bool, **drawing: Any
-) -> list[tuple[str, Picture]]:
-    """Render each scene from outside the capture, in one row like those of :func:`view_pictures`.
+) -> list[tuple[str, BytePicture]]:
+    """Render each scene from outside the capture, and return a row of pictures like those of :func:`view_pictures`.
 
-    Every picture comes with its name. With ``photos`` the row begins with a dark picture, in the column of photos.
+    ``photos``: the other rows begin with photos, so this one begins with a dark picture.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
     renders = [
@@ -116,18 +117,21 @@ def outside_pictures(
     return [(f"{OUTSIDE_VIEW}: no photo", np.full_like(renders[0][1], LABEL_LEVEL))] * photos + renders
 
 
-def contact_sheet(views: Sequence[Sequence[tuple[str, Picture]]], *, min_width: int = 320) -> Picture:
-    """Arrange pictures in a sheet with a labelled row per view, enlarged by a whole factor to ``min_width`` pixels."""
+def contact_sheet(views: Sequence[Sequence[tuple[str, BytePicture]]], *, min_width: int = 320) -> BytePicture:
+    """Arrange pictures with their texts in a sheet that has a row for each view.
+
+    Pictures narrower than ``min_width`` pixels are enlarged by a whole factor.
+    """
     factor = max(1, -(-min_width // views[0][0][1].shape[1]))
     rows = []
     for pictures in views:
         tiles = [(text, np.repeat(np.repeat(picture, factor, 0), factor, 1)) for text, picture in pictures]
-        rows.append(_join([label(picture, text) for text, picture in tiles], axis=1))
-    return _join(rows, axis=0)
+        rows.append(_join_with_gaps([label(picture, text) for text, picture in tiles], axis=1))
+    return _join_with_gaps(rows, axis=0)
 
 
-def _join(pictures: Sequence[Picture], axis: int) -> Picture:
-    """Join pictures to a row or a column, with gaps between them."""
+def _join_with_gaps(pictures: Sequence[BytePicture], axis: int) -> BytePicture:
+    """Join pictures along an axis, 0 for a column and 1 for a row, with white gaps between them."""
     shape = list(pictures[0].shape)
     shape[axis] = GAP_PIXELS
     gap = np.full(shape, 255, np.uint8)

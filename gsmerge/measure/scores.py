@@ -1,4 +1,4 @@
-"""Make documents of evaluations: JSON with a stable schema, a CSV with one row per view, and tables for people."""
+"""Write evaluations as JSON with a stable schema, as CSV with one row per view, and as tables for people."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsmerge.runtime.memory import human_bytes, human_share
 Row = Sequence[str]
 TextTable = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
 
-SPLIT_WORDS = {"context": "input", "target": "held-out"}  # words for the views of a split
+SPLIT_WORDS = {"context": "input", "target": "held-out"}  # what the views of a split are called
 SIMPLE = ("psnr", "ssim")  # measures that are also taken over the pixels that the input covers
 SCORE_COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
@@ -23,7 +23,7 @@ OUTSIDE_COLUMNS = {
     "fog_near": "near fog", "fog_far": "far fog", "holes": "holes", "veil": "veil", "veil_worst": "worst veil",
     "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
-# Columns that a narrow terminal omits, in this order
+# Columns that are omitted first, in this order, if a terminal is narrow
 OMITTED_FIRST = ("bytes each", "smaller by", "ms/view", "kept")
 MASKED_SUFFIX = "_visible"  # suffix of measures over the pixels that the input views have seen
 COVERED_SUFFIX = "_covered"  # suffix of measures over the pixels that the input covers
@@ -39,8 +39,8 @@ def evaluation_document(
 ) -> dict[str, Any]:
     """Convert an evaluation to plain JSON types, with further facts on each result, such as path and bytes.
 
-    ``schema_version`` 1 has tool, reference, views, results and notes. A result has its facts, count, ratio, render
-    seconds, fog, holes, veils and spikes (null for the input), means by split, and a score for each view.
+    The document has version, tool, reference, numbers of views, results and notes. A result has its facts, count,
+    ratio, render seconds, fog, holes, veils and spikes (null for the input), means by split, and a score for each view.
     ``photo_side`` is present if it is not 0, ``antialiased`` if it is true, and ``lpips_views`` if some split has views
     without LPIPS. Within a schema version keys may be added, but not removed.
     """
@@ -51,19 +51,19 @@ def evaluation_document(
         **({"antialiased": True} if evaluation.options.antialiased else {}),
         **({"lpips_views": evaluation.options.lpips_views} if _some_lpips(evaluation) else {}),
         "num_views": dict(evaluation.num_views),
-        "results": [_result(result, evaluation, facts.get(result.name, {})) for result in evaluation.results],
+        "results": [_result_entries(result, evaluation, facts.get(result.name, {})) for result in evaluation.results],
         **note_entries([*notes, *evaluation.notes]),
     }
 
 
 def _some_lpips(evaluation: Evaluation) -> bool:
-    """Return whether LPIPS was measured on only some of the views."""
+    """Return whether LPIPS was measured, but only on some of the views."""
     num_views = evaluation.options.lpips_views
     return bool(evaluation.options.lpips and num_views and num_views < max(evaluation.num_views.values()))
 
 
-def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert the scores of one result, with its ``facts``."""
+def _result_entries(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a document for one result: its ``facts`` and its scores."""
     return {
         "name": result.name,
         **facts,
@@ -73,34 +73,35 @@ def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, An
         **asdict(result.fog.get(ALL, Fog())),
         "fog_by_kind": {kind: asdict(fog) for kind, fog in result.fog.items() if kind != ALL},
         "mean": {
-            split: _flat(result.mean(split)) | _covered(*result.mean_covered(split)) for split in evaluation.num_views
+            split: _quality_entries(result.mean(split)) | _covered_entries(*result.mean_covered(split))
+            for split in evaluation.num_views
         },
         "views": [
             {
                 "split": s.split,
                 "view": s.view,
                 "visible_share": s.visible,
-                **_flat((s.full, s.masked)),
-                **_covered(s.covered_share, s.covered),
+                **_quality_entries((s.full, s.masked)),
+                **_covered_entries(s.covered_share, s.covered),
             }
             for s in result.scores
         ],
     }
 
 
-def _covered(share: float | None, quality: Quality) -> dict[str, float | None]:
-    """Convert the share of covered pixels and the scores over them."""
+def _covered_entries(share: float | None, quality: Quality) -> dict[str, float | None]:
+    """Return the entries for the share of the pixels that the input covers, and for the scores over these."""
     return {"share" + COVERED_SUFFIX: share} | {name + COVERED_SUFFIX: getattr(quality, name) for name in SIMPLE}
 
 
-def _flat(pair: QualityPair) -> dict[str, float | None]:
-    """Convert the scores over all and over visible pixels to one dictionary."""
+def _quality_entries(pair: QualityPair) -> dict[str, float | None]:
+    """Return the entries for the scores over all pixels, and over the pixels that the input views have seen."""
     full, masked = map(asdict, pair)
     return full | {name + MASKED_SUFFIX: value for name, value in masked.items()}
 
 
 def evaluation_csv(document: Mapping[str, Any]) -> str:
-    """Format an evaluation as CSV with one row per result and view; cells without a measurement are empty."""
+    """Format the document of an evaluation as CSV with one row per result and view; missing measures are empty."""
     rows = []
     for result in document["results"]:
         shared = {"schema_version": document["schema_version"], "result": result["name"]}
@@ -110,7 +111,7 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 
 def evaluation_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
-    """Make the text tables of an evaluation: heading, columns and rows of each."""
+    """Yield the text tables of an evaluation: heading, columns and rows of each."""
     results = document["results"]
     yield (
         "Size",
@@ -119,15 +120,16 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
     )
     for split in document["num_views"]:
         yield from _quality_tables(document, split)
-    outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE_COLUMNS)) for result in results]
+    outside = [(result["name"], *(_format_number(result[name]) for name in OUTSIDE_COLUMNS)) for result in results]
     heading = "Faults seen from outside that the input does not have: shares of the picture, less is better"
     yield heading, ("", *OUTSIDE_COLUMNS.values()), [row for row in outside if any(row[1:])]
 
 
 def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[TextTable]:
-    """Make the tables of the mean scores over a split's views: over seen pixels, and over covered pixels.
+    """Yield two tables of the mean scores over a split's views.
 
-    The second has no rows if the input covers nearly all pixels.
+    One is over the pixels that the input views have seen, and the other over the pixels that the input covers. The
+    second has no rows if the input covers nearly all pixels.
     """
     results, count = document["results"], document["num_views"][split]
     quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"
@@ -136,12 +138,12 @@ def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[TextTab
     seen = (
         f"against {document['reference']}, over the pixels that the input views have seen{_describe_options(document)}"
     )
-    yield f"{views}, {seen}", ("", *SCORE_COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
+    yield f"{views}, {seen}", ("", *SCORE_COLUMNS.values()), [(name, *_format_figures(mean)) for name, mean in means]
     input_mean = next(iter(results[0]["mean"].values()))  # over the input views, if they are measured
     lacks_pixels = (input_mean["share" + COVERED_SUFFIX] or 1) < WHOLE_SHARE
     heading = f"{views}, over the pixels that the input covers"
     yield heading, ("", "of all", *(SCORE_COLUMNS[name] for name in SIMPLE)), [
-        (name, f"{100 * mean['share' + COVERED_SUFFIX]:.0f} %", *_cells(mean, SIMPLE, COVERED_SUFFIX))
+        (name, f"{100 * mean['share' + COVERED_SUFFIX]:.0f} %", *_format_figures(mean, SIMPLE, COVERED_SUFFIX))
         for name, mean in means if lacks_pixels
     ]  # fmt: skip
 
@@ -154,7 +156,7 @@ def _describe_options(document: Mapping[str, Any]) -> str:
 
 
 def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
-    """Return the row of a result in the table of sizes; ``first``: the result that it is compared with."""
+    """Return the row of a result in the table of sizes; ``first`` is the result with whose size it is compared."""
     size, input_size = result.get("bytes"), first.get("bytes")
     bytes_each = sum(result.get("bytes_by_attribute", {}).values()) / max(result["num_gaussians"], 1)
     return (
@@ -168,19 +170,21 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
     )
 
 
-def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED_SUFFIX) -> Iterator[str]:
-    """Format the figures over visible pixels, or those with another ``suffix``; missing figures become ""."""
+def _format_figures(
+    score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED_SUFFIX
+) -> Iterator[str]:
+    """Yield the measures ``names`` with a ``suffix`` as text; missing ones become ""."""
     for name in names:
-        yield _number(score[name + suffix], 2 if name == "psnr" else 3)
+        yield _format_number(score[name + suffix], 2 if name == "psnr" else 3)
 
 
-def _number(value: float | None, digits: int = 3) -> str:
+def _format_number(value: float | None, digits: int = 3) -> str:
     """Format a number; "" for None."""
     return "" if value is None else f"{value:.{digits}f}"
 
 
 def filled_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
-    """Make the tables of :func:`evaluation_tables` without empty columns and tables."""
+    """Yield the tables of :func:`evaluation_tables` without empty columns, and without tables that have no rows."""
     for heading, head, rows in evaluation_tables(document):
         filled = [i for i in range(len(head)) if i == 0 or any(row[i] for row in rows)]
         if rows:
@@ -188,7 +192,7 @@ def filled_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
 
 
 def evaluation_lines(document: Mapping[str, Any], columns: int | None = None) -> list[str]:
-    """Format the tables of an evaluation as lines for a terminal of ``columns`` width; None: unlimited."""
+    """Format the tables of an evaluation as lines for a terminal that is ``columns`` letters wide; None: unlimited."""
     lines = list[str]()
     for heading, head, rows in filled_tables(document):
         omitted_first = [head.index(name) for name in OMITTED_FIRST if name in head]

@@ -1,4 +1,4 @@
-"""Resize cameras, photos and masks, so that renders and photos that are compared have the same size."""
+"""Resize cameras, photos and masks, so that renders have the size of the photos with which they are compared."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
 
 
 def fill_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """Resize the images of cameras until they fill ``[height,width]``, and crop both ends of the longer axis evenly."""
+    """Resize the images of cameras until they fill ``[height,width]``, and crop what is outside evenly at both ends."""
     new_width, new_height = _filling_size(cameras.width, cameras.height, width, height)
     resized = resize_cameras(cameras, new_width, new_height)
     Ks = resized.Ks.astype(np.float64)
@@ -42,7 +42,7 @@ def fill_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _filling_size(old_width: int, old_height: int, width: int, height: int) -> tuple[int, int]:
-    """Return the least size with the old aspect ratio that covers ``width`` x ``height``."""
+    """Return the least width and height with the old aspect ratio that cover ``width`` x ``height``."""
     scale = max(width / old_width, height / old_height)
     return max(width, round(scale * old_width)), max(height, round(scale * old_height))
 
@@ -78,6 +78,9 @@ def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.
 
 
 def _overlapped(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the range of old pixels, first and last + 1, that each new pixel overlaps if ``old`` become ``new``."""
+    """Return the first and the last + 1 of the old pixels that each new pixel overlaps.
+
+    A line of ``old`` pixels is resized to ``new`` pixels.
+    """
     pixel = np.arange(new)
     return pixel * old // new, -(-(pixel + 1) * old // new)

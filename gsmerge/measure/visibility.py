@@ -16,24 +16,24 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
 Points = NDArray[np.float64]  # [n,3]
-VISIBILITY_GAUSSIANS = 200_000  # largest sample on which a share is measured
-_CHUNK = 1 << 16  # points processed at a time; the first ones often show all pixels
+VISIBILITY_GAUSSIANS = 200_000  # largest sample of Gaussians on which a share is measured
+_CHUNK = 1 << 16  # number of points that are processed at a time; often the first ones already mark all pixels
 
 
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
     """Return the surface points ``[n,3]``, in world units, that the pixels of the input views show.
 
-    If views have Gaussians of their own, the points are their centres. Otherwise they are depths rendered beyond
-    ``near`` (world units) in the ``cameras``; None: the scene's cameras.
+    If views have Gaussians of their own, the points are the centres of these. Otherwise they follow from depths that
+    are rendered beyond ``near`` (world units) in ``cameras``, by default the scene's cameras.
     """
     if scene.has_own_pixels:
         return scene.file_gaussians.means.astype(np.float64)
     cameras = scene.cameras if cameras is None else cameras
-    return np.concatenate([_rendered_points(scene.gaussians, cameras[[i]], near) for i in range(len(cameras))])
+    return np.concatenate([_render_points(scene.gaussians, cameras[[i]], near) for i in range(len(cameras))])
 
 
-def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
-    """Return the surface points that the rendered depth of one camera shows."""
+def _render_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
+    """Render the depths of one camera, and return the points ``[n,3]`` at these depths; faint pixels have none."""
     drawn = render(gaussians, camera, near=near, with_depths=True)
     assert drawn.depths is not None
     depths = drawn.depths[0, ..., 0]
@@ -45,18 +45,18 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
-    """Return masks ``[c,h,w]`` of the pixels at or next to the projection of a point ``[n,3]``, occluded or not.
+    """Return masks ``[c,h,w]`` of the pixels at or next to the projection of a point ``[n,3]``, hidden or not.
 
-    Points nearer than ``near`` (world units) do not count. If the views have smaller pixels than the ``sources``, the
-    cameras of the points, a point marks proportionally more pixels, so that there are no gaps.
+    Points nearer than ``near`` (world units) do not count. ``sources`` are the cameras from which the points are. If
+    the views have smaller pixels than these, a point marks more pixels in proportion, so that there are no gaps.
     """
     viewmats, Ks = cameras.viewmats.astype(np.float64, "C"), cameras.Ks.astype(np.float64, "C")
 
-    def one_view(view: int) -> NDArray[np.bool_]:
+    def find_seen(view: int) -> NDArray[np.bool_]:
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
         seen = hit > 0
-        side = _side(Ks[view], sources)
-        own = len(points) * view // len(cameras)  # in most scenes the view's own points begin here; start with them
+        side = _choose_mark_side(Ks[view], sources)
+        own = len(points) * view // len(cameras)  # in most scenes the view's own points begin here, so start with them
         for start in (*range(own, len(points), _CHUNK), *range(0, own, _CHUNK)):
             mark_pixels(points[start : start + _CHUNK], viewmats[view], Ks[view], near, hit)
             seen = cv2.dilate(hit, np.ones((side, side), np.uint8)) > 0
@@ -64,12 +64,12 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
                 break
         return seen
 
-    return np.stack(parallel_map(one_view, range(len(cameras))))
+    return np.stack(parallel_map(find_seen, range(len(cameras))))
 
 
-def _side(K: np.ndarray, sources: Cameras | None) -> int:
+def _choose_mark_side(K: np.ndarray, sources: Cameras | None) -> int:
     """Choose the side (odd, pixels) of the square that a point marks in a view with intrinsics ``K [3,3]``."""
-    mark_side = 3  # side of the square that a point marks, pixels of the input views
+    mark_side = 3  # side of this square in the views from which the points are, pixels
     if sources is None:
         return mark_side
     focals = [np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64))]  # pixels
@@ -77,7 +77,7 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
 
 
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
-    """Yield for each view a mask ``[n]`` of the points ``[n,3]`` inside its picture."""
+    """Yield, for each view, the mask ``[n]`` of the points ``[n,3]`` inside its picture."""
     at_once = 1 + _CHUNK // max(1, len(points))
     for start in range(0, len(cameras), at_once):
         pixels, depths = project(points, cameras[start : start + at_once])

@@ -16,7 +16,7 @@ from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Quality, ResultScores, evaluate
 from gsmerge.measure.lpips import lpips_available
-from gsmerge.measure.preview import OUTSIDE_VIEW, Picture, to_picture
+from gsmerge.measure.preview import OUTSIDE_VIEW, BytePicture, to_picture
 from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.photos.views import even_views
 from gsmerge.raster import render
@@ -240,7 +240,7 @@ def short_names(names: Sequence[str]) -> list[str]:
     return stems if len(set(stems)) == len(stems) else list(names)
 
 
-def encode_still(picture: Picture) -> bytes:
+def encode_still(picture: BytePicture) -> bytes:
     """Encode a picture as WebP."""
     webp_quality = 90  # stills of this quality score within 1 dB of lossless stills
     return encode_picture(picture, webp_quality)

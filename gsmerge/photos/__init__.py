@@ -1,1 +1,1 @@
-"""Compare photos with what Gaussians show; all scores are relative to the noise of wrong pairs."""
+"""Decide which photo shows which view, and correct photos that differ from what the Gaussians show."""

@@ -4,11 +4,11 @@ File names propose a photo for each view. A comparison of the photo with the Gau
 photo is replaced or left out
 
 - if another photo or another orientation matches the view clearly better,
-- if it matches the view no better than wrong pairs match, or
+- if it matches the view no better than photos match views that they do not show (wrong pairs), or
 - if its parts lie farther from their places than the parts of the other proposed photos do.
 
-For all other views the photos with the highest scores are compared part by part. This tells neighbouring views apart,
-because their photos show the same things in different places.
+For each view that is left without a photo, the photos with the highest scores are compared part by part. This tells
+neighbouring views apart, because their photos show the same things in different places.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from gsmerge.photos.scores import NOISE_MARGIN, SCORE_PIXELS, Comparer, fisher_z
 from gsmerge.runtime.threads import parallel_map
 
 SIGNIFICANT = 2.0  # standard deviations of noise; smaller scores and smaller differences of scores count as noise
-MIN_EXPLAINED = 0.5  # share of the variance of a view that a photo explains; above it, the photo matches the view
+MIN_EXPLAINED = 0.5  # a photo that explains more than this share of the variance of a view matches the view
 MIN_CONTRAST = 1 / 255  # root mean square, the rounding of 8 bits; pictures with less contrast cannot be compared
-FIRST_PHOTOS = 256  # evenly spaced photos of a film that are compared first; their best neighbourhoods come next
+FIRST_PHOTOS = 256  # evenly spaced photos of a film that are compared first; then the neighbours of the best ones
 
 
 class Assignment(NamedTuple):
@@ -43,9 +43,9 @@ class Assignment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Photos that may show the views of a scene."""
+    """Photos that may show the views of a scene, numbered from 0."""
 
-    # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to OFFSET_PIXELS pixels
+    # photo -> its picture [h,w,3] as it is stored, sRGB in [0, 1]; may be reduced to OFFSET_PIXELS pixels
     read: Callable[[int], np.ndarray]
     count: int
     tag: Callable[[int], int]  # photo -> orientation in its EXIF tag, 0 to 7
@@ -53,20 +53,20 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class _Scores:
-    """Fisher's z of some photos in all views and orientations, in units of the noise of wrong pairs."""
+    """Scores of p photos in all views and orientations: Fisher's z, in units of the noise of wrong pairs."""
 
-    photos: tuple[int, ...]
-    # [v,p,8]; NaN for views without Gaussians, and where an oriented photo is portrait but the views are landscape or
-    # vice versa
+    photos: tuple[int, ...]  # the p photos, in the order of the second axis
+    # [v,p,8] scores; NaN for views without Gaussians, and where an oriented photo is portrait but the views are
+    # landscape or vice versa
     values: np.ndarray
-    correlations: np.ndarray  # [v,p,8]
+    correlations: np.ndarray  # [v,p,8] correlations from which the scores follow
 
     def of(self, view: int, assignment: Assignment) -> float:
-        """Return the score of an assignment in a view; NaN where the shapes differ."""
+        """Return the score of an assigned photo in a view; NaN if only one of the two is portrait."""
         return float(self.values[view, self.photos.index(assignment.photo), assignment.orientation])
 
-    def fits(self, assignment: Assignment) -> bool:
-        """Return True if the oriented photo has the shape, portrait or landscape, of the views."""
+    def has_shape(self, assignment: Assignment) -> bool:
+        """Return True if the oriented photo is portrait or landscape as the views are."""
         return bool(np.isfinite(self.values[:, self.photos.index(assignment.photo), assignment.orientation]).any())
 
     def best(self) -> np.ndarray:
@@ -74,14 +74,18 @@ class _Scores:
         return np.nan_to_num(self.values, nan=-np.inf).max(2)
 
     def choose_orientation(self, view: int, photo: int, tag: int) -> int:
-        """Choose the orientation of a photo: as stored or as tagged, unless another one scores clearly higher."""
+        """Choose the orientation in which a photo shows a view.
+
+        It is the stored one, 0, if no other scores clearly higher; otherwise ``tag``, on the same condition; otherwise
+        the one with the highest score.
+        """
         scores = np.nan_to_num(self.values[view, self.photos.index(photo)], nan=-np.inf)
         likely = (orientation for orientation in (0, tag) if scores[orientation] > scores.max() - SIGNIFICANT)
         return next(likely, int(scores.argmax()))
 
 
 class Assigner:
-    """Assigns photos to the views of a scene, and caches all comparisons.
+    """Assign photos to the views of a scene, and cache all comparisons.
 
     ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side. Small pictures are compared
     first, larger ones where the small ones do not decide.
@@ -92,36 +96,36 @@ class Assigner:
         self.candidates, self._show = candidates, show
         self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
         self._offsets = dict[tuple[int, Assignment], PhotoOffsets | None]()
-        self.has_contrast = self._comparer.measure_contrast() > MIN_CONTRAST  # [v] the view can be compared
+        self.has_contrast = self._comparer.measure_contrast() > MIN_CONTRAST  # [v] False: too plain to be compared
 
     @cached_property
     def shown(self) -> ViewPictures:
-        """Pictures of the views, large enough to search for parts."""
+        """Pictures of the views that are large enough to be compared part by part."""
         return self._show(OFFSET_PIXELS)
 
-    def score(self, photos: Iterable[int]) -> _Scores:
-        """Compare photos with all views."""
+    def score_in_views(self, photos: Iterable[int]) -> _Scores:
+        """Return the scores of photos in all views, relative to the noise among these photos."""
         ids = tuple(dict.fromkeys(photos))
         new = [photo for photo in ids if photo not in self._correlations]
-        # Photos per task, and number of tasks; each task reads the pictures of all views
+        # Least photos per task, and most tasks: each task goes through the pictures of all views
         min_per_task, max_tasks = 8, 16
         task_size = max(min_per_task, -(-len(new) // max_tasks))
 
-        def compare(start: int) -> np.ndarray:
+        def correlate_task(start: int) -> np.ndarray:
             return self._comparer.correlate([self.candidates.read(photo) for photo in new[start : start + task_size]])
 
-        compared = parallel_map(compare, range(0, len(new), task_size))
-        self._correlations |= dict(zip(new, itertools.chain(*compared), strict=True))
+        new_correlations = parallel_map(correlate_task, range(0, len(new), task_size))
+        self._correlations |= dict(zip(new, itertools.chain(*new_correlations), strict=True))
         correlations = np.stack([self._correlations[photo] for photo in ids], 1)
         z = fisher_z(correlations)
         middle, noise = measure_noise(z, self._comparer.least_noise)
         return _Scores(ids, (z - middle[:, None, None]) / noise, correlations)
 
-    def compare(self, view: int, assignment: Assignment) -> float | None:
-        """Compare a photo with a view part by part.
+    def compare_parts(self, view: int, assignment: Assignment) -> float | None:
+        """Compare a photo with a view part by part, and return their similarity.
 
-        Returns their similarity, at least 1, if the photo shows the view; 0 if it was taken from elsewhere; None if the
-        parts do not decide.
+        It is at least 1 if the photo shows the view, 0 if the photo was taken from elsewhere, and None if the parts do
+        not decide.
         """
         offsets = self.find_offsets(view, assignment)
         if offsets is None or offsets.verdict is None:
@@ -129,20 +133,20 @@ class Assigner:
         return 1 + max(offsets.similarity, 0.0) if offsets.verdict else 0.0
 
     def find_offsets(self, view: int, assignment: Assignment) -> PhotoOffsets | None:
-        """Find the parts of a photo in the picture of a view; None if the picture is too small for parts."""
+        """Find where the parts of a view's picture are in a photo; None if the picture is too small for parts."""
         if (view, assignment) not in self._offsets:
             photo = turn_picture(self.candidates.read(assignment.photo), assignment.orientation)
             self._offsets[view, assignment] = find_offsets(self.shown, view, np.ascontiguousarray(photo))
         return self._offsets[view, assignment]
 
-    def lies_elsewhere(self, view: int, assignments: Mapping[int, Assignment]) -> bool:
+    def is_displaced(self, view: int, assignments: Mapping[int, Assignment]) -> bool:
         """Return True if the parts of a view's photo are displaced farther than the parts of the other views' photos.
 
-        The threshold is twice the median distance in the other views. Wrong depth displaces the drawn Gaussians of all
-        views, but by no more than ``NEAR_PIXELS``, the largest differences between the offsets of one view.
+        Wrong depth displaces the drawn Gaussians of all views. So parts of the photo may be displaced by twice the
+        median offset in the other views, but by no more than ``NEAR_PIXELS``, by which offsets within one view differ.
         """
         offsets = self.find_offsets(view, assignments[view])
-        if offsets is None or offsets.verdict is not False:
+        if offsets is None or offsets.verdict is not False:  # the parts do not even speak against the photo
             return False
         other_pairs = [pair for pair in assignments.items() if pair[0] != view]
         other_offsets = parallel_map(lambda pair: self.find_offsets(*pair), other_pairs)
@@ -153,10 +157,10 @@ class Assigner:
         return replace(offsets, tolerance=ZERO_OFFSET + min(threshold, NEAR_PIXELS)).verdict is False
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
-        """Check the photos that names or their order propose for views.
+        """Check the photos ``named`` that names or order propose for the views, one for each view or None.
 
-        Returns the assignment of each view, None where the proposed photo is rejected, and a list that is True where
-        the comparison confirms the photo. A photo is rejected
+        Returns two lists with an entry for each view: the assignment, None where no photo is proposed or the photo is
+        rejected; and True where the comparison confirms the photo. A photo is rejected
 
         - if another orientation, or another photo that no other view needs, scores clearly higher in its view,
         - if it scores no higher than wrong pairs do, or
@@ -165,48 +169,54 @@ class Assigner:
         Noise of the drawings lowers the scores of all photos and moves their parts. The thresholds therefore follow
         from the scores and parts of the proposed photos themselves.
 
-        Where names are ``exact``, a photo is confirmed if its score is high and no other assignment raises it. Other
-        photos are confirmed by their parts.
+        Where names are ``exact``, a photo is confirmed if its score is high and no other assignment scores higher.
+        Other photos are confirmed by their parts.
         """
         out, confirmed = list[Assignment | None]([None] * len(named)), [False] * len(named)
         named_pairs = [(view, photo) for view, photo in enumerate(named) if photo is not None]
         if not named_pairs:
             return out, confirmed
-        scores = self.score(photo for _, photo in named_pairs)
+        scores = self.score_in_views(photo for _, photo in named_pairs)
         proposed = {view: Assignment(photo, self._stored_or_tagged(scores, view, photo)) for view, photo in named_pairs}
         columns = [scores.photos.index(photo) for _, photo in named_pairs]
         best = scores.best()[np.ix_(list(proposed), columns)]  # of each proposed view with each proposed photo
-        own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)
-        matched = _match(best)
+        own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)  # of each photo in its view
+        matched = _match_columns(best)
         # if the proposed photos together are right, half their median lies half-way from wrong pairs to right ones
         with_contrast = own[self.has_contrast[list(proposed)]]
         least = min(SIGNIFICANT, median(with_contrast) / 2) if _exceed_noise(with_contrast) else SIGNIFICANT
         for row, (view, assignment) in enumerate(proposed.items()):
             score, highest = own[row], max(best[row, row], best[row, matched[row]])
             correlation = scores.correlations[view, columns[row], assignment.orientation]
-            matches = score > least or correlation**2 > MIN_EXPLAINED
-            matches = matches and score > highest - SIGNIFICANT
+            is_similar = score > least or correlation**2 > MIN_EXPLAINED
+            matches = is_similar and score > highest - SIGNIFICANT
             is_clear = score > NOISE_MARGIN and score >= highest
             if is_clear and exact:
                 out[view], confirmed[view] = assignment, True
-            elif matches or (not self.has_contrast[view] and scores.fits(assignment)):
-                parts = self.compare(view, assignment)
-                out[view] = None if self.lies_elsewhere(view, proposed) else assignment
-                confirmed[view] = bool(parts) or (is_clear and parts is None) or not self.has_contrast[view]
+            elif matches or (not self.has_contrast[view] and scores.has_shape(assignment)):
+                similarity = self.compare_parts(view, assignment)
+                out[view] = None if self.is_displaced(view, proposed) else assignment
+                confirmed[view] = bool(similarity) or (is_clear and similarity is None) or not self.has_contrast[view]
         return out, confirmed
 
     def explain_most(self, assignments: Sequence[Assignment | None]) -> bool:
         """Return True if photos explain :data:`MIN_EXPLAINED` of the variance of at least half of their views."""
-        pairs = [(view, pair) for view, pair in enumerate(assignments) if pair is not None and self.has_contrast[view]]
+        pairs = [
+            (view, assignment)
+            for view, assignment in enumerate(assignments)
+            if assignment is not None and self.has_contrast[view]
+        ]
         if not pairs:
             return False
-        scores = self.score(pair.photo for _, pair in pairs)
-        correlations = [scores.correlations[view, scores.photos.index(photo), turn] for view, (photo, turn) in pairs]
+        scores = self.score_in_views(assignment.photo for _, assignment in pairs)
+        correlations = [
+            scores.correlations[view, scores.photos.index(photo), orientation] for view, (photo, orientation) in pairs
+        ]
         return median(np.array(correlations)) > np.sqrt(MIN_EXPLAINED)
 
     def match_together(self, assignments: Sequence[Assignment | None]) -> bool:
         """Return True if assigned photos together match their views better than equally many wrong pairs would."""
-        scores = self.score(self._correlations)
+        scores = self.score_in_views(self._correlations)  # of all photos that were compared so far
         own = [
             scores.of(view, assignment)
             for view, assignment in enumerate(assignments)
@@ -221,26 +231,30 @@ class Assigner:
         return tag if tagged > stored + SIGNIFICANT else 0
 
     def search(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, Assignment]:
-        """Find which of ``photos`` show ``views``; the most similar photos are compared part by part."""
+        """Find which of ``photos`` show ``views``, and return the assignment of each view that has such a photo.
+
+        The photos with the highest scores in a view are compared with it part by part.
+        """
         likely_by_view = self.list_likely(views, photos)
         pairs = [(view, assignment) for view, likely in likely_by_view.items() for assignment in likely]
         if not pairs:
             return {}
-        scores = self.score(self._correlations)
+        scores = self.score_in_views(self._correlations)
 
         def compare(pair: tuple[int, Assignment]) -> float:
-            similarity = self.compare(*pair)
+            """Return the similarity of the parts, or, if they do not decide, a smaller number from the score."""
+            similarity = self.compare_parts(*pair)
             if similarity is not None:
                 return similarity
             score = scores.of(*pair)
-            return 1 - NOISE_MARGIN / score if score > NOISE_MARGIN else 0.0  # always below the similarity of parts
+            return 1 - NOISE_MARGIN / score if score > NOISE_MARGIN else 0.0
 
-        return _choose(pairs, parallel_map(compare, pairs))
+        return _choose_assignments(pairs, parallel_map(compare, pairs))
 
     def list_likely(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, list[Assignment]]:
-        """List the ``photos`` with the highest scores in each of ``views``.
+        """List the ``photos`` with the highest scores in each of ``views``, the best first.
 
-        Of many photos an evenly spaced sample is compared first, then the photos around the best of the sample.
+        If there are many photos, an evenly spaced sample is compared first, then the photos around the best of them.
         """
         if not views or not photos:
             return {}
@@ -248,7 +262,7 @@ class Assigner:
         compared = set(range(0, len(photos), step))  # indices into ``photos``
         max_compared = 4  # photos with the highest scores that are compared with a view part by part
         while True:
-            scores = self.score(photos[index] for index in sorted(compared))
+            scores = self.score_in_views(photos[index] for index in sorted(compared))
             best = scores.best()
             columns = {view: np.argsort(-best[view], kind="stable")[:max_compared] for view in views}
             peaks = {photos.index(scores.photos[column]) for ids in columns.values() for column in ids}
@@ -273,60 +287,69 @@ def assign_photos(
     exact: bool,
     stored: Candidates | None = None,
 ) -> tuple[list[Assignment | None], bool]:
-    """Assign a photo to each view, None where no photo shows it; return whether proposed photos explain most views.
+    """Assign a photo to each view.
 
-    ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side. ``named`` is the photo that
-    names or order propose for each view, or None. If names are ``exact`` and most of them prove right, a view whose
-    name has no photo gets none, since each other photo carries the name of its own view. ``stored`` are the photos as
-    stored in their files, if ``candidates`` are resampled to the views.
+    Args:
+        show: ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side.
+        candidates: The photos.
+        named: The photo that names or order propose for each view, or None.
+        exact: The proposal is by names. If most names prove right, a view whose name has no photo gets none, since each
+            other photo has the name of its own view.
+        stored: The photos as stored in their files, if ``candidates`` are resampled to the views.
+
+    Returns:
+        The assignment of each view, None where no photo shows it; and True if the proposed photos explain most views.
     """
     assigner = Assigner(show, candidates)
     out, confirmed = assigner.confirm(named, exact=exact)
     num_assigned = sum(assignment is not None for assignment in out)
     most_match = 2 * num_assigned > len(out) and assigner.match_together(out)
-    are_alike = assigner.explain_most(out)
+    explain_most = assigner.explain_most(out)
     if exact and most_match:  # search only for the views whose proposed photo was rejected
         unknown = [view for view, photo in enumerate(named) if photo is not None and out[view] is None]
     else:
         unknown = [view for view, is_confirmed in enumerate(confirmed) if not is_confirmed]
     if not unknown:
-        return out, are_alike
+        return out, explain_most
     used = {assigned.photo for view, assigned in enumerate(out) if assigned is not None and view not in unknown}
     if stored is not None:
         assigner = Assigner(show, stored)
     results = assigner.search(unknown, [photo for photo in range(candidates.count) if photo not in used])
     for view in unknown:
         out[view] = results.get(view) or (out[view] if most_match else None)
-    return out, are_alike
+    return out, explain_most
 
 
 def _exceed_noise(scores: np.ndarray) -> bool:
     """Return True if the median of scores ``[n]`` is significantly above the median of equally many wrong pairs.
 
-    The median is used because a single score hardly moves it.
+    A single extreme score hardly moves the median.
     """
     return bool(len(scores) and median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
 
 
-def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:
-    """Give each photo to one view so that the sum of the scores is largest."""
+def _choose_assignments(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:
+    """Choose at most one pair for each view and each photo, so that the sum of their scores is largest.
+
+    Pairs with a score of 0 are not chosen. Returns the assignment of each view that has a pair.
+    """
     possible = [(*pair, score) for pair, score in zip(pairs, scores, strict=True) if score > 0]
     if not possible:
         return {}
     views = sorted({view for view, _, _ in possible})
     photos = sorted({assignment.photo for _, assignment, _ in possible})
-    gains, assignments = np.zeros((len(views), len(photos))), dict[tuple[int, int], Assignment]()
+    table, assignments = np.zeros((len(views), len(photos))), dict[tuple[int, int], Assignment]()
     for view, assignment, score in possible:
-        gains[views.index(view), photos.index(assignment.photo)] = score
+        table[views.index(view), photos.index(assignment.photo)] = score
         assignments[view, assignment.photo] = assignment
-    matched = ((view, photos[column]) for view, column in zip(views, _match(gains), strict=True) if column >= 0)
+    matched = ((view, photos[column]) for view, column in zip(views, _match_columns(table), strict=True) if column >= 0)
     return {view: assignments[view, photo] for view, photo in matched if (view, photo) in assignments}
 
 
-def _match(scores: np.ndarray) -> np.ndarray:
-    """Choose a column for each row of ``scores [r,c]`` so that the sum is largest.
+def _match_columns(scores: np.ndarray) -> np.ndarray:
+    """Choose a column ``[r]`` for each row of ``scores [r,c]`` so that the sum is largest; -1 for a row without one.
 
-    No column is chosen twice; -1 for a row without a column.
+    No column is chosen twice.
     """
     best, out = scores.argmax(1), np.full(len(scores), -1)
     if len(set(best.tolist())) == len(best):  # the best columns differ, so no search is needed

@@ -21,12 +21,12 @@ from gsmerge.photos.scores import stands_out
 from gsmerge.runtime.threads import parallel_map
 
 BLOCKS = 12  # along the longer side
-SOLID_BLOCK = 0.2  # least opacity of a block that is compared; fainter blocks show only a few Gaussians
+SOLID_BLOCK = 0.2  # opacity above which a block is compared; fainter blocks show only a few Gaussians
 TONE_LEVELS = 33  # number of quantiles of a tone curve
 EXPOSURE_STEP = 0.05  # change of middle grey by a third of a stop, the smallest exposure step of cameras
 VISIBLE = 0.01  # root mean square of differences that are just visible on plain surfaces
 ChangeColors = Callable[[np.ndarray], np.ndarray]  # maps colours [...,3]
-# From colours [n,3] to targets [n,3], weights [n]
+# Fits a change to colours [n,3], their targets [n,3] and weights [n]
 FitColors = Callable[[np.ndarray, np.ndarray, np.ndarray], ChangeColors]
 
 
@@ -39,17 +39,17 @@ class Blocks:
     solid: np.ndarray  # [v,H,W] True where a block is opaque enough to be compared
 
     def errors(self, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
-        """Return the mean difference ``[n]`` between photo and picture, for each block of some views; NaN if faint."""
+        """Return the mean difference ``[n]`` between photo and picture in each block of ``views``; NaN if faint."""
         return self.distances(self.pictures, views)
 
     def distances(self, colors: np.ndarray, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
-        """Return the mean difference ``[n]`` between photos and ``colors [v,H,W,3]``, for each block; NaN if faint."""
+        """Return the mean difference ``[n]`` between photo and ``colors [v,H,W,3]`` in each block; NaN if faint."""
         differences = np.abs(self.photos - colors).mean(-1)
         return np.where(self.solid, differences, np.nan)[views].reshape(-1)
 
 
 def is_visible(errors: np.ndarray) -> bool:
-    """Return True if errors of blocks ``[n]`` are visible."""
+    """Return True if the root mean square of errors of blocks ``[n]`` is above :data:`VISIBLE`."""
     return _sum_squares(errors) > VISIBLE**2 * np.isfinite(errors).sum()
 
 
@@ -59,6 +59,7 @@ def explains(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _sum_squares(errors: np.ndarray) -> float:
+    """Sum the squares of all errors that are not NaN."""
     return float(np.nansum(errors.astype(np.float64) ** 2))
 
 
@@ -69,9 +70,9 @@ def cut_blocks(pairs: Pairs) -> Blocks:
 
 
 def fit_tones(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Fit a tone curve ``[3,256]`` that maps quantiles of ``colors`` to quantiles of ``targets``.
+    """Fit a tone curve ``[3,256]`` that maps the quantiles of ``colors`` to those of ``targets``, channel by channel.
 
-    The curve is proportional at both ends. Wrong depth and noise hardly change quantiles.
+    Wrong depth and noise hardly change quantiles.
     """
     return np.stack([_join_quantiles(colors[:, channel], targets[:, channel], weights) for channel in range(3)])
 
@@ -100,9 +101,9 @@ def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def vary_in_hue(colors: np.ndarray, weights: np.ndarray) -> float:
-    """Return the root mean square by which colours ``[n,3]`` differ from a curve of their brightness alone.
+    """Return the root mean square by which colours ``[n,3]`` differ from a tone curve of their brightness.
 
-    It is about 0 for grey photos, toned ones as well.
+    It is about 0 for grey photos, and for photos of a single tint.
     """
     grey = colors.mean(1, keepdims=True).repeat(3, 1)
     away = (colors - map_tones(fit_tones(grey, colors, weights), grey)) ** 2 * weights[:, None]
@@ -110,14 +111,14 @@ def vary_in_hue(colors: np.ndarray, weights: np.ndarray) -> float:
 
 
 def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
-    """Return blocks of photos after a tone curve for each group of views; see :func:`_cross_fit`."""
+    """Return blocks of the photos after a tone curve, which is fitted to each group of views by :func:`_cross_fit`."""
     toned = pairs.photos.copy()
 
     def fit(group: Sequence[int]) -> None:
         group_pairs = pairs[group]
         shown = group_pairs.shown
         toned[group] = _cross_fit(
-            group_pairs.photos, shown.pictures, shown.weights, lambda *pairs: partial(map_tones, fit_tones(*pairs))
+            group_pairs.photos, shown.pictures, shown.weights, lambda *colors: partial(map_tones, fit_tones(*colors))
         )
 
     parallel_map(fit, groups)
@@ -125,34 +126,32 @@ def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
 
 
 def map_blocks(blocks: Blocks) -> Blocks:
-    """Return blocks after a linear map of colours; see :func:`_cross_fit`."""
+    """Return the blocks after a linear map of the photos' colours, which is fitted by :func:`_cross_fit`."""
     mapped = _cross_fit(
         blocks.photos,
         blocks.pictures,
         blocks.solid.astype(np.float32),
-        lambda *pairs: partial(map_colors, fit_map(*pairs)),
+        lambda *colors: partial(map_colors, fit_map(*colors)),
     )
     return Blocks(mapped, blocks.pictures, blocks.solid)
 
 
 def plain_blocks(blocks: Blocks) -> Blocks:
-    """Return blocks of one colour, the mean colour of the Gaussians; see :func:`_cross_fit`."""
+    """Return the blocks with photos of one colour, the mean colour of the Gaussians; see :func:`_cross_fit`."""
     plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _plain_change)
     return Blocks(plain, blocks.pictures, blocks.solid)
 
 
 def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> ChangeColors:
+    """Return the change that gives every pixel the mean of the targets."""
     mean = (targets * weights[:, None]).sum(0, dtype=np.float64) / max(float(weights.sum(dtype=np.float64)), 1e-9)
     return partial(np.full_like, fill_value=mean)
 
 
 def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: FitColors) -> np.ndarray:
-    """Change photos ``[v,h,w,3]`` by two-fold cross-fitting.
-
-    Each half of the blocks is changed by the fit to the other half.
-    """
-    out, side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
-    y, x = ((np.arange(size) / side).astype(int) for size in photos.shape[1:3])
+    """Change each half of the blocks of photos ``[v,h,w,3]`` by the change that ``fit`` finds for the other half."""
+    out, block_side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
+    y, x = ((np.arange(size) / block_side).astype(int) for size in photos.shape[1:3])
     black_squares = (y[:, None] + x) % 2 == 1  # of the chess board
     for fold in (black_squares, ~black_squares):
         colors, targets = photos[:, ~fold].reshape(-1, 3), pictures[:, ~fold].reshape(-1, 3)
@@ -162,13 +161,16 @@ def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fi
 
 
 def _join_quantiles(levels: np.ndarray, tones: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the curve ``[256]`` float32 from quantiles of ``levels`` to those of ``tones``; both ends are linear."""
+    """Return the curve ``[256]`` float32 that maps quantiles of ``levels`` to those of ``tones``.
+
+    Darker and brighter levels than all quantiles are mapped in proportion.
+    """
     used = weights > 0
     if not used.any():
         return np.linspace(0, 1, 256, dtype=np.float32)
-    x, y = (np.round(_weigh_quantiles(values[used], weights[used]), 6) for values in (levels, tones))
-    is_distinct = np.concatenate([[True], np.diff(x) > 1 / 255]) & (x > 0) & (x < 1)
-    x, y = x[is_distinct], np.maximum.accumulate(y[is_distinct].clip(0, 1))
+    before, after = (np.round(_weigh_quantiles(values[used], weights[used]), 6) for values in (levels, tones))
+    is_distinct = np.concatenate([[True], np.diff(before) > 1 / 255]) & (before > 0) & (before < 1)
+    x, y = before[is_distinct], np.maximum.accumulate(after[is_distinct].clip(0, 1))  # points of the curve
     end = min(1.0, max(y[-1], y[-1] / x[-1])) if len(x) else 1.0
     curve = np.interp(np.arange(256) / 255, [0, *x, 1], [0, *y, end])
     return np.round(curve, 6).astype(np.float32)

@@ -1,9 +1,9 @@
 """Scene -> the scene with photos that look like its Gaussians, without photos that do not show it.
 
 Photos with another tone (linear light, exposure or gamma) are corrected by a curve for each channel. Photos that do not
-show their views are left out, and all photos if they have another look, such as red and blue in the wrong order. If a
-pixel of a photo still differs from the Gaussians of this pixel, at any depth, something covers the scene there. Then
-the Gaussians' colours are used instead.
+show their views are left out. All photos are left out if they have another look, such as red and blue in the wrong
+order. If a pixel of a photo still differs from the colour of its own Gaussian and from a drawing of its view's
+Gaussians, something covers the scene there. Then the Gaussians' colours are used instead.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
 from gsmerge.types import PicturedScene
 
-# Signed differences of single pixels are averaged over 5 x 5 pixels. Then a blur of 1.5 pixels, as by models, makes
-# 0.5 % of the pixels differ by a step.
+# Signed differences of pixels are averaged over 5 x 5 pixels. So if a model blurs a photo by 1.5 pixels, only 0.5 % of
+# its pixels differ by EXPOSURE_STEP.
 MEAN_WINDOW = np.full(5, 1 / 5, np.float32)
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 COMPARED_OPACITY = 0.05  # opacity below which a pixel's Gaussian is not compared
-GREY_VARIATION = 0.25  # of the variation of the Gaussians' hues; photos whose hues vary less are grey
-STRAY_PHOTOS = "do not show what the Gaussians show"  # said of photos that are not used
+GREY_VARIATION = 0.25  # a photo is grey if its hues vary by less than this share of the Gaussians' variation
+STRAY_PHOTOS = "do not show what the Gaussians show"  # in notes, of photos that are not used
 
 
 def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedScene, tuple[int, ...]]:
     """Correct the photos of a canonical scene, and replace photos, or parts of them, that do not show it.
 
-    Returns the scene and the views whose photos show it. There are no such views if most photos do not show the scene,
-    or if the photos have another look. With ``look`` "photos" all photos count unchanged, with "scene" none counts. The
-    record gets notes and the choices ``photos_changed`` and ``photos_left_out``.
+    Returns the scene and the views whose photos show it. There are none if most photos do not show the scene, or if the
+    photos have another look. With ``look`` "photos" all photos count unchanged; with "scene" none counts. The record
+    gets notes and the choices ``photos_changed`` and ``photos_left_out``.
     """
     photo_views = scene.photo_views
     if look != "auto" or not photo_views:
@@ -77,7 +77,7 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         note(Doubt(f"{problem}; --set look=photos gives it the look of the photos"))
         return scene, ()
     stray = [view for view in photo_views if view not in matching]
-    if stray and not _leave_out(scene, stray, photo_views):
+    if stray and not _note_stray(scene, stray, photo_views):
         return scene, ()
     tones = find_tones(pairs, matching)
     if pairs.shown.drawn and not have_other_tones(scene, matching):
@@ -95,15 +95,15 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
 
 
 def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
-    """Find the tone curves ``[3,256]`` from photos to their Gaussians; None for a photo with the right tone.
+    """Find, for each view, the tone curve ``[3,256]`` from its photo to its Gaussians; None for the right tone.
 
-    Drawings have one curve for all photos. If no photo changes by at least a step, no curve counts, because models have
-    a tone of their own. A curve also has to work in the other direction, from Gaussians to photos. Otherwise the cause
-    is noise, which flattens the colours of the Gaussians.
+    If the Gaussians are drawn, all photos share a curve. If no photo changes by at least :data:`EXPOSURE_STEP`, no
+    curve counts, because models have a tone of their own. A curve from Gaussians to photos has to work, too. Otherwise
+    the cause is noise, which flattens the colours of the Gaussians.
     """
     curves, is_clear = list[np.ndarray | None]([None] * len(pairs)), False
-    stored, groups = cut_blocks(pairs), _group(pairs, views)
-    groups = [group for group in groups if is_visible(stored.errors(group))]
+    stored = cut_blocks(pairs)
+    groups = [group for group in _group_by_curve(pairs, views) if is_visible(stored.errors(group))]
     toned, back = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
     for group in groups:
         before = stored.errors(group)
@@ -117,7 +117,10 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
 
 
 def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
-    """Find the ``views`` whose photos have no hues while their Gaussians have; return the share that photos have."""
+    """Find the ``views`` whose photos have no hues although their Gaussians have.
+
+    Returns for each of them by how much its hues vary, as a share of the variation of the Gaussians' hues.
+    """
     hue_sample = 2_000  # approximate number of pixels of a photo whose hues are compared, if it has as many
     shares, step = dict[int, float](), 1 + pairs.photos[0].size // (3 * hue_sample)
     for view in views:
@@ -130,27 +133,30 @@ def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
 
 
 def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedScene:
-    """Give grey photos the hues of the Gaussians, which keep the photos' brightness; note how grey they are."""
+    """Give grey photos the hues of the Gaussians, but leave their brightness; note which photos are grey.
+
+    ``grey`` is the result of :func:`find_grey`.
+    """
     changes, views = [PhotoChange()] * len(scene), list(grey)
     if scene.has_own_pixels:
         colors = row_pictures(scene)[views]
     else:
         colors = draw_canonical(scene.gaussians, scene.cameras[views], max(scene.images.shape[1:3])).pictures
     for view, picture in zip(views, colors, strict=True):
-        changes[view] = PhotoChange(cover=np.full(picture.shape[:2], True), colors=picture, bright=False)
+        changes[view] = PhotoChange(cover=np.full(picture.shape[:2], True), colors=picture, keeps_brightness=True)
     note(
         f"{len(grey)} of {len(scene.photo_views)} photos are grey or of one tint (their hues vary by"
         f" {100 * max(grey.values()):.0f} % of the Gaussians' at most): only their brightness counts, and the Gaussians"
         f" keep their hues; --set look=photos makes them grey: {list_some([scene.names[view] for view in grey])}"
     )
-    return _apply(scene, changes)
+    return _apply_changes(scene, changes)
 
 
 def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
-    """Return whether the base colours of all Gaussians have another tone than the photos of some views.
+    """Return whether the base colours of all Gaussians have another tone than the photos of ``views``.
 
-    If depth is wrong, wrong Gaussians in front may set the tone of a drawing. The base colours of all Gaussians come
-    from the photos, even if other Gaussians hide them in drawings. So they show whether the tone really differs.
+    If depth is wrong, a drawing may have the tone of Gaussians that hide the right ones. But the base colours of all
+    Gaussians, hidden or not, come from the photos. So they show whether the tone really differs.
     """
     solid = np.flatnonzero(scene.gaussians.opacities > COMPARED_OPACITY)
     step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
@@ -164,10 +170,10 @@ def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
     return bool(np.median(np.abs(map_tones(curve, levels) - levels).mean(1)) > EXPOSURE_STEP)
 
 
-def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
-    """Group the views by tone curve: one group if their pictures are drawings, because these show tones less exactly.
+def _group_by_curve(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
+    """Group the views whose photos share a tone curve.
 
-    Otherwise each view is a group of its own.
+    All do if their pictures are drawings, because these show tones less exactly. Otherwise each view has its own curve.
     """
     return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
@@ -175,10 +181,10 @@ def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
 def find_matching_views(
     scene: PicturedScene, views: Sequence[int], photos: Sequence[np.ndarray], shown: ViewPictures
 ) -> list[int]:
-    """Find the views whose ``photos [h,w,3]`` show them; see :mod:`gsmerge.photos.assign`.
+    """Find which of ``views`` are shown by their ``photos [h,w,3]``; see :mod:`gsmerge.photos.assign`.
 
-    There are none if all photos together fit no better than wrong pairs. Layers of one camera share one photo.
-    ``shown`` are small pictures of the Gaussians in all views; if they are drawings, they are reused.
+    There are none if all photos together match no better than photos of other views would. Layers of one camera share
+    one photo. ``shown`` are small pictures of the Gaussians in all views; if they are drawings, they are reused.
     """
     kinds = camera_kinds(scene.cameras)
     ids = sorted({kinds[view]: view for view in reversed(views)}.values())
@@ -198,10 +204,11 @@ def find_matching_views(
 
 
 def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> bool:
-    """Return whether a linear map, but no tone curve, explains the difference between photos and Gaussians.
+    """Return whether a linear map of colours, but no tone curve, explains how the photos differ from Gaussians.
 
-    It may map photos to Gaussians, or Gaussians to photos, which are grey then. Photos of another scene are excluded:
-    one colour explains them as well as a map, or they do not show their views even after the map.
+    The map may lead from photos to Gaussians, or from Gaussians to photos, for example to grey ones. Photos of another
+    scene do not have another look: a single colour explains them as well as the map, or they do not match their views
+    even after it. Only ``views`` are compared.
     """
     view_pairs = pairs[views]
     if _is_mapped(view_pairs):
@@ -216,7 +223,7 @@ def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) ->
 
 
 def are_exchanged(pairs: Pairs) -> bool:
-    """Return whether red and blue exchanged in the photos explain the pictures, and a linear map no better."""
+    """Return True if photos with red and blue exchanged match the pictures, and a linear map matches no better."""
     stored, exchanged = cut_blocks(pairs), cut_blocks(pairs.with_photos(pairs.photos[..., ::-1]))
     before, after = stored.errors(), exchanged.errors()
     return explains(before, after) and not explains(after, map_blocks(stored).errors())
@@ -227,13 +234,16 @@ def _is_mapped(pairs: Pairs) -> bool:
     stored = cut_blocks(pairs)
     if not is_visible(stored.errors()):
         return False
-    toned, mapped = tone_blocks(pairs, _group(pairs, range(len(pairs)))), map_blocks(stored)
+    toned, mapped = tone_blocks(pairs, _group_by_curve(pairs, range(len(pairs)))), map_blocks(stored)
     simpler = toned, plain_blocks(stored)
     return is_visible(toned.errors()) and all(explains(blocks.errors(), mapped.errors()) for blocks in simpler)
 
 
-def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence[int]) -> bool:
-    """Note which photos do not show the scene; return whether the other photos are used."""
+def _note_stray(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence[int]) -> bool:
+    """Note and record the ``stray`` views, whose photos do not show the scene; return whether other photos are used.
+
+    They are, unless most photos are stray.
+    """
     names = [scene.names[view] for view in stray]
     choose(photos_left_out=names)
     are_few, listed = 2 * len(stray) <= len(photo_views), list_some(names)
@@ -245,14 +255,12 @@ def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence
 
 
 def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Sequence[int]) -> None:
-    """Note by which factors the tones of photos change."""
-    toned = {view: changes[view].tones for view in views if changes[view].tones is not None}
+    """Note by which factors the tones of the photos of ``views`` change."""
+    toned = {view: curve for view in views if (curve := changes[view].tones) is not None}
     if not toned:
         return
     middle_grey = 128  # level of 255 at which notes report the change of tone
-    factors = [
-        float(curve[:, middle_grey].mean()) / (middle_grey / 255) for curve in toned.values() if curve is not None
-    ]
+    factors = [float(curve[:, middle_grey].mean()) / (middle_grey / 255) for curve in toned.values()]
     low, high = min(factors), max(factors)
     factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
     note(
@@ -262,10 +270,10 @@ def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Seq
 
 
 def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int]) -> None:
-    """Note in which of some photos something covers the scene, at the pixels ``hidden [v,h,w]``."""
+    """Note in which photos of ``views`` something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
     max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
-    least_percent = 1  # of a photo; no note says that less of it differs
+    least_percent = 1  # of a photo; if less differs, there is no note
     if max_percent < least_percent:
         return
     note(
@@ -279,11 +287,13 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
 def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[np.ndarray, np.ndarray]:
     """Find the pixels ``[v,h,w]`` at which changed photos differ from their rows; also return the rows' pictures.
 
-    A pixel without a row takes the result of the nearest pixel with one. If the rows' base colours differ, each view's
-    own Gaussians are drawn from its camera, which takes longer; a photo that looks like the drawing does not differ.
+    A pixel without a row takes the result of the nearest pixel with one. If a photo differs from the base colours of
+    its rows, these Gaussians are drawn from its camera, which takes longer. Where the photo looks like the drawing, it
+    does not differ.
     """
 
     def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Return the mask of the pixels at which a view's photo differs from a picture that is ``known`` there."""
         weights = known.astype(np.float32)
         difference = (changes[view](scene.images[view]) - picture) * weights[..., None]
         red, green, blue = np.moveaxis(np.abs(convolve(difference, MEAN_WINDOW, MEAN_WINDOW)), -1, 0)
@@ -299,8 +309,8 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     inside = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     pictures, pixels = row_pictures(scene), scene.get_pixels()
     shown = pixels.shown
-    known = shown & (scene.gaussians.opacities[pixels.fronts] > COMPARED_OPACITY) & inside
-    hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
+    with_row = shown & (scene.gaussians.opacities[pixels.fronts] > COMPARED_OPACITY) & inside
+    hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], with_row[view]), range(len(scene))))
     picture_rows(scene, differ_drawn, np.asarray((hidden | ~inside).any((1, 2))))
     return hidden, pictures
 
@@ -312,10 +322,11 @@ def _change_photos(
     pictures: np.ndarray | None,
     views: Sequence[int],
 ) -> PicturedScene:
-    """Change photos at both sizes; use the Gaussians' colours at ``hidden [v,h,w]`` pixels, and in all other views.
+    """Change the photos of ``views``, and use the Gaussians' colours at ``hidden [v,h,w]`` pixels and in other views.
 
-    The photos of ``views`` show the scene. The Gaussians' colours are ``pictures [v,h,w,3]``; None: drawings. In views
-    without a photo, colours of the view's own Gaussians count as a photo, and drawings as what masks leave out.
+    Small and large photos are changed alike. The Gaussians' colours are ``pictures [v,h,w,3]``; if these are None, they
+    are drawn. The pixels of the other views count only if their colours are those of the view's own Gaussians.
+    ``hidden`` is changed in place: other views and pixels outside masks become hidden.
     """
     other_views = sorted({*range(len(scene))} - {*views})
     hidden[other_views] = True
@@ -336,11 +347,11 @@ def _change_photos(
             covers = pictures[with_hidden]
         for view, colors in zip(with_hidden, covers, strict=True):
             changes[view] = replace(changes[view], cover=hidden[view], colors=colors)
-    return _apply(scene, changes)
+    return _apply_changes(scene, changes)
 
 
-def _apply(scene: PicturedScene, changes: Sequence[PhotoChange]) -> PicturedScene:
-    """Change the photos of all views at both sizes."""
+def _apply_changes(scene: PicturedScene, changes: Sequence[PhotoChange]) -> PicturedScene:
+    """Apply a change to each view's photo, small and large."""
     images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
     return replace(scene, images=images, large_photos=large)

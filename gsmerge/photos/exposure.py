@@ -2,14 +2,14 @@
 
 Cameras choose exposure and white balance for each photo, and models copy them into their Gaussians, so one surface has
 several tones. Pixels of a view are looked up in other views that have Gaussians at the same depth. The median ratio of
-each channel is the ratio of the pair of views. The gains of all views follow from all pairs by least squares, with a
-geometric mean of one.
+their colours, in each channel, is the ratio of this pair of views. The gains of all views follow from all pairs by
+least squares, with a geometric mean of one.
 
-Gains are removed if nothing predicts the gain of a new view, so that the mean of all gains is the best guess. The gain
-can be predicted in two cases, in which photos stay unchanged. First, a camera that meters light makes bright places
-darker, in new photos, too; then photos with larger gains are not brighter. Second, exposure may drift along a video;
-then neighbours have nearly the same gain. In both cases the mean would be farther from new photos, by 1.5 dB in a video
-of a kitchen.
+Gains are removed if nothing predicts the gain of a new view, so that the mean of all gains is the best guess. Photos
+stay unchanged in two cases, in which the gain can be predicted. First, a camera that meters light makes bright places
+darker, also in new photos. Then photos with larger gains are not brighter. Second, exposure may drift along a video.
+Then neighbours have nearly the same gain. In both cases photos of mean exposure would be farther from new photos, by
+1.5 dB in a video of a kitchen.
 """
 
 from __future__ import annotations
@@ -32,39 +32,42 @@ from gsmerge.types import Cameras, PicturedScene, Scene
 
 EXPOSURE_PIXELS = 2000  # pixels of a view that are looked up in the other views
 NOISE_LEVEL, CLIPPED_LEVEL = 0.05, 0.95  # colours in between are neither noise nor clipped
-# The following three bounds were chosen on the plain exports of 15 captures. Root mean square of the logarithmic gains:
-# above the bound in nine of ten draws of random gains of 0.8 to 1.25 for five photos, and in six unchanged captures
+# The bounds down to UNEXPECTED were chosen on the plain exports of 15 captures.
+# Exposures differ if the root mean square of the logarithmic gains is above this bound. It is for nine of ten draws of
+# random gains of 0.8 to 1.25 for five photos, and in six captures that were left as they are
 DIFFERENT = 0.06
-# Slope of a photo's brightness over its gain, both as logarithms: 0.61 to 1.11 with random gains of 0.5 to 2, at most
-# 0.41 if a camera metered light and gains are 0.1 or more. If places differ in brightness by more than the gains, the
-# slope says little. So it counts only if gains and brightness are opposed, with a correlation of -0.67 to -0.99
+# Brightness follows gains if the slope of photos' brightness over their gains, both as logarithms, is above FOLLOWS.
+# The slope is 0.61 to 1.11 for random gains of 0.5 to 2, and at most 0.41 if a camera metered light and gains are 0.1
+# or more. If places differ in brightness by more than the gains, the slope says little. So it counts only if gains
+# oppose the brightness of places, with a correlation below OPPOSED. For cameras that metered light it is -0.67 to -0.99
 FOLLOWS, OPPOSED = 0.5, -0.6
-# Distance of a gain from the mean gain of its two nearest views, relative to that of random gains: 0.71 to 1.22 with
-# gains of 0.5 to 2; 0.19 to 0.57 if exposure drifts and compensation loses 1.7 dB or more; 0.67 for four views in a row
+# Gains are unexpected if their distance from the mean gain of the two nearest views, divided by that of random gains,
+# is above this bound. It is 0.71 to 1.22 for random gains of 0.5 to 2, and 0.67 for four views in a row. It is 0.19 to
+# 0.57 if exposure drifts, and removing gains then loses 1.7 dB or more
 UNEXPECTED = 0.69
 COARSE_STEP = 4  # the brightness of a photo is measured on every COARSE_STEP-th pixel of every COARSE_STEP-th row
 BRIGHT_GAIN = 1.15  # gain from which on clipped pixels no longer count
 CLIPPED_NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
-# A view is compared with the nearest views, and with further views at equal steps of rank
+# Numbers of nearest and of farther views with which a view is compared; see choose_partners
 NEAREST_VIEWS, FARTHER_VIEWS = 6, 2
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Ratios of the colours of one view's pixels in another."""
+    """How much brighter one view's pixels are in another view."""
 
     view: int
     other: int
-    ratios: np.ndarray  # [3], median of the logarithms
-    count: int  # Number of pixels
+    ratios: np.ndarray  # [3] median, over the pixels, of the logarithm of the other view's colour divided by this one's
+    count: int  # number of pixels
 
 
 def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> PicturedScene:
     """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, if that is needed.
 
     The photos of ``views`` show the scene; each view has Gaussians of its own. Clipped pixels of brighter photos no
-    longer count if another photo shows their surface unclipped. The record gets a note, and the choice ``exposure``,
-    which is the gain of each view in red, green and blue. If photos differ but stay unchanged, a note says why.
+    longer count if another photo shows their surface unclipped. The record gets a note and the choice ``exposure``, the
+    gain of each view in red, green and blue. If photos differ but stay unchanged, a note says why.
     """
     if exposure == "fixed" or len(views) < 2:
         return scene
@@ -85,7 +88,7 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
             return scene
     choose(exposure=factors.tolist())
     note(f"{differ}; photos are brought to their mean exposure")
-    return _divide(scene, factors)
+    return _divide_by_gains(scene, factors)
 
 
 def _find_objection(scene: PicturedScene, views: Sequence[int], gains: np.ndarray) -> str:
@@ -106,9 +109,10 @@ def root_mean_square(gains: np.ndarray) -> float:
 
 
 def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
-    """Return whether the gains come from metering: whether they offset the brightness of the surfaces in each photo.
+    """Return True if a camera that meters light seems to have chosen the gains, so that they offset bright surfaces.
 
-    With fixed exposure, photos with larger gains are brighter; metering makes all photos equally bright.
+    ``brightness [v,3]`` of the photos and ``gains [v,3]`` are logarithms. If gains are random, photos with larger gains
+    are brighter. Metering makes all photos equally bright.
     """
     gains, brightness = gains - gains.mean(0), brightness - brightness.mean(0)
     slope = float((gains * brightness).sum() / max((gains * gains).sum(), 1e-12))
@@ -116,7 +120,7 @@ def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
 
 
 def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
-    """Measure the RMS distance of each view's gains from the mean of its two nearest views; 1 for random gains.
+    """Measure the RMS distance of views' gains from the mean gains of their two nearest views; 1 for random gains.
 
     ``gains [v,3]`` are logarithms; ``distances [v,v]`` are the distances between cameras.
     """
@@ -128,14 +132,17 @@ def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Pixels:
-    """Position of every pixel's Gaussian, and the pixels that count."""
+    """Centres of the Gaussians in front of all pixels, and the pixels that count."""
 
     cameras: Cameras
     means: np.ndarray  # [v,h*w,3] canonical units
-    valid: np.ndarray  # [v,h*w]
+    valid: np.ndarray  # [v,h*w] bool, True for pixels that count
 
     def look_up(self, view: int, rows: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
-        """Find the pixels ``rows`` of a view whose surface another view shows; return their indices and its pixels."""
+        """Find which of the pixels ``rows`` of a view show a surface that another view shows, too.
+
+        Returns indices into ``rows``, and the pixels at which the other view shows the surface.
+        """
         poses = self.cameras.viewmats[other].astype(np.float64), self.cameras.Ks[other].astype(np.float64)
         same_depth = 0.05  # difference of the logarithms of two depths of one surface
         return find_surfaces(
@@ -151,7 +158,7 @@ class _Pixels:
 
 
 def _pixels_of(scene: Scene) -> _Pixels:
-    """Collect the pixels of a scene and the Gaussians in front; pixels outside masks do not count."""
+    """Collect the pixels of a scene; those without a Gaussian and those outside masks do not count."""
     shape = len(scene), scene.pixels_per_view
     fronts = scene.get_pixels().fronts.reshape(shape)
     valid = fronts >= 0
@@ -161,35 +168,35 @@ def _pixels_of(scene: Scene) -> _Pixels:
 
 
 def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
-    """Measure the ratios of colours between views that see the same surfaces."""
+    """Measure the ratios of colours between views of ``views`` that show the same surfaces."""
     size, pixels = scene.pixels_per_view, _pixels_of(scene)
     photos = scene.images.reshape(len(scene), size, 3)
     sample = np.random.default_rng(0).permutation(size)[:EXPOSURE_PIXELS]
     partners = choose_partners(camera_distances(scene.cameras[list(views)]))
 
-    def measure(row: int) -> list[_Pair]:
+    def measure_view(row: int) -> list[_Pair]:
         view, pairs = views[row], list[_Pair]()
         rows = sample[pixels.valid[view, sample]]
-        min_pairs = 60  # least number of pixels that two views share
+        min_pixels = 60  # least number of shared pixels from which a ratio is measured
         for other in (views[column] for column in partners[row]):
-            found, other_rows = pixels.look_up(view, rows, other)
-            here, there = photos[view].take(rows[found], axis=0), photos[other].take(other_rows, axis=0)
+            shared, other_rows = pixels.look_up(view, rows, other)
+            here, there = photos[view].take(rows[shared], axis=0), photos[other].take(other_rows, axis=0)
             red, green, blue = (
                 (here > NOISE_LEVEL) & (here < CLIPPED_LEVEL) & (there > NOISE_LEVEL) & (there < CLIPPED_LEVEL)
             ).T
-            clear = red & green & blue
-            if clear.sum() >= min_pairs:
-                ratios = log(there[clear].astype(np.float64) / here[clear])
+            usable = red & green & blue
+            if usable.sum() >= min_pixels:
+                ratios = log(there[usable].astype(np.float64) / here[usable])
                 pairs.append(_Pair(view, other, medians(ratios), len(ratios)))
         return pairs
 
-    return [pair for pairs in parallel_map(measure, range(len(views))) for pair in pairs]
+    return [pair for pairs in parallel_map(measure_view, range(len(views))) for pair in pairs]
 
 
 def choose_partners(distances: np.ndarray) -> np.ndarray:
-    """Choose the views ``[v,p]``, ascending, that each view is compared with: all others, or some if there are many.
+    """Choose the views ``[v,p]``, ascending, with which each view is compared: all others, or p of them.
 
-    The nearest views share the most surfaces. Views at equal steps of rank connect groups of cameras.
+    The nearest ones share the most surfaces. Farther ones, at equal steps of rank, connect groups of cameras.
     """
     order = order_others(distances)
     if order.shape[1] > NEAREST_VIEWS + FARTHER_VIEWS:
@@ -223,16 +230,16 @@ def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     def confirm(view: int) -> np.ndarray:
         rows, is_shown = np.flatnonzero(flat[view] & pixels.valid[view]), np.zeros_like(flat[view])
         for other in order[view]:
-            found, other_rows = pixels.look_up(view, rows, other)
-            is_shown[rows[found[~flat[other, other_rows]]]] = True
+            shared, other_rows = pixels.look_up(view, rows, other)
+            is_shown[rows[shared[~flat[other, other_rows]]]] = True
             rows = rows[~is_shown[rows]]
         return is_shown
 
     return np.stack(parallel_map(confirm, range(len(scene)))).reshape(clipped.shape)
 
 
-def _divide(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
-    """Divide photos and colours of Gaussians by the gains ``[v,3]``; exclude clipped pixels from the masks."""
+def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
+    """Divide photos and colours of Gaussians by the gains ``[v,3]``; mask pixels that :func:`_find_clipped` finds."""
     factors = (1 / gains).astype(np.float32)
     levels = np.arange(256, dtype=np.float32) / np.float32(255)
     changes = [PhotoChange(tones=(factor[:, None] * levels).clip(0, 1)) for factor in factors]
@@ -250,5 +257,5 @@ def _divide(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
     gaussians = replace(g, sh0=sh0, shN=g.shN * row_factors)
     large = scene.large_photos
     large = None if large is None else change_large(large, changes)
-    counting = scene.masks if masks.all() else masks
-    return replace(scene, images=images, gaussians=gaussians, masks=counting, large_photos=large)
+    new_masks = scene.masks if masks.all() else masks
+    return replace(scene, images=images, gaussians=gaussians, masks=new_masks, large_photos=large)

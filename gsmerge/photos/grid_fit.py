@@ -2,7 +2,7 @@
 
 Photos of another shape than their cameras may have bars, or show both eyes of a stereo camera or several pictures side
 by side. Where cameras were estimated, models resized photos without their aspect ratio or cropped them, and some cut a
-border off their output. The pictures of the Gaussians decide.
+border off their output. Of all these possibilities, the one that best matches the pictures of the Gaussians is chosen.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gsmerge.photos.offsets import correlate_parts
 from gsmerge.photos.pictures import ViewPictures
 from gsmerge.photos.scores import stands_out
 
-_TILES = 4  # most pictures beside or below each other in a photo
+_TILES = 4  # most pictures in a row or a column of a photo
 _HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
 
 
@@ -40,7 +40,8 @@ class PartFit:
     """The part of each photo that its view shows."""
 
     part: Part = WHOLE
-    shape: Size | None = None  # to whose aspect ratio the part is stretched, as in films that squeeze both eyes
+    # Size to whose aspect ratio the part is stretched, since stereo films squeeze both pictures; None: not stretched
+    shape: Size | None = None
 
     def cut(self, photo: np.ndarray) -> np.ndarray:
         """Cut the part out of an upright photo ``[h,w,3]``, and stretch it."""
@@ -49,14 +50,14 @@ class PartFit:
         return part if size == new_size else resize_to(size, new_size).photos([part])[0]
 
     def stretch(self, size: Size) -> Size:
-        """Return the size that a part of a ``size`` is stretched to; the same size if it is not stretched."""
+        """Return the size to which a part of a ``size`` is stretched; the same size if parts are not stretched."""
         if self.shape is None:
             return size
         scale = max(size[0] / self.shape[0], size[1] / self.shape[1])
         return round(scale * self.shape[0]), round(scale * self.shape[1])
 
     def describe(self, size: Size, *, bars: bool) -> str:
-        """Describe in a note what is cut out of photos of a size."""
+        """Say in a note which part of photos of a ``size`` is used; ``bars`` means that only bars are cut off."""
         before, part = "{} x {}".format(*size), part_size(size, self.part)
         after, ratio = "{} x {}".format(*part), self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
         if bars:
@@ -72,12 +73,13 @@ WHOLE_FIT = PartFit()
 
 
 def list_parts(size: Size, shape: Size | None, inner: Part) -> list[PartFit]:
-    """List the parts of photos of a size that views may show, likely ones first; ``inner`` is that inside of bars.
+    """List the parts of photos of a ``size`` that views may show, likely ones first.
 
-    Views have the aspect ratio of ``shape``; None: models made them from parts of any. Parts of another one, which are
-    stretched, come last.
+    ``inner`` is the part inside of bars. Views have the aspect ratio of ``shape``. Of parts with another aspect ratio,
+    only the whole and its halves are listed; they come last, and are stretched. With None, views may have any aspect
+    ratio, and no part is stretched.
     """
-    counts = product(range(1, _TILES + 1), repeat=2)
+    counts = product(range(1, _TILES + 1), repeat=2)  # columns and lines of tiles
     tiles = [(x / m, y / n, (x + 1) / m, (y + 1) / n) for m, n in counts for y, x in product(range(n), range(m))]
     if shape is None:
         return [PartFit(part) for part in dict.fromkeys([WHOLE, inner, *tiles])]
@@ -89,10 +91,11 @@ def list_parts(size: Size, shape: Size | None, inner: Part) -> list[PartFit]:
     return [*fits, *(PartFit(part, shape) for part in stretched)]
 
 
-def sharpen(inner: Part, size: Size, shape: Size) -> Part:
-    """Return the part inside of bars at the size of the cameras, or a multiple, if it may be only a block larger.
+def round_to_cameras(inner: Part, size: Size, shape: Size) -> Part:
+    """Return the part ``inner`` of photos of a ``size``, rounded to the size ``shape`` of the cameras or a multiple.
 
-    JPEG files mix the pixels of a block, so bars end up to a block before the photo begins.
+    ``inner`` is the part inside of bars. JPEG files mix the pixels of a block, so its measured size may be up to a
+    block too small or too large. It stays as it is if it would change by more, or if it would not fit into the photos.
     """
     width, height = part_size(size, inner)
     times = max(1, round(width / shape[0]))
@@ -115,27 +118,30 @@ class GridFit:
     """The resizing and cropping by which a model made the pixels of a grid of rows from photos."""
 
     size: Size  # of the grid
-    crops: bool = False  # True: resized in proportion and cropped at the centre; False: width and height independently
-    trim: tuple[int, int] = (0, 0)  # columns and lines that the model then cut off at each side
+    crops: bool = False  # True: resized in proportion and cropped at the centre; False: resized without proportion
+    trim: tuple[int, int] = (0, 0)  # columns and lines that the model cut off its output at each side
 
     def transform(self, size: Size) -> PhotoTransform:
-        """Return the transform of photos of a size to the grid with the borders that the model cut off."""
+        """Return the transform of photos of a ``size`` to the grid before the model cut off borders."""
         width, height = (side + 2 * cut for side, cut in zip(self.size, self.trim, strict=True))
         return (resize_and_crop if self.crops else resize_to)(size, (width, height))
 
     def cut(self, photo: np.ndarray) -> np.ndarray:
         """Resize and crop a photo ``[h,w,3]`` of any size to the pixels of the grid.
 
-        If one is landscape and the other portrait, the photo is turned first, and the result is turned back.
+        If only one of the two is portrait, the photo is turned first, and the result is turned back.
         """
-        (width, height), (x, y) = self.size, self.trim
+        (width, height), (left, top) = self.size, self.trim
         if (photo.shape[1] - photo.shape[0]) * (width - height) < 0:
             return np.rot90(self.cut(np.ascontiguousarray(np.rot90(photo))), -1)
         whole = self.transform((photo.shape[1], photo.shape[0])).photos([photo])[0]
-        return np.asarray(whole[y : y + height, x : x + width])
+        return np.asarray(whole[top : top + height, left : left + width])
 
     def cameras(self, camera_file: CameraFile, size: Size) -> CameraFile:
-        """Return the cameras of the grid with its borders; their ``photo_map`` is the transform of photos of a size."""
+        """Return the cameras of the grid as they were before the model cut off borders.
+
+        Their ``photo_map`` is the transform of photos of a ``size``.
+        """
         (left, top), (width, height), Ks = self.trim, self.size, camera_file.Ks.copy()
         assert camera_file.pixel_ids is not None, "estimated cameras are those of pixels"
         Ks[:, :2, 2] += self.trim
@@ -149,7 +155,10 @@ class GridFit:
 
 
 def _da3_borders(side: int) -> list[int]:
-    """List the numbers of pixels that Depth Anything 3 may have cut off at both ends if ``side`` pixels are left."""
+    """List how many pixels Depth Anything 3 may have cut off at each end of a side of which ``side`` pixels are left.
+
+    It cuts off 8 of 256 pixels, rounded down.
+    """
     return [border for border in range(side) if int(8 / 256 * (side + 2 * border)) == border]
 
 
@@ -157,25 +166,28 @@ FitT = TypeVar("FitT", bound=GridFit | PartFit)
 
 
 def list_fits(size: Size) -> list[GridFit]:
-    """List how models resize and crop photos to a grid of a size, simple fits first."""
+    """List the ways in which models resize and crop photos to a grid of a ``size``, simple ones first."""
     trims = [(trim, trim) for trim in (0, *TRIMS)]
     trims += product(_da3_borders(size[0]), _da3_borders(size[1]))
     return [GridFit(size, crops, trim) for crops in (False, True) for trim in dict.fromkeys(trims)]
 
 
 def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: Sequence[FitT]) -> FitT:
-    """Choose the fit with which photos ``[h,w,3]`` match the pictures of their views best; of equal fits the first."""
+    """Choose the fit with which photos ``[h,w,3]`` match the pictures of their views best.
+
+    A later fit is chosen only if it matches significantly better than the ones before.
+    """
     views = [view for view, photo in enumerate(photos) if photo is not None]
 
-    def score(fit: FitT) -> np.ndarray:
+    def correlate(fit: FitT) -> np.ndarray:
         return np.concatenate([
             correlate_parts(shown, view, fit.cut(photos[view]))  # type: ignore[arg-type]
             for view in views
         ])  # fmt: skip
 
-    best, best_scores = fits[0], score(fits[0])
+    best, best_correlations = fits[0], correlate(fits[0])
     for fit in fits[1:]:
-        scores = score(fit)
-        if stands_out(scores - best_scores):
-            best, best_scores = fit, scores
+        correlations = correlate(fit)
+        if stands_out(correlations - best_correlations):
+            best, best_correlations = fit, correlations
     return best

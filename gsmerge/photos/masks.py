@@ -37,15 +37,15 @@ _WHITE = np.uint8(255)
 
 
 class CameraMaskError(SceneError):
-    """Pictures that the cameras' file names as masks, and that are none."""
+    """Raised if pictures that the cameras' file names as masks are photos."""
 
 
 @dataclass(frozen=True, eq=False)
 class Masks:
     """Masks and weights of the pixels of v views."""
 
-    counts: np.ndarray | None = None  # [v,h,w] bool: whether a pixel counts; None: all pixels count
-    importance: np.ndarray | None = None  # [v,h,w] float32: weight of a pixel in a fit; None: all weights are 1
+    counts: np.ndarray | None = None  # [v,h,w] bool, True for a pixel that counts; None: all pixels count
+    importance: np.ndarray | None = None  # [v,h,w] float32, weight of a pixel in a fit; None: all weights are 1
 
 
 NO_MASKS = Masks()
@@ -56,16 +56,16 @@ class MaskFiles:
     """The mask files of v photos, and how a picture of a photo is cropped to its view."""
 
     photos: tuple[Path | None, ...]  # files of the photos; empty if the photos are inside another file
-    turns: Sequence[int]  # quarter turns from each photo's file to its upright picture
+    turns: Sequence[int]  # orientation of each photo's file, 0 to 7; odd if the photo is stored on its side
     masks: Sequence[Path | None]  # dark where a photo does not count
     protecting: Sequence[Path | None]  # white where a photo counts more
-    part: Part  # of upright photos that is used
-    stored: Size  # of this part
-    cut: Callable[[int, np.ndarray], np.ndarray]  # view, picture of the size ``stored`` -> the part that the view shows
+    part: Part  # the part of each upright photo that is used
+    stored: Size  # size of this part
+    cut: Callable[[int, np.ndarray], np.ndarray]  # view, picture of the size ``stored`` -> what the view shows of it
     cameras: Cameras
 
     def read(self, view: int) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Read which pixels ``[h,w]`` of a view count, and their weights; None: all pixels count, with weight 1."""
+        """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
         photo, counts, importance = self.photos[view] if self.photos else None, None, None
         alpha = None if photo is None else decode_alpha(photo)
         min_level = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
@@ -77,7 +77,7 @@ class MaskFiles:
             is_light = levels > _WHITE // 2
             light = self._reduce(is_light * _WHITE, view)
             counts = (light > min_level) if counts is None else counts & (light > min_level)
-            if (levels[is_light] < _WHITE).any():  # the weight is the mean over the pixels that count
+            if (levels[is_light] < _WHITE).any():  # grey means a lower weight: the mean over the pixels that count
                 importance = self._reduce(levels * is_light, view) / np.maximum(light, np.float32(1))
         if (mask := self.protecting[view]) is not None:
             share = self._reduce(self._read_levels(mask, view), view) / np.float32(_WHITE)
@@ -118,30 +118,31 @@ def read_masks(
     cut: Callable[[int, np.ndarray], np.ndarray],
     cameras: Cameras,
 ) -> tuple[Masks, list[str]]:
-    """Read the masks of photos of which a part of the size ``stored`` is used; return them and notes.
+    """Read the masks of a scene's photos; return them and notes.
 
-    Masks that the cameras' file names come before those beside the scene. ``cut``: as in :class:`MaskFiles`.
+    Masks that the cameras' file names are used rather than those beside the scene. ``stored`` and ``cut`` are those of
+    :class:`MaskFiles`. SceneError if masks are photos.
     """
     paths = photos.paths
     views = [view for view in range(len(camera_file)) if not paths or paths[view] is not None]  # with a photo
     names = [path.as_posix() for path in paths if path is not None] or list(camera_file.names)
     of_cameras, notes = ([], []) if "masks" in files.named else _find_masks_of_cameras(camera_file)
-    found = protecting = list[Path | None]([None] * len(views))
+    photo_masks = photo_protecting = list[Path | None]([None] * len(views))  # in the order of `names`
     if by_cameras := any(of_cameras):
-        found = [of_cameras[view] for view in views]
+        photo_masks = [of_cameras[view] for view in views]
     elif files.masks is not None:
-        found, unused = match_masks(files.masks, names, named="masks" in files.named)
+        photo_masks, unused = match_masks(files.masks, names, named="masks" in files.named)
         notes += unused
     if files.protect is not None:
-        protecting, unused = match_masks(files.protect, names, "--protect")
+        photo_protecting, unused = match_masks(files.protect, names, "--protect")
         notes += unused
 
-    def spread(pictures: Sequence[Path | None]) -> list[Path | None]:
-        """Spread the pictures of existing photos over all views; None for a view without a photo."""
+    def list_by_view(pictures: Sequence[Path | None]) -> list[Path | None]:
+        """List the pictures of existing photos by view; None for a view without a photo."""
         of_views = dict(zip(views, pictures, strict=True))
         return [of_views.get(view) for view in range(len(camera_file))]
 
-    masks, protecting = spread(found), spread(protecting)
+    masks, protecting = list_by_view(photo_masks), list_by_view(photo_protecting)
     turns = photos.turns or (0,) * len(masks)
     mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.part, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
@@ -149,7 +150,7 @@ def read_masks(
     _refuse_photos(error, place, "masks", masks, photos.pictures)
     _refuse_photos(SceneError, files.protect or "", "protect", protecting, photos.pictures)
     shape = cameras.height, cameras.width
-    result = Masks(_stack(counts, True, shape), _stack(importance, np.float32(1), shape))
+    result = Masks(_stack_views(counts, True, shape), _stack_views(importance, np.float32(1), shape))
     if files.protect is not None:
         notes.append(_describe_protected(result.importance, protecting))
     return result, notes
@@ -158,12 +159,15 @@ def read_masks(
 def _refuse_photos(
     error: type[SceneError], place: StrPath, option: str, masks: Sequence[Path | None], photos: PhotoArrays
 ) -> None:
-    """Raise an ``error`` if a view's mask, which a ``place`` has or names, is a photo for certain, or most may be."""
-    views = {view: mask for view, mask in enumerate(masks) if mask is not None}
-    doubts = parallel_map(lambda view: _doubt_mask(views[view], photos, view), views)
-    if 2 * sum(doubts) > len(views):
-        doubtful = [views[view].name for view, doubt in zip(views, doubts, strict=True) if doubt]
-        expected = f"expected black, white and grey pictures for --{option}, found {len(doubtful)} of {len(views)}"
+    """Raise an ``error`` about ``place`` if some mask is a photo for certain, or if most masks may be photos.
+
+    ``place`` is the folder of the masks, or the file that names them.
+    """
+    of_views = {view: mask for view, mask in enumerate(masks) if mask is not None}
+    doubts = parallel_map(lambda view: _doubt_mask(of_views[view], photos, view), of_views)
+    if 2 * sum(doubts) > len(of_views):
+        doubtful = [of_views[view].name for view, doubt in zip(of_views, doubts, strict=True) if doubt]
+        expected = f"expected black, white and grey pictures for --{option}, found {len(doubtful)} of {len(of_views)}"
         problem = f"{expected} that look like photos, {list_some(doubtful)}"
         raise error(place, problem, f"name another folder with --{option}, or pass --{option} {NONE}")
 
@@ -171,8 +175,8 @@ def _refuse_photos(
 def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     """Return whether a mask looks like a photo: infinity if it is one for certain, 1 if it may be one, 0 otherwise.
 
-    A picture of several colours is one for certain. A grey one may be if it changes from pixel to pixel as the photo of
-    its view does, unless most of its pixels have one of two levels, as in masks with soft edges.
+    A picture of several colours is a photo for certain. A grey picture may be one if it changes from pixel to pixel as
+    the photo of its view does. But if most of its pixels have one of two levels, it is a mask with soft edges.
     """
     picture = np.rint(decode_small(mask, OFFSET_PIXELS) * _WHITE)
     spread = np.ptp(picture, axis=-1)
@@ -188,26 +192,32 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
         photo, limit_size((photo.shape[1], photo.shape[0]), 2 * OFFSET_PIXELS), interpolation=cv2.INTER_AREA
     )
     jpeg_texture = 0.2  # largest share of the pixels of a smooth mask that JPEG makes uneven
-    return _texture(grey) > max(_texture(small.mean(-1)) / 2, jpeg_texture)  # nearer to the photo's than to a mask's
+    return _texture(grey) > max(_texture(small.mean(-1)) / 2, jpeg_texture)
 
 
 def _texture(grey: np.ndarray) -> float:
-    """Return the share of pixels that differ from the mean of those left and right by more than a level of 255."""
+    """Return the share of pixels that differ by more than a level of 255 from the mean of their two neighbours.
+
+    The neighbours are those to the left and right.
+    """
     bends = np.diff(grey, 2, prepend=grey[:, :1], append=grey[:, -1:])
     return float((np.abs(bends) > 2).mean())
 
 
-def _stack(
+def _stack_views(
     values: Sequence[np.ndarray | None], default: bool | np.float32, shape: tuple[int, int]
 ) -> np.ndarray | None:
-    """Stack values ``[h,w]`` of views to ``[v,h,w]``, with the ``default`` for None; None if all are the default."""
+    """Stack the values ``[h,w]`` of views to ``[v,h,w]``, with ``default`` in place of None.
+
+    None if all values are the default.
+    """
     if all(view_values is None or (view_values == default).all() for view_values in values):
         return None
     return np.stack([np.full(shape, default) if view_values is None else view_values for view_values in values])
 
 
 def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | None]) -> str:
-    """Describe which share of the pixels is protected, and how many photos have a picture that protects pixels."""
+    """Describe what share of the pixels is protected, and how many photos have a picture that protects pixels."""
     count = sum(mask is not None for mask in masks)
     max_weight = 1.0 if importance is None else float(importance.max())
     photos = f"{count} photo{'' if count == 1 else 's'} of {len(masks)}"
@@ -219,7 +229,7 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
 
 
 def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], list[str]]:
-    """Find the masks that a camera file names, for each view; return them and a note on files that are not there.
+    """Find the mask of each view that a camera file names; return the masks and a note on files that are not there.
 
     SceneError for a file outside the folder of the cameras.
     """
@@ -232,17 +242,18 @@ def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], 
 
 
 def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple[Masks, list[str]]:
-    """Note the share of the photos that masks leave out; SceneError if named masks leave out nearly everything.
+    """Return the masks that are used, and notes on the share of the photos that they leave out.
 
-    A folder of masks that was found is doubted if it hides most of the pixels that have Gaussians, as the wrong way
-    round: whoever wants only what it leaves, names it.
+    Masks that leave out nearly everything are not used, and raise a SceneError if the user named them. If a folder of
+    masks that the user did not name leaves out most pixels that show Gaussians, the note is a doubt, since the masks
+    may be inverted.
     """
     counts = masks.counts
     if counts is None:
         return masks, []
-    share = float(1 - counts.mean())
-    max_masked = 0.98  # share of the pixels of photos that masks may leave out
-    if share < max_masked:
+    share = float(1 - counts.mean())  # of the pixels that masks leave out
+    max_share = 0.98  # masks that leave out more are not used
+    if share < max_share:
         count = int((~counts.all((1, 2))).sum())
         note = f"masks leave out {100 * share:.0f} % of the photos' pixels; {count} of {len(counts)} photos have a mask"
         shown = None if pixels is None or "masks" in files.named or files.masks is None else pixels.shown

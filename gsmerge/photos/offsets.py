@@ -2,7 +2,7 @@
 
 Pictures of neighbouring views are similar as a whole, but their parts are displaced. Each part of the view's picture is
 searched for around the same place in the photo. The offset of a part counts if its best place stands out from all other
-places. Parts of the view's own photo have no offset. Parts of a neighbour's photo have one.
+places. It is zero in the photo of the view itself, but not in the photo of a neighbour.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ OFFSET_PIXELS = 256  # pixels of the longer side of both pictures
 PART_PIXELS, MOST_OFFSET = 32, 12  # pixels: side of a part, and largest offset that is searched
 CONTRAST_PIXELS = 30  # pixels: side of the square whose mean is subtracted to get contrast
 TAPS = 64  # size of the Fourier transforms, at least PART_PIXELS + 2 MOST_OFFSET
-ZERO_OFFSET = 1  # pixels: offsets up to it count as zero, since the peak of a correlation is that wide
-NEAR_PIXELS = 3  # pixels by which offsets of parts may differ in one common motion, because their depths differ
+ZERO_OFFSET = 1  # pixels: smaller and equal offsets count as zero, since the peak of a correlation is that wide
+NEAR_PIXELS = 3  # pixels: parts that move together differ by at most this in their offsets, since their depths differ
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoOffsets:
-    """Offsets of the parts of a photo whose best place stands out from all other places."""
+    """Offsets of the n parts of a view's picture whose best place in a photo stands out from all other places."""
 
     offsets: np.ndarray  # [n,2] pixels down and right
     similarity: float  # mean of Fisher's z of all parts at offset zero
-    tolerance: float = ZERO_OFFSET  # pixels: offsets up to it count as zero
+    tolerance: float = ZERO_OFFSET  # pixels: smaller and equal offsets count as zero
 
     @cached_property
     def distances(self) -> np.ndarray:
@@ -54,32 +54,32 @@ class PhotoOffsets:
         """True if the photo was taken from the view, False if it was taken from elsewhere, None in doubt.
 
         The photo was taken from the view if more parts are in place than moved together, and from elsewhere if fewer
-        are. The difference must exceed the standard error of a fair coin.
+        are. The difference of the two numbers must exceed the standard error of tosses of a fair coin.
         """
         in_place, together = self.num_in_place, self.num_moved_together
         return in_place > together if abs(in_place - together) > np.sqrt(in_place + together) else None
 
 
 def correlate_parts(shown: ViewPictures, view: int, photo: np.ndarray) -> np.ndarray:
-    """Return Fisher's z ``[n]`` of the correlations between parts of a photo and the same parts of a view."""
+    """Return Fisher's z ``[n]`` of the correlation of each part of a view's picture with the same part of a photo."""
     weight = shown.weights[view]
     height, width = weight.shape
     photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, CONTRAST_PIXELS)
     view_contrast = find_contrast(shown.pictures[view], weight, CONTRAST_PIXELS)
     starts = [np.arange(0, side, max(1, PART_PIXELS * max(height, width) // OFFSET_PIXELS)) for side in (height, width)]
 
-    def add(values: np.ndarray) -> np.ndarray:
+    def sum_parts(values: np.ndarray) -> np.ndarray:
         """Add weighted values ``[h,w,3]`` over each part."""
         return np.add.reduceat(np.add.reduceat(values.sum(-1) * weight, starts[0], 0), starts[1], 1).reshape(-1)
 
-    squares = add(photo_contrast * photo_contrast) * add(view_contrast * view_contrast)
-    return fisher_z(add(photo_contrast * view_contrast) / np.sqrt(np.maximum(squares, 1e-12)))
+    squares = sum_parts(photo_contrast * photo_contrast) * sum_parts(view_contrast * view_contrast)
+    return fisher_z(sum_parts(photo_contrast * view_contrast) / np.sqrt(np.maximum(squares, 1e-12)))
 
 
 def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffsets | None:
-    """Search for the parts of a view in an upright ``photo [h,w,3]``, which may have any size.
+    """Search for the parts of a view's picture in an upright ``photo [h,w,3]``, which may have any size.
 
-    ``shown`` are pictures of the views with up to :data:`OFFSET_PIXELS` pixels on the longer side. None if they are too
+    ``shown`` are pictures of all views with up to :data:`OFFSET_PIXELS` pixels on the longer side. None if they are too
     small to be cut into parts.
     """
     weight = shown.weights[view]
@@ -89,7 +89,7 @@ def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffs
     photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, CONTRAST_PIXELS)
     view_contrast = find_contrast(shown.pictures[view], weight, CONTRAST_PIXELS)
     padded = np.pad(photo_contrast, ((MOST_OFFSET, MOST_OFFSET), (MOST_OFFSET, MOST_OFFSET), (0, 0)))
-    scores = _score_offsets(padded, view_contrast, weight)
+    scores = _correlate_offsets(padded, view_contrast, weight)
     middle = np.median(scores, 1)
     noise = NORMAL_SPREAD * np.median(np.abs(scores - middle[:, None]), 1) + 1e-6
     stand_out = scores.max(1) - middle > NOISE_MARGIN * noise
@@ -97,7 +97,7 @@ def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffs
     return PhotoOffsets(offsets, float(scores[:, scores.shape[1] // 2].mean()))
 
 
-def _score_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _correlate_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return Fisher's z ``[n,(2 MOST_OFFSET + 1)^2]`` of each part of a picture at every offset in a padded photo."""
     rows, columns = (
         np.arange(0, side - PART_PIXELS + 1, PART_PIXELS) + (side % PART_PIXELS) // 2 for side in weight.shape

@@ -1,6 +1,6 @@
 """Photos of another shape, or that do not show their views as a whole -> the part of each that shows its view.
 
-Bars are cut off, and one picture is taken out of both eyes of a stereo camera, or out of several side by side.
+Bars are cut off. Of photos that show both eyes of a stereo camera, or several pictures side by side, one is used.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, sizes_of
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, WHOLE, decode_image, image_size, limit_size, resize_to, same_shape
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.photos.assign import Assigner, Assignment, Candidates
-from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_parts, sharpen
+from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_parts, round_to_cameras
 from gsmerge.photos.offsets import OFFSET_PIXELS
 from gsmerge.photos.pictures import show_views
 from gsmerge.photos.scene_photos import Proposal
@@ -23,11 +23,11 @@ from gsmerge.photos.views import pick_views
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
-_BAR_SPREAD = 8  # largest range of a bar's colours, of 255
+_BAR_SPREAD = 8  # largest difference of the colours within a bar, of 255
 
 
 def has_bars(scene: Scene) -> bool:
-    """Return whether the first photo of a scene has bars on opposite sides, without which it has another shape."""
+    """Return True if the first photo of a scene has bars on opposite sides, so wide that they change its shape."""
     if scene.images is None:
         return False
     above, below, left, right = count_bars(scene.images[0], _BAR_SPREAD / 255)
@@ -39,10 +39,11 @@ def has_bars(scene: Scene) -> bool:
 def choose_part(
     scene: Scene, proposal: Proposal, camera_file: CameraFile, grid_fit: GridFit | None = None
 ) -> Proposal | None:
-    """Find the part of the proposed photos that shows the views; None if whole photos fit as well, or if no part does.
+    """Find the part of the proposed photos that shows the views, and return a proposal that uses it.
 
-    A part fits if it explains the views as a photo does (:meth:`Assigner.explain_most`). ``grid_fit``: how the whole
-    photos would fit a grid whose cameras were estimated.
+    None if no part fits better than whole photos, or if the best part does not explain the views either
+    (:meth:`Assigner.explain_most`). None also if photos differ in shape or have orientation tags. ``grid_fit`` is the
+    fit of whole photos to a grid whose cameras were estimated.
     """
     proposal = proposal.without_broken() or proposal
     named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
@@ -54,7 +55,7 @@ def choose_part(
         return None
 
     def read(number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Read a photo small, and the shares of its sides that bars have."""
+        """Return a small photo, and the shares of its sides (left, above, right, below) that are bars."""
         size = sizes[number]
         with suppress(SceneError):
             whole = decode_image(proposal.pool[photos[number]], size)
@@ -65,11 +66,11 @@ def choose_part(
 
     pictures, bars = zip(*parallel_map(read, range(len(photos))), strict=True)
     left, above, right, below = np.median(bars, 0).tolist()
-    inner, shape = (left, above, 1 - right, 1 - below), (scene.cameras.width, scene.cameras.height)
-    shape = next(iter(sizes_of(camera_file)), shape)
+    inner = left, above, 1 - right, 1 - below
+    shape = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
     fits: list[GridFit | PartFit] = [] if grid_fit is None else [grid_fit]
     if grid_fit is None:
-        inner = sharpen(inner, sizes[0], shape)
+        inner = round_to_cameras(inner, sizes[0], shape)
     fits += list_parts(sizes[0], shape if grid_fit is None else None, inner)
     fit = choose_fit(show_views(scene, OFFSET_PIXELS)[views], pictures, fits)
     if isinstance(fit, GridFit) or fit == WHOLE_FIT:

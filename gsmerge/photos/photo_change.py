@@ -11,32 +11,32 @@ import numpy as np
 from gsmerge.photos.colors import map_tones
 from gsmerge.types import LargePhotos
 
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # brightness of red, green and blue (Rec. 601), as of grey JPEGs
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # brightness of red, green and blue, as in JPEGs (Rec. 601)
 CLIPPED = 0.985  # a pixel may be clipped from this level on
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoChange:
-    """Changes of one photo, in this order."""
+    """Changes of one photo: first the tones, then the cover."""
 
     tones: np.ndarray | None = None  # [3,256] float32, new value of each level of each channel
     cover: np.ndarray | None = None  # [h,w] bool, pixels that get `colors`
     colors: np.ndarray | None = None  # [h,w,3] sRGB in [0, 1]
-    bright: bool = True  # False: covered pixels get the hue of `colors` alone, and keep the photo's brightness
+    keeps_brightness: bool = False  # True: covered pixels get only the hue of `colors`; False: also its brightness
 
     def __bool__(self) -> bool:
         """Return whether the photo changes at all."""
         return self.tones is not None or self.cover is not None
 
     def __call__(self, photo: np.ndarray) -> np.ndarray:
-        """Change a photo ``[h,w,3]`` in [0, 1], at the size of the cover or a larger one; float32."""
+        """Return a changed photo ``[h,w,3]`` float32 in [0, 1]; it has the size of the cover, or is larger."""
         if self.tones is not None:
             photo = map_tones(self.tones, photo)
         if self.cover is not None and self.colors is not None:
             cover, colors = self.cover, self.colors
             if cover.shape != photo.shape[:2]:
                 cover, colors = _enlarge(cover, photo.shape) > 0, _enlarge(colors, photo.shape)
-            if not self.bright:
+            if self.keeps_brightness:
                 colors = (colors + ((photo - colors) * LUMA).sum(-1, keepdims=True)).clip(0, 1)
             photo = np.where(cover[..., None], colors, photo)
         return np.ascontiguousarray(photo, np.float32)
@@ -49,7 +49,7 @@ def _enlarge(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def change_large(large: LargePhotos, changes: Sequence[PhotoChange]) -> LargePhotos:
-    """Return larger photos that are changed whenever they are read."""
+    """Return the large photos so that each is changed when it is read."""
 
     def read(view: int) -> np.ndarray:
         photo = large.read(large.ids[view])

@@ -1,4 +1,4 @@
-"""Find the folders whose files have the names of a scene's cameras, whatever the folders are called."""
+"""Find the folder whose files have the names of a scene's cameras, whatever the folder is called."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ _MODEL_FOLDERS = {"sparse", "colmap", "distorted"}  # names of folders that have
 
 
 def capture_folder(cameras: Path) -> Path:
-    """Return the folder of a capture from its camera file or COLMAP model, which may also be that folder itself."""
+    """Return the folder of a capture: that of its camera file, or the one that has its COLMAP model.
+
+    ``cameras`` is the file or the folder of the model. The model may also be in the folder of the capture itself.
+    """
     if not cameras.is_dir():
         return cameras.parent
     places = cameras, *cameras.parents
@@ -33,9 +36,12 @@ def find_named_photos(
 ) -> tuple[Path, list[Path], list[Path | None]] | None:
     """Find the folder at or below ``roots`` in which most cameras, and more than ``num_known``, have a photo by name.
 
-    Of several, photos with the endings of the names come first; then those near the cameras, below the first root; then
-    those with colours, unlike masks and depths, with the size of the cameras, with their shape, and with more pixels.
-    Returns the folder, its photos and those of the next best folders, and the photo of each camera; None without.
+    If several folders have as many, a folder is preferred whose files have the whole names, with endings; then one
+    below the first root, which is near the cameras; then one whose photos have colours, unlike masks and depths; then
+    one whose photos have the size of the cameras, or their shape, or more pixels.
+
+    Returns the folder, the photos of this and of the next best folders, and the photo of each camera, None without one.
+    Returns None if there is no such folder.
     """
     pools = dict[Path, dict[Path, None]]()  # folder -> photos in it and below
     for root in roots:
@@ -45,15 +51,16 @@ def find_named_photos(
                 pools.setdefault(place, {}).update(dict.fromkeys(photos))
 
     sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
-    endings = {PurePath(name).name for name in camera_file.names}
+    file_names = {PurePath(name).name for name in camera_file.names}
 
     def rank(folder: Path) -> tuple[Any, ...]:
-        found = propose_images(folder, list(pools[folder]), camera_file.names, count_pixels)
-        first = next(filter(count_pixels, filter(None, found)), None)
+        """Return a key by which better folders sort first; it begins with minus the number of cameras with a photo."""
+        proposed = propose_images(folder, list(pools[folder]), camera_file.names, count_pixels)
+        first = next(filter(count_pixels, filter(None, proposed)), None)
         if first is None:
             return 0, folder
-        own, size = sizes[found.index(first)], image_size(first)
-        count, num_exact = len({*found} - {None}), sum(path.name in endings for path in filter(None, found))
+        own, size = sizes[proposed.index(first)], image_size(first)
+        count, num_exact = len({*proposed} - {None}), sum(path.name in file_names for path in filter(None, proposed))
         look = is_grey(first), size != own, min(own) > 1 and not same_shape(own, size), -count_pixels(first)
         nested = len(pools[folder]), -len(folder.parts), folder  # the folder itself rather than one above it
         return -count, -num_exact, not folder.is_relative_to(roots[0]), *look, *nested
@@ -67,14 +74,14 @@ def find_named_photos(
 
 
 def is_grey(path: Path) -> bool:
-    """Return whether an image file has no colours, as masks and depths; False where it cannot be read."""
+    """Return True if an image file has no colours, like masks and depths; False if it cannot be read."""
     with suppress(SceneError):
         return bool(np.ptp(decode_small(path, OFFSET_PIXELS), axis=-1).mean() <= _ROUNDING)
     return False
 
 
 def count_pixels(path: Path) -> int:
-    """Count the pixels of an image file; 0 where it cannot be read."""
+    """Count the pixels of an image file; 0 if it cannot be read."""
     try:
         width, height = image_size(path)
     except SceneError:

@@ -1,7 +1,7 @@
 """Make small pictures of what Gaussians show from cameras, to compare them with photos.
 
-Transparency is divided out, so faint or sparse Gaussians have the colours of solid ones. The opacity of a pixel is its
-weight. Photos are averaged with the same weights, so pixels without Gaussians count in neither photos nor pictures.
+Colours are divided by opacity, so faint or sparse Gaussians have the colours of solid ones. The opacity of a pixel is
+its weight. Photos are averaged with the same weights, so pixels without Gaussians count in neither photos nor pictures.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import LEAST_OPACITY, blank_photos, photo_errors, photos_of, pixel_weights, shrink_pictures
 from gsmerge.types import Cameras, Gaussians, Scene
 
-PICTURE_GAUSSIANS = 1 << 17  # Gaussians that are drawn
+PICTURE_GAUSSIANS = 1 << 17  # largest sample of Gaussians that is drawn
 PICTURE_PIXELS = 96  # pixels of the longer side of pictures that photos are compared with
-_CANONICAL = Frame(np.zeros(3), 1.0)  # of canonical scenes
+_CANONICAL = Frame(np.zeros(3), 1.0)  # frame of canonical scenes
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPictures:
     """Small pictures of what the Gaussians show in v views."""
 
-    pictures: np.ndarray  # [v,h,w,3] colours in [0, 1], transparency divided out; 0 where nothing is shown
+    pictures: np.ndarray  # [v,h,w,3] colours in [0, 1], as of solid Gaussians; 0 where nothing is shown
     weights: np.ndarray  # [v,h,w] opacity, in [0, 1]; 0 outside masks
     drawn: bool  # True for renders, which wrong depth displaces; False for colours of each view's own Gaussians
 
@@ -34,7 +34,7 @@ class ViewPictures:
         return len(self.pictures)
 
     def __getitem__(self, views: Sequence[int]) -> ViewPictures:
-        """Return the pictures of some views."""
+        """Select the pictures of ``views``."""
         ids = list(views)
         return replace(self, pictures=self.pictures[ids], weights=self.weights[ids])
 
@@ -61,15 +61,15 @@ class Pairs:
         return Pairs(average(self.photos, self.shown.weights, small.weights), small)
 
     def exchange(self) -> Pairs:
-        """Return pairs with photos and pictures exchanged."""
+        """Return pairs in which photos and pictures are exchanged."""
         return Pairs(self.shown.pictures, replace(self.shown, pictures=self.photos))
 
     def with_photos(self, photos: np.ndarray) -> Pairs:
-        """Return a copy with other photos."""
+        """Return a copy with other ``photos``."""
         return replace(self, photos=photos)
 
     def __getitem__(self, views: Sequence[int]) -> Pairs:
-        """Return the pairs of some views."""
+        """Select the pairs of ``views``."""
         ids = list(views)
         return Pairs(self.photos[ids], self.shown[ids])
 
@@ -82,7 +82,7 @@ def fit_size(size: Sequence[int], side: int) -> tuple[int, int]:
 
 
 def average(pictures: np.ndarray, weights: np.ndarray, small: np.ndarray) -> np.ndarray:
-    """Average pictures ``[v,h,w,3]`` by ``weights [v,h,w]`` to the size of ``small [v,H,W]``, the reduced weights."""
+    """Average pictures ``[v,h,w,3]`` by ``weights [v,h,w]`` to the size of ``small [v,H,W]``, the shrunk weights."""
     sums = shrink_pictures((pictures * weights[..., None]).astype(np.float32), small.shape[2], small.shape[1])
     return np.asarray(
         np.divide(sums, small[..., None], out=np.zeros_like(sums), where=small[..., None] > LEAST_OPACITY)
@@ -101,8 +101,9 @@ def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
 def show_views(scene: Scene, side: int | None = None, frame: Frame | None = None) -> ViewPictures:
     """Make small pictures of what a scene's Gaussians show in its views.
 
-    Where each view has Gaussians of its own, a picture has the colours of a sample of them. Otherwise it is a render of
-    a sample of the Gaussians. ``frame`` is the canonical frame of the scene, if known.
+    If each view has Gaussians of its own, a picture has the colours of a sample of them. Otherwise it is a render of a
+    sample of all Gaussians. ``side`` is the number of pixels on the longer side, by default :data:`PICTURE_PIXELS`.
+    ``frame`` is the canonical frame of the scene, if known.
     """
     if scene.has_own_pixels:
         return _show_rows(scene, PICTURE_PIXELS) if side is None else _show_rows(scene, 2 * side).shrink(side)
@@ -114,7 +115,10 @@ def show_views(scene: Scene, side: int | None = None, frame: Frame | None = None
 
 
 def _show_rows(scene: Scene, side: int) -> ViewPictures:
-    """Return the colours of the views' own Gaussians on a regular grid of at most ``side`` pixels per side."""
+    """Make pictures from the colours of the views' own Gaussians, one of every few pixels.
+
+    The longer side has at most ``side`` pixels.
+    """
     grid = _sample_grid(scene.cameras, side)
     rows = scene.get_pixels().fronts[grid]
     weights = np.where(rows >= 0, scene.gaussians.opacities[rows], 0)
@@ -125,9 +129,9 @@ def _show_rows(scene: Scene, side: int) -> ViewPictures:
 
 
 def _sample_grid(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
-    """Return slices of views, lines and columns that sample pixels in equal steps, at most ``side`` per line.
+    """Return slices of views, lines and columns that select pixels at equal steps, at most ``side`` on the longer side.
 
-    The first sample is in the middle of the first step.
+    The first pixel is in the middle of the first step.
     """
     step = -(-max(cameras.width, cameras.height) // side)
     pixels = slice(min(step // 2, cameras.width - 1, cameras.height - 1), None, step)
@@ -135,7 +139,7 @@ def _sample_grid(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
 
 
 def draw_canonical(gaussians: Gaussians, cameras: Cameras, side: int) -> ViewPictures:
-    """Render canonical Gaussians, and divide their transparency out."""
+    """Render canonical Gaussians at most ``side`` pixels wide and high, and divide colours by opacity."""
     blank = blank_photos(cameras, max(1.0, max(cameras.width, cameras.height) / side))
     renders = photo_errors(gaussians, blank, lambda _, image, transmittance: (image, 1 - transmittance))
     images, opacities = map(np.stack, zip(*renders, strict=True))

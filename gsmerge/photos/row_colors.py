@@ -1,9 +1,9 @@
 """Scene without photos -> the scene with the colours of its rows as photos; each view needs Gaussians of its own.
 
-Feed-forward models start the colour of a pixel's Gaussian from the photo. These colours are compared with a drawing of
-the view's own Gaussians from its own camera, after both were blurred. If the two disagree, or if the Gaussians of a
-pixel are so faint that their colours mean little, the drawing is used instead, if it is solid. Pixels with neither a
-colour nor a solid drawing do not count.
+Feed-forward models take the colour of a pixel's Gaussian from the photo. These colours are compared with a drawing of
+the view's own Gaussians from its own camera, after both are blurred. A solid drawing replaces the colours where the two
+disagree, and where the Gaussians of a pixel are so faint that their colours mean little. Pixels with neither a colour
+nor a solid drawing do not count.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
-OWN_PHOTOS = "the scene's own photos"  # photos that a fit has seen, in messages
-# Names of the reference pictures in messages. Without photos the rows' colours are used; if rows belong to no pixels
-# either, renders are used
+# Names of pictures in messages: the photos that a fit uses, and the pictures with which results are compared. Without
+# photos these are the colours of the rows, or, if rows belong to no pixels, renders
+OWN_PHOTOS = "the scene's own photos"
 PHOTOS = "photos"
 ROW_COLORS = "the model's own pixels"
 RENDERS = "renders of the input"
 NO_PHOTOS = f"no photos: {ROW_COLORS} are used instead; name photos with --images"
 FAINT_OPACITY = 0.1  # opacity of a pixel's Gaussians below which their colours mean little
-# Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 in exports of
-# nine captures. After a blur of 2 pixels they differ by .39, where Gaussians of wrong depth hide others
+# Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 in the exports
+# of nine captures. After a blur of only 2 pixels they differ by .39 where Gaussians of wrong depth hide others
 ROW_BLUR_PIXELS = 8.0
 T = TypeVar("T")
 
@@ -42,46 +42,48 @@ T = TypeVar("T")
 def add_row_colors(scene: Scene, *, has_photos: bool = False) -> PicturedScene:
     """Use the colours of each view's own Gaussians as the photos of a canonical scene, with a note.
 
-    ``has_photos``: there are photos, but they do not count.
+    ``has_photos``: the scene has photos, which do not count. Then an earlier note has said so, and this function makes
+    a note only if drawings are used.
     """
     shape = len(scene), scene.cameras.height, scene.cameras.width
     images, masks = np.zeros((*shape, 3), np.float32), np.full(shape, False)
 
     def keep(views: np.ndarray, rows: RowPicture) -> int:
+        """Store the pictures of a camera's views, and return how many of their pixels are drawn."""
         images[views], masks[views] = rows.picture, rows.known
         return len(views) * int(rows.by_drawing.sum())
 
     num_drawn = sum(picture_rows(scene, keep))
     share = num_drawn / masks.size
     detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE_SHARE else ""
-    if detail or not has_photos:  # otherwise an earlier note has said that photos do not count
+    if detail or not has_photos:
         note((f"photos do not count: {ROW_COLORS} are used instead" if has_photos else NO_PHOTOS) + detail)
     return PicturedScene.with_pictures(scene, images, None if masks.all() else masks)
 
 
 @dataclass(frozen=True, eq=False)
 class RowPicture:
-    """Picture of the Gaussians of a camera's own pixels, from this camera."""
+    """Colours of the pixels of a camera, from the Gaussians of these pixels."""
 
-    picture: np.ndarray  # [h,w,3] their colours, or the drawing at the pixels `by_drawing`
+    picture: np.ndarray  # [h,w,3] colours of the Gaussians, or those of the drawing at the pixels `by_drawing`
     known: np.ndarray  # [h,w] bool, pixels with a colour or a drawing
     by_drawing: np.ndarray  # [h,w] bool, pixels at which the drawing is used
-    drawing: np.ndarray  # [h,w,3] drawing before black
+    drawing: np.ndarray  # [h,w,3] the Gaussians drawn over black
 
 
 def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T], mask: np.ndarray | None = None) -> list[T]:
-    """Return ``use(views, picture)`` for every camera; views with the same camera are its layers.
+    """Call ``use(views, picture)`` for every camera with its views, which are its layers, and return the results.
 
     With ``mask [v]``, only cameras with a view in the mask are drawn.
     """
     kinds = camera_kinds(scene.cameras)
     groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]
     groups = [views for views in groups if mask is None or mask[views].any()]
-    return list(in_turn(lambda views: use(views, _picture(scene, views)), groups))
+    return list(in_turn(lambda views: use(views, _picture_camera(scene, views)), groups))
 
 
-def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
-    """Draw the Gaussians of all ``views`` of one camera, and choose between the drawing and their colours."""
+def _picture_camera(scene: Scene, views: np.ndarray) -> RowPicture:
+    """Draw the Gaussians of all ``views`` of one camera, and choose for each pixel their colours or the drawing."""
     layers = subset(scene, views.tolist())
     if len(layers.gaussians) == 0:
         no_pixel = np.zeros((scene.cameras.height, scene.cameras.width), bool)
@@ -95,9 +97,9 @@ def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
     row_picture, opacity = _blend_layers(layers, colors.clip(0, 1))
     alpha = 1 - transmittance
     drawn = (drawing / np.maximum(alpha, np.float32(1e-3))[..., None]).clip(0, 1)
-    weights = np.minimum(opacity, alpha)  # of the difference of both pictures, which are blurred; a mean over channels
+    weights = np.minimum(opacity, alpha)  # pixels that are faint in one of the two pictures count less
     red, green, blue = np.moveaxis(np.abs(blur((row_picture - drawn) * weights[..., None], ROW_BLUR_PIXELS)), -1, 0)
-    disagreement = 0.2  # the drawing is used from this mean difference of blurred colours over the channels (sRGB) on
+    disagreement = 0.2  # mean difference of the blurred colours over the channels (sRGB) from which on they disagree
     agree = (red + green + blue) / (3 * np.maximum(blur(weights, ROW_BLUR_PIXELS), np.float32(1e-6))) < disagreement
     solid = transmittance < COVERED_TRANSMITTANCE
     by_row = (opacity > 0) & ~(solid & ((opacity < FAINT_OPACITY) | ~agree))
@@ -125,7 +127,7 @@ def _blend_layers(layers: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Fill unknown pixels of a picture ``[h,w,c]`` with the values of the nearest known pixel."""
+    """Fill the pixels of a picture ``[h,w,c]`` outside ``valid [h,w]`` with the values of the nearest pixel inside."""
     if valid.all() or not valid.any():
         return picture
     _, labels = cv2.distanceTransformWithLabels(

@@ -1,7 +1,7 @@
 """Find and read the photos of a scene's views.
 
 Names and folders propose a file for each camera. The content of the photos decides which photo belongs to which view,
-and how it is turned (:mod:`gsmerge.photos.assign`).
+and in which orientation (:mod:`gsmerge.photos.assign`).
 """
 
 from __future__ import annotations
@@ -52,49 +52,52 @@ from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
-UNNAMED = "view 0"  # name of the first camera if the format, or rows without cameras, have no names
+UNNAMED = "view 0"  # name of the first camera if its file has no names, or if cameras were estimated from rows
 
 
 @dataclass(frozen=True, eq=False)
 class ScenePhotos:
-    """The photos of c cameras, of one size, and their files."""
+    """The photos of c cameras, all of one size, and their files."""
 
-    pictures: PhotoArrays = ()  # [h,w,3] uint8, black for a camera without a photo; empty without photos
+    pictures: PhotoArrays = ()  # [h,w,3] uint8 each, black for a camera without a photo; empty without photos
     paths: tuple[Path | None, ...] = ()  # None for a camera without a photo; empty if the photos are inside a file
-    turns: tuple[int, ...] = ()  # how each file is turned; see gsmerge.kernels.pictures.turn_picture
-    part: Part = WHOLE  # the part of each turned photo that is used
+    turns: tuple[int, ...] = ()  # orientation of each file, 0 to 7; see gsmerge.kernels.pictures.turn_picture
+    part: Part = WHOLE  # the part of each upright photo that is used
 
     def __len__(self) -> int:
         return len(self.pictures)
 
     @property
     def absent(self) -> list[int]:
-        """Cameras without a photo."""
+        """Numbers of the cameras without a photo."""
         return [view for view, path in enumerate(self.paths) if path is None]
 
     @property
     def file_size(self) -> Size | None:
-        """Most frequent size of what is used of turned photos, of two the larger one; None if they are in no files."""
-        files = [file for file in zip(self.paths, self.turns, strict=True) if file[0]]
-        sizes = [part_size(_turned_size(path, turn), self.part) for path, turn in files if path]
+        """Most frequent size of the used part of upright photos, the largest of several. None without files."""
+        sizes = [
+            part_size(_upright_size(path, turn), self.part)
+            for path, turn in zip(self.paths, self.turns, strict=True)
+            if path is not None
+        ]
         return max(set(sizes), key=lambda size: (sizes.count(size), size[0] * size[1])) if sizes else None
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """Files of photos, and which of them the names of c cameras propose."""
+    """Files that may be photos of c cameras, and the file that is proposed for each camera."""
 
     folder: Path
-    pool: tuple[Path, ...]
+    pool: tuple[Path, ...]  # all files
     named: tuple[int | None, ...]  # for each camera, the index of its file in the pool; None without a proposed file
     exact: bool  # True: names propose the files; False: their order does
     faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None without a reason
-    by_names: bool = False  # whether the folder was found by the names of its files
-    fit: PartFit = WHOLE_FIT  # what is used of each photo
-    notes: tuple[str, ...] = ()  # on what is used of the photos
+    by_names: bool = False  # True: the folder was found by the names of its files
+    fit: PartFit = WHOLE_FIT  # the part of each photo that is used
+    notes: tuple[str, ...] = ()  # on this part
 
     def tag(self, photo: int) -> int:
-        """Read the turn of a file of the pool by its orientation tag."""
+        """Return the orientation, 0 to 7, in the tag of a file of the pool."""
         return orientation_turn(self.pool[photo])
 
     @property
@@ -104,28 +107,31 @@ class Proposal:
 
     @property
     def choice(self) -> list[Assignment | None]:
-        """The proposed file of each camera, not turned."""
+        """The proposed file of each camera, in the orientation in which it is stored."""
         return [None if photo is None else Assignment(photo, 0) for photo in self.named]
 
     def without_views(self, cameras: Sequence[int]) -> Proposal:
-        """Return a copy with faults for ``cameras`` whose views have no Gaussians, and so no photos."""
+        """Return a copy in which ``cameras`` have a fault: they are unknown, since their views have no Gaussians."""
         faults = list(self.faults)
         for camera in cameras:
             path = self.paths[camera]
-            which = f"view {camera}" if path is None else _inside(path, self)
-            faults[camera] = f"{which}: its camera is unknown, since no Gaussian belongs to it"
+            name = f"view {camera}" if path is None else _short_path(path, self)
+            faults[camera] = f"{name}: its camera is unknown, since no Gaussian belongs to it"
         return replace(self, faults=tuple(faults))
 
     def without_files(self, faults: Mapping[Path, str]) -> Proposal:
-        """Return a copy without some files; why each of them cannot be used becomes a fault of its cameras."""
+        """Return a copy without the files in ``faults``, whose values say why these files cannot be used.
+
+        The reason becomes a fault of the cameras for which the file was proposed.
+        """
         pool = tuple(path for path in self.pool if path not in faults)
         ids = {path: number for number, path in enumerate(pool)}
-        of_cameras = (
-            fault if path not in faults or path is None else f"{_inside(path, self)}: {faults[path]}"
+        camera_faults = (
+            fault if path not in faults or path is None else f"{_short_path(path, self)}: {faults[path]}"
             for path, fault in zip(self.paths, self.faults, strict=True)
         )
         named = (None if path is None else ids.get(path) for path in self.paths)
-        return replace(self, pool=pool, named=tuple(named), faults=tuple(of_cameras))
+        return replace(self, pool=pool, named=tuple(named), faults=tuple(camera_faults))
 
     def without_unreadable(self, *, decode: bool) -> Proposal:
         """Return a copy without the proposed files whose headers, or with ``decode`` whose pixels, cannot be read."""
@@ -139,47 +145,48 @@ class Proposal:
         return None if len(sound.pool) == len(self.pool) or not any(sound.choice) else sound
 
     def select_views(self, cameras: Sequence[int]) -> Proposal:
-        """Return a copy for some ``cameras``."""
+        """Return a copy for ``cameras`` alone."""
         named = tuple(self.named[camera] for camera in cameras)
         return replace(self, named=named, faults=tuple(self.faults[camera] for camera in cameras))
 
 
 def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | None:
-    """Propose the photo file of every camera by its name; None if there are no files of photos.
+    """Propose a photo file for every camera by names, or by order if no name fits and the numbers are equal.
 
-    Files that cannot be read are left out.
+    Files that cannot be read are left out. None if there are no files of photos.
     """
     names = camera_file.names
     if files.images is None and "images" not in files.named:
-        folder, pool, named = _find_near_cameras(files, camera_file)
+        folder, pool, named = _find_photos_near(files, camera_file)
     elif files.images is not None and files.images.is_dir():
         folder, pool = files.images, list_images(files.images)
         named = propose_images(folder, pool, names, count_pixels)
-    else:
+    else:  # the user wants no photos, or the photos are inside a file
         return None
-    found = None
+    better = None  # another folder, in which more cameras have a photo by name
     if "images" not in files.named and len(known := {*named} - {None}) < len(names) and names[0] != UNNAMED:
         roots = dict.fromkeys(path.absolute() for path in (capture_folder(Path(camera_file.path)), files.root) if path)
-        found = find_named_photos([*roots], camera_file, len(known))
-        folder, pool, named = found or (folder, pool, named)
+        better = find_named_photos([*roots], camera_file, len(known))
+        folder, pool, named = better or (folder, pool, named)
     exact = any(named) and camera_file.source != ESTIMATED
     if not any(named) and len(pool) == len(names):
         named = list(pool)
     if not pool:
         return None
     faults = tuple(
-        _describe_missing(folder, name) if exact and path is None else None
+        _describe_missing_file(folder, name) if exact and path is None else None
         for name, path in zip(names, named, strict=True)
     )
     ids = {path: number for number, path in enumerate(pool)}
     photos = tuple(None if path is None else ids.get(path) for path in named)
-    return Proposal(folder, tuple(pool), photos, exact, faults, found is not None).without_unreadable(decode=False)
+    proposal = Proposal(folder, tuple(pool), photos, exact, faults, by_names=better is not None)
+    return proposal.without_unreadable(decode=False)
 
 
-def _find_near_cameras(files: SceneFiles, camera_file: CameraFile) -> tuple[Path, list[Path], list[Path | None]]:
+def _find_photos_near(files: SceneFiles, camera_file: CameraFile) -> tuple[Path, list[Path], list[Path | None]]:
     """Find photos near the camera file: the files that it names, or files beside the ``.ply``.
 
-    Returns their folder, all files, and the file that belongs to each camera by its name; None without.
+    Returns their folder, all files, and for each camera the file of its name, or None.
     """
     path, names = Path(camera_file.path), camera_file.names
     folder = capture_folder(path)
@@ -193,13 +200,13 @@ def _find_near_cameras(files: SceneFiles, camera_file: CameraFile) -> tuple[Path
     return folder, pool, named
 
 
-def _describe_missing(folder: Path, name: str) -> str:
-    """Say that a file does not exist, and name a file of the same stem whose format is not read."""
-    inner, unread = PurePath(name), set[str]()
+def _describe_missing_file(folder: Path, name: str) -> str:
+    """Say that a file does not exist; also name a file of the same stem whose format is not read, if there is one."""
+    inner, same_stem = PurePath(name), set[str]()
     for place in {folder, folder if inner.is_absolute() or ".." in inner.parts else folder / inner.parent}:
         with suppress(OSError, ValueError):
-            unread |= {file for file in os.listdir(place) if PurePath(file).stem == inner.stem}
-    unread = {file for file in unread if PurePath(file).suffix.lower() not in IMAGE_SUFFIXES}
+            same_stem |= {file for file in os.listdir(place) if PurePath(file).stem == inner.stem}
+    unread = {file for file in same_stem if PurePath(file).suffix.lower() not in IMAGE_SUFFIXES}
     shown = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner
     if not unread:
         return f"{shown}: no such file"
@@ -218,9 +225,9 @@ def _find_fault(path: Path, *, decode: bool = False) -> str | None:
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
-    """Read the photos of all cameras by their names, or from a file that holds them; empty without photos.
+    """Read the photos of all cameras, from files of their names or from one file that has all photos.
 
-    SceneError if a photo is missing or cannot be read, or if two differ in size.
+    Returns no photos if there are none. SceneError if a photo is missing or cannot be read, or if two differ in size.
     """
     proposal = propose_photos(files, camera_file)
     if proposal is None:
@@ -228,7 +235,7 @@ def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
             raise SceneError(files.images, f"expected photos of {len(camera_file)} cameras, found none")
         return photos_inside(files, camera_file)
     if None in proposal.named:
-        if files.images is None:
+        if files.images is None:  # photos that nobody named may be incomplete
             return ()
         view = proposal.named.index(None)
         reason = proposal.faults[view] or f"{camera_file.names[view]}: no such file"
@@ -237,7 +244,7 @@ def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
 
 
 def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
-    """Read the photos inside a file; empty if the scene has no file with photos."""
+    """Read the photos from the one file that has them all; return none if the scene has no such file."""
     if files.images is None or files.images.is_dir():
         return ()
     same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
@@ -248,10 +255,10 @@ def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
 
 
 def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile) -> ScenePhotos:
-    """Read the chosen photo of each camera, turned, and resized to the size of most photos.
+    """Read the chosen photo of each camera upright, and resize it to the size of most photos.
 
     Photos of SHARP are resized to the size of their camera. SceneError if a photo cannot be read, or if its aspect
-    ratio differs from most photos.
+    ratio differs from that of most photos.
     """
     paths = tuple(None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen)
     turns = tuple(0 if assignment is None else assignment.orientation for assignment in chosen)
@@ -262,19 +269,20 @@ def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_
     if camera_file.source == SHARP:
         size = int(camera_file.widths[0]), int(camera_file.heights[0])
     for path, turn in zip(paths, turns, strict=True):
-        part = size if path is None else part_size(_turned_size(path, turn), photos.part)
-        if camera_file.source != SHARP and not same_shape(part, size):
-            width, height = part
+        used_size = size if path is None else part_size(_upright_size(path, turn), photos.part)
+        if camera_file.source != SHARP and not same_shape(used_size, size):
+            width, height = used_size
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
             raise SceneError(proposal.folder, problem)
     return replace(photos, pictures=decode_photos(paths, turns, proposal.fit.stretch(size), proposal.fit.part))
 
 
 def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:
-    """Leave out photos that do not have the aspect ratio of most photos, and their views if the cameras have neither.
+    """Leave out photos that do not have the aspect ratio of most photos, and views whose cameras do not have it.
 
-    Returns the cameras and the photos of all other views, and a doubt if views are left out. None if that is
-    not possible, because there are no photos, all have one aspect ratio, or a single view would remain.
+    A camera without a size has the aspect ratio of its photo. Returns the cameras and the photos of all other views,
+    and a doubt if views are left out. None if there are no photos, if all have one aspect ratio, or if fewer than two
+    views would remain.
     """
     paths = proposal.paths
     sizes = {path: image_size(path) for path in paths if path is not None}
@@ -282,9 +290,10 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
         return None
     (width, height), _ = Counter(sizes[path] for path in paths if path is not None).most_common(1)[0]
     shape = f"the aspect ratio of {width} x {height}"
+    # the photos with another aspect ratio, and their sizes as text
     others = {path: "{} x {}".format(*size) for path, size in sizes.items() if not same_shape(size, (width, height))}
     camera_sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
-    # a size of 1 pixel means that the size is unknown, and is that of the photo
+    # a size of 1 pixel means that the camera has no size
     used = [
         view
         for view, (path, size) in enumerate(zip(paths, camera_sizes, strict=True))
@@ -298,17 +307,17 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
     return select_views(camera_file, used), fewer.select_views(used), [Doubt(doubt)] if unused else []
 
 
-def _turned_size(path: Path, turn: int) -> Size:
-    """Read the size of a photo after a turn."""
+def _upright_size(path: Path, turn: int) -> Size:
+    """Read the size of a photo, and return the size after the turn."""
     width, height = image_size(path)
     return (height, width) if turn % 2 else (width, height)
 
 
 def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
-    """Make candidates of the files: small versions, resized and cropped to the pixels of a grid by ``fit``."""
+    """Make candidates of the files of a proposal. Photos are read small, and fitted to a grid by ``fit`` if given."""
 
     def read(photo: int) -> np.ndarray:
-        """Return a small version of a photo: the part that the proposal compares, and of it that of the grid."""
+        """Read a small version of a photo, and cut out the part that is used."""
         try:
             small = decode_small(proposal.pool[photo], OFFSET_PIXELS)
         except SceneError:  # an unreadable photo is black and fits no view
@@ -325,28 +334,30 @@ def assign_to_views(
     """Assign files to the views of a scene; see :func:`gsmerge.photos.assign.assign_photos`.
 
     Args:
-        scene: The scene; its photos are those that names propose if ``read``.
+        scene: The scene.
         proposal: The files.
-        read: The scene has the proposed photos. Otherwise files are read small.
+        read: True: the photos of the scene are the proposed ones, and are compared. False: files are read small.
         guessed: Views that get no photo.
         fit: How files are resized and cropped to the pixels of a grid.
 
     Returns:
-        The file of each view with its turn, None without a photo; and whether the proposed photos explain most views.
+        The file of each view with its orientation, None without a photo; and True if the proposed photos explain most
+        views.
     """
     stored, images = _list_candidates(proposal, fit), scene.images
     candidates = stored
     if read and images is not None:
         view_of_photo = {photo: view for view, photo in enumerate(proposal.named) if photo is not None}
         candidates = replace(stored, read=lambda photo: images[view_of_photo[photo]])
+    # a view whose mask leaves out all pixels is compared as a whole
     masks = None if scene.masks is None else scene.masks | ~scene.masks.any((1, 2), keepdims=True)
     show = partial(show_views, replace(scene, masks=masks))
-    chosen, are_alike = assign_photos(show, candidates, proposal.named, exact=proposal.exact, stored=stored)
-    return [None if view in guessed else assignment for view, assignment in enumerate(chosen)], are_alike
+    chosen, explain_most = assign_photos(show, candidates, proposal.named, exact=proposal.exact, stored=stored)
+    return [None if view in guessed else assignment for view, assignment in enumerate(chosen)], explain_most
 
 
 def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
-    """List the views without Gaussians if cameras were estimated, since the cameras of these views are guesses."""
+    """List the views whose cameras are guesses: the views without Gaussians, if cameras were estimated from these."""
     if camera_file.source != ESTIMATED or scene.pixels is None:
         return []
     return np.flatnonzero(~scene.pixels.shown.any((1, 2))).tolist()
@@ -354,19 +365,22 @@ def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
 
 def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
     """Find how the photos that show a scene's views were resized and cropped to the grid of its rows."""
-    simple, *other_fits = list_fits((scene.cameras.width, scene.cameras.height))
+    fits = list_fits((scene.cameras.width, scene.cameras.height))
     views = range(len(scene))
     shown, chosen = show_views(scene, OFFSET_PIXELS), list[np.ndarray | None]()
     assigner = Assigner(partial(show_views, scene), _list_candidates(proposal, None))
     for view, likely in assigner.list_likely(views, range(len(proposal.pool))).items():
         photos = [turn_picture(assigner.candidates.read(photo), turn) for photo, turn in likely]
-        scores = [float(correlate_parts(shown, view, simple.cut(photo)).mean()) for photo in photos]
+        scores = [float(correlate_parts(shown, view, fits[0].cut(photo)).mean()) for photo in photos]
         chosen.append(photos[int(np.argmax(scores))] if photos else None)
-    return choose_fit(shown, chosen, (simple, *other_fits)) if any(photo is not None for photo in chosen) else simple
+    return choose_fit(shown, chosen, fits) if any(photo is not None for photo in chosen) else fits[0]
 
 
 def has_other_shape(proposal: Proposal, camera_file: CameraFile) -> bool:
-    """Return whether proposed photos have another aspect ratio than all cameras, also if turned, and no known crop."""
+    """Return True if the first proposed photo, upright or turned, has another aspect ratio than all cameras.
+
+    Return False if that is expected, because the cameras' source is known to resize or crop photos.
+    """
     photo, shapes = next((photo for photo in proposal.named if photo is not None), None), sizes_of(camera_file)
     if photo is None or not shapes or camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP):
         return False
@@ -376,26 +390,30 @@ def has_other_shape(proposal: Proposal, camera_file: CameraFile) -> bool:
 
 def has_nearer_colors(scene: Scene, other: Scene) -> bool:
     """Return whether the colours of a scene are nearer to its photos than those of ``other`` with the same photos."""
-
-    def measure(images: np.ndarray, shown: ViewPictures) -> np.ndarray:
-        return cut_blocks(Pairs(shrink_pictures(images, *shown.weights.shape[2:0:-1]), shown)).errors()
-
     images = scene.images
     assert images is not None
+
+    def measure_errors(shown: ViewPictures) -> np.ndarray:
+        return cut_blocks(Pairs(shrink_pictures(images, *shown.weights.shape[2:0:-1]), shown)).errors()
+
     return stands_out(
-        measure(images, show_views(other, OFFSET_PIXELS)) - measure(images, show_views(scene, OFFSET_PIXELS))
+        measure_errors(show_views(other, OFFSET_PIXELS)) - measure_errors(show_views(scene, OFFSET_PIXELS))
     )
 
 
 def name_by_photos(
     camera_file: CameraFile, proposal: Proposal, chosen: Sequence[Assignment | None], fit: GridFit | None
 ) -> CameraFile:
-    """Name estimated cameras by the photos of their views; set their ``photo_map`` to the fit of the photos."""
+    """Name estimated cameras by the photos of their views, and adapt the cameras to the ``fit`` of the photos.
+
+    Cameras that were read from a file stay as they are.
+    """
     if camera_file.source != ESTIMATED:
         return camera_file
     files = [None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen]
     names = [
-        name if file is None else _inside(file, proposal) for name, file in zip(camera_file.names, files, strict=True)
+        name if file is None else _short_path(file, proposal)
+        for name, file in zip(camera_file.names, files, strict=True)
     ]
     turns = [0 if assignment is None else assignment.orientation for assignment in chosen]
     size = ScenePhotos((), tuple(files), tuple(turns), proposal.fit.part).file_size
@@ -403,8 +421,8 @@ def name_by_photos(
     return named if fit is None or size is None else fit.cameras(named, size)
 
 
-def _inside(path: Path, proposal: Proposal) -> str:
-    """Return the path of a file inside the folder of photos, or its name with the name of its folder."""
+def _short_path(path: Path, proposal: Proposal) -> str:
+    """Return the path of a file from the folder of photos on; of a file outside, its name and that of its folder."""
     folder = proposal.folder
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else f"{path.parent.name}/{path.name}"
 
@@ -412,15 +430,15 @@ def _inside(path: Path, proposal: Proposal) -> str:
 def describe_assignment(
     proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile, *, are_pixels: bool
 ) -> list[str]:
-    """Describe where the assignment of photos differs from their names, and doubt views whose photos are left out.
+    """Describe where the assigned photos differ from names and tags, and why views have no photo.
 
-    ``are_pixels``: the rows are pixels of the views, so no view lacks its camera.
+    ``are_pixels``: the rows are pixels of the views, see :func:`_describe_spare`.
     """
     folders = dict.fromkeys(str(proposal.pool[assignment.photo].parent) for assignment in chosen if assignment)
-    text = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
-    count, notes = len(chosen), [text] if proposal.by_names else []
+    place = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
+    count, notes = len(chosen), [place] if proposal.by_names else []
     turned = [
-        _inside(proposal.pool[assignment.photo], proposal)
+        _short_path(proposal.pool[assignment.photo], proposal)
         for assignment in chosen
         if assignment is not None and assignment.orientation != proposal.tag(assignment.photo)
     ]
@@ -428,7 +446,7 @@ def describe_assignment(
         text = f"{len(turned)} of {count} photos are turned or mirrored relative to their orientation tags"
         notes.append(f"{text}: {list_some(turned)}")
     moved = [
-        f"photo {_inside(proposal.pool[assignment.photo], proposal)} for view {camera_file.names[view]}".replace(
+        f"photo {_short_path(proposal.pool[assignment.photo], proposal)} for view {camera_file.names[view]}".replace(
             "view view ", "view "
         )
         for view, assignment in enumerate(chosen)
@@ -441,22 +459,23 @@ def describe_assignment(
     missing = [view for view, assignment in enumerate(chosen) if assignment is None]
     if not missing:
         return notes
-    reasons = [_explain(proposal, view, camera_file.names[view]) for view in missing]
+    reasons = [_explain_absence(proposal, view, camera_file.names[view]) for view in missing]
     return [*notes, Doubt(f"photos of {len(missing)} of {count} views are left out: {list_some(reasons, '; ')}")]
 
 
-def _explain(proposal: Proposal, view: int, name: str) -> str:
-    """Say why a camera has no photo."""
+def _explain_absence(proposal: Proposal, view: int, name: str) -> str:
+    """Say why the camera of a view has no photo."""
     path = proposal.paths[view]
     if path is None:
         return proposal.faults[view] or f"{name}: no photo shows this view"
-    return proposal.faults[view] or f"{_inside(path, proposal)}: shows something else than its camera"
+    return proposal.faults[view] or f"{_short_path(path, proposal)}: shows something else than its camera"
 
 
 def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, are_pixels: bool) -> list[str]:
-    """Note photos without a camera in the folders of the used photos: parts of the scene may be in these alone.
+    """Note the photos without a camera in the folders of the used photos, since they may show other parts of the scene.
 
-    Rows that are pixels are seen by their own cameras. Other photos are noted there only if they are fewer.
+    If rows are pixels (``are_pixels``), their own cameras see all of the scene. Then photos without a camera are noted
+    only if names propose photos, and if they are fewer than the used ones.
     """
     used = [proposal.pool[assignment.photo] for assignment in chosen if assignment is not None]
     named = [proposal.pool[photo] for photo in proposal.named if photo is not None]
@@ -465,15 +484,18 @@ def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, 
     if not spare or (are_pixels and (not proposal.exact or len(spare) >= len(used))):
         return []
     count = f"{len(spare)} of {len(spare) + len(used)} photos {'has' if len(spare) == 1 else 'have'} no camera"
-    names = list_some([_inside(path, proposal) for path in spare])
+    names = list_some([_short_path(path, proposal) for path in spare])
     return [f"{count} and {'is' if len(spare) == 1 else 'are'} not used: {names}"]
 
 
 def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | None, *, is_right: bool) -> str | None:
-    """Note which views of a grid have no camera in the file ``stored``; None if it may be of another scene.
+    """Describe which views of a grid have no camera in the file ``stored``; None if that may be of another scene.
 
-    ``names`` of the views are those of their photos, where photos show them. ``is_right``: the cameras see the
-    Gaussians; otherwise only photos with their names show that they belong to the scene.
+    Args:
+        names: Names of the views; those of their photos, where photos show them.
+        stored: The cameras of the file, or why it cannot be read, or None.
+        is_right: True: the cameras of the file see the Gaussians. False: they do not, so the file counts only if every
+            camera has the name of a view.
     """
     if not isinstance(stored, CameraFile):
         return None
@@ -488,21 +510,21 @@ def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | Non
 
 
 def explain_mismatch(proposal: Proposal, camera_file: CameraFile) -> SceneError:
-    """Return the error that no photo shows any view, with the photos that are missing."""
+    """Return the error that no photo shows any view; it names the photos that cannot be used."""
     views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
-    found = "none that shows one of them"
+    photos = "none that shows one of them"
     if has_other_shape(proposal, camera_file) and camera_file.source != ESTIMATED:
         width, height = image_size(next(proposal.pool[photo] for photo in proposal.named if photo is not None))
         shape = " (2 : 1 as 360-degree panoramas have)" if width == 2 * height else ""
-        found = f"{width} x {height}{shape}, of which no part shows one of them"
+        photos = f"{width} x {height}{shape}, of which no part shows one of them"
     faults = [fault for fault in proposal.faults if fault is not None]
     reasons = f" ({list_some(faults, '; ')})" if faults else ""
-    problem = f"expected photos of {views}, found {found}{reasons}"
+    problem = f"expected photos of {views}, found {photos}{reasons}"
     return SceneError(proposal.folder, problem, "name their folder with --images")
 
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:
-    """Return a scene whose ``views`` have no photo: renders of its Gaussians replace them, and no pixel counts."""
+    """Return a scene with pictures of its Gaussians in place of the photos of ``views``, whose pixels do not count."""
     if not views or scene.images is None:
         return scene
     images, ids = scene.images.copy(), list(views)

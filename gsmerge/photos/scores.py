@@ -1,8 +1,9 @@
-"""Score the similarity of photos and pictures, in units of the noise of wrong pairs.
+"""Score how similar photos and pictures of views are, in units of the noise of wrong pairs.
 
-Two pictures are compared by the correlation of their local contrast at two sizes. Exposure, white balance and soft
-colours hardly change it. Fisher's z of the correlation has the same spread for all values. Nearly all pairs are wrong,
-so the median absolute deviation of all z is the noise of wrong pairs.
+A photo and a view are a wrong pair if the photo does not show the view. A photo and a picture are compared by the
+correlation of their local contrast at two sizes. Exposure, white balance and soft colours hardly change it. Fisher's z
+of a correlation has the same spread for all values. Nearly all pairs of a scene are wrong, so the median absolute
+deviation of all z is the noise of wrong pairs.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from gsmerge.photos.pictures import ViewPictures, fit_size
 from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
 
 SCORE_PIXELS = (24, 64)  # pixels of the longer side at which pictures are compared
-PICTURE_SPREADS = 6  # side of the picture in standard deviations of the local mean
-CUT_OFF_SPREADS = 2  # standard deviations at which the local mean is cut off
-NOISE_MARGIN = 5.0  # standard deviations of noise by which evidence must exceed the noise
+PICTURE_SPREADS = 6  # side of a picture, in standard deviations of the blur that gives the local mean
+CUT_OFF_SPREADS = 2  # standard deviations at which this blur is cut off
+NOISE_MARGIN = 5.0  # standard deviations of the noise above which a value is evidence
 
 
 def fisher_z(correlations: np.ndarray) -> np.ndarray:
@@ -47,10 +48,10 @@ def find_contrast(picture: np.ndarray, weight: np.ndarray | None = None, side: i
 
 @dataclass(frozen=True, eq=False)
 class _Filters:
-    """Contrast of the views at one size, in each orientation that a stored photo may have."""
+    """Contrast of v views at one size, in t orientations that a stored photo may have."""
 
     size: tuple[int, int]  # width and height of the photos that are multiplied with the filters
-    orientations: tuple[int, ...]  # t of those photos
+    orientations: tuple[int, ...]  # the t orientations
     products: np.ndarray  # [v·t,h·w·3] weight times contrast, normalised to length 1
     weights: np.ndarray  # [v·t,h·w]
     lengths: np.ndarray  # [v] of the products before they were normalised
@@ -69,12 +70,12 @@ class Comparer:
 
     @cached_property
     def _upright(self) -> list[_Filters]:
-        """Filters at each size for photos that are stored upright or upside down."""
+        """Filters at each size, for photos that are stored upright or upside down."""
         return [_make_filters(shown, (0, 2)) for shown in self._small]
 
     @cached_property
     def _sideways(self) -> list[_Filters]:
-        """Filters at each size for photos that are stored on their side."""
+        """Filters at each size, for photos that are stored on their side."""
         return [_make_filters(shown, (1, 3)) for shown in self._small]
 
     def measure_contrast(self) -> np.ndarray:
@@ -107,7 +108,7 @@ class Comparer:
 
 
 def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
-    """Make filters for photos that are stored turned by one of ``quarters``, quarter turns, plain or mirrored."""
+    """Make filters for photos that are stored turned by one of these numbers of quarter turns, mirrored or not."""
     orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
     products, weights, lengths = [], [], []
     for picture, weight in zip(small.pictures, small.weights, strict=True):
@@ -123,7 +124,7 @@ def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
 
 
 def _correlate(photos: Sequence[np.ndarray], filters: _Filters) -> np.ndarray:
-    """Correlate the contrast of photos with filters in all their orientations, ``[p,v·t]``."""
+    """Return the correlations ``[p,v·t]`` of the contrast of photos with all filters."""
     contrast = np.stack([find_contrast(shrink_pictures(photo[None], *filters.size)[0]) for photo in photos])
     products = matmul(filters.products, contrast.reshape(len(photos), -1).T)
     squares = matmul(filters.weights, (contrast * contrast).sum(-1).reshape(len(photos), -1).T)
@@ -131,9 +132,9 @@ def _correlate(photos: Sequence[np.ndarray], filters: _Filters) -> np.ndarray:
 
 
 def measure_noise(z_scores: np.ndarray, least: float) -> tuple[np.ndarray, float]:
-    """Return the median ``[v]`` of each view's scores ``[v,...]``, and the standard deviation of all scores about it.
+    """Return the median ``[v]`` of each view's z ``[v,...]``, and the standard deviation of all z about these medians.
 
-    Both are robust and ignore NaN. ``least`` is the smallest standard deviation that is returned.
+    The deviation is estimated from the median absolute deviation, and is at least ``least``. NaN are ignored.
     """
     flat = z_scores.reshape(len(z_scores), -1)
     middle = np.array([_median_of_known(scores) for scores in flat], flat.dtype)
@@ -141,7 +142,7 @@ def measure_noise(z_scores: np.ndarray, least: float) -> tuple[np.ndarray, float
 
 
 def _median_of_known(scores: np.ndarray) -> float:
-    """Return the median of ``scores [n]`` that are not NaN; 0 without any, as for views without Gaussians."""
+    """Return the median of the ``scores [n]`` that are not NaN; 0 if all are, as for views without Gaussians."""
     known = scores[~np.isnan(scores)]
     return median(known) if len(known) else 0.0
 
@@ -164,6 +165,7 @@ def signed_ranks(gains: np.ndarray) -> float:
 def stands_out(gains: np.ndarray) -> bool:
     """Return True if gains ``[n]`` are above zero by more than :data:`NOISE_MARGIN` standard deviations of their noise.
 
-    The gains must be held out: their views, or their parts of views, were not used to fit the change.
+    The gains must be held out: the change that causes them was fitted without the views, or the parts of views, in
+    which they are measured.
     """
     return signed_ranks(gains) > NOISE_MARGIN

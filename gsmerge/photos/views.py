@@ -1,4 +1,7 @@
-"""Choose views: given, held out (the paper's rule, supplement A, "View sampling"), and scored; select their cameras."""
+"""Choose the views of an input, held-out views (as the paper does: supplement A, "View sampling") and scored views.
+
+Also select the cameras and the Gaussians of chosen views.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,13 @@ import numpy as np
 
 from gsmerge.types import PER_PIXEL, Cameras, Pixels, Scene, SceneT
 
-MAX_SCORED_VIEWS = 24  # most scored views of a scene if a decision depends on the score
-REPORT_VIEWS = 8  # most scored views if only the report needs the score
-BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of a scene with one part for each view
+MAX_SCORED_VIEWS = 24  # most views of a scene that are scored if a decision depends on the score
+REPORT_VIEWS = 8  # most views that are scored if only the report needs the score
+BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of a scene that have an entry for each view
 
 
 def even_views(num_views: int, count: int) -> list[int]:
-    """Return ``count`` view ids at equal intervals, first and last included (the middle one for ``count = 1``)."""
+    """Return ``count`` view ids at equal intervals, with the first and the last; the middle one for ``count = 1``."""
     if not 1 <= count <= num_views:
         raise ValueError(f"views: expected 1 to {num_views}, got {count}")
     if count == 1:
@@ -25,22 +28,24 @@ def even_views(num_views: int, count: int) -> list[int]:
 
 
 def scored_views(num_views: int) -> list[int]:
-    """Return view ids for scoring a whole scene: all, or ``MAX_SCORED_VIEWS`` evenly spaced views.
+    """Return the ids of the views on which a whole scene is scored: all, or ``MAX_SCORED_VIEWS`` evenly spaced ones.
 
-    The time to render the unmerged input is proportional to views and Gaussians; with all views it would be most of a
-    run.
+    The unmerged input is rendered in each of them. With all views of a large scene this would take most of a run.
     """
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
 
 def pick_views(num_views: int, max_count: int) -> list[int]:
-    """Return at most ``max_count`` evenly spread view ids, if possible without the first and the last view."""
+    """Return at most ``max_count`` evenly spread view ids, without the first and the last view if possible."""
     count = min(num_views, max_count)
     return [int((i + 0.5) * num_views / count) for i in range(count)]
 
 
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
-    """Return, for each pair of consecutive ``contexts``, the index of the candidate nearest to their middle, if any."""
+    """Return the index of the candidate nearest to the middle of each two consecutive ``contexts``.
+
+    Both are positions along the capture. Two contexts without a candidate between them are left out.
+    """
     midpoints = []
     for low, high in pairwise(sorted(contexts)):
         inside = [i for i, position in enumerate(candidates) if low < position < high]
@@ -50,7 +55,7 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
 
 
 def camera_kinds(cameras: Cameras) -> np.ndarray:
-    """Number the cameras ``[c]`` from 0, with equal numbers for equal poses and intrinsics."""
+    """Return a number ``[c]`` from 0 on for each camera; cameras with equal poses and intrinsics share a number."""
     rows = np.concatenate([cameras.viewmats.reshape(-1, 16), cameras.Ks.reshape(-1, 9)], 1)
     numbers = [tuple(row) for row in rows.tolist()]
     kinds = {kind: i for i, kind in enumerate(sorted(set(numbers)))}
@@ -58,9 +63,9 @@ def camera_kinds(cameras: Cameras) -> np.ndarray:
 
 
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
-    """Return the ids of distinct views, which repeat no earlier view, and for every view its index among these.
+    """Return the ids of distinct views, which equal no earlier view, and for every view which of these it equals.
 
-    A view repeats another if camera, photo and Gaussians are equal. Then both have the same index.
+    The second list has indices into the first. Two views are equal if camera, photo, masks and Gaussians are.
     """
     kinds = camera_kinds(scene.cameras)
     distinct, indices = list[int](), list[int]()
@@ -86,9 +91,10 @@ def _equal_views(scene: Scene, first: int, second: int) -> bool:
 
 
 def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
-    """Return the scene with only the views ``view_ids``, and only their Gaussians if views have Gaussians of their own.
+    """Return the scene with only the views ``view_ids``.
 
-    Otherwise all Gaussians stay, and their pixels are unknown.
+    If views have Gaussians of their own, only the Gaussians of these views stay. Otherwise all Gaussians stay, and
+    their pixels are unknown.
     """
     ids = list(view_ids)
     fields = {name: array[ids] for name, array in vars(scene).items() if name in BY_VIEW and array is not None}
@@ -102,7 +108,7 @@ def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
 
 
 def take_rows(scene: SceneT, rows: np.ndarray) -> SceneT:
-    """Return the scene with only the Gaussians ``rows [m]``, ascending; pixels of dropped Gaussians show none."""
+    """Return the scene with only the Gaussians ``rows [m]``, ascending; the pixels of all others show no Gaussian."""
     filled = None if scene.filled is None else scene.filled[rows]
     reduced = replace(scene, gaussians=scene.gaussians[rows], filled=filled, pixels=None)
     if not scene.has_own_pixels:
@@ -119,7 +125,7 @@ def in_float64(cameras: Cameras) -> Cameras:
 
 
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """Resize the cameras' images, and scale their intrinsics to match."""
+    """Set the size of the cameras' images, and scale their intrinsics to match."""
     scale = np.array([width / cameras.width, height / cameras.height, 1.0], cameras.Ks.dtype)
     return replace(cameras, Ks=cameras.Ks * scale[:, None], width=width, height=height)
 

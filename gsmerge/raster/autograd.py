@@ -18,7 +18,10 @@ from gsmerge.types import Cameras, Gaussians
 
 
 class _Render(torch.autograd.Function):
-    """Render images, alphas and optional depths (without gradient) from tensors of Gaussians and view matrices."""
+    """Render images, alphas and, if requested, depths from tensors of Gaussians and view matrices.
+
+    Depths have no gradient.
+    """
 
     @staticmethod
     def forward(
@@ -71,7 +74,7 @@ class _Render(torch.autograd.Function):
 
 
 def _add_view(totals: list[Array], grads: Gradients, color_grads: ColorGradients) -> None:
-    """Add the gradients of one view to ``totals``, the gradients of all Gaussians in the order of their fields."""
+    """Add the gradients of one view to ``totals``, which have the gradients of all Gaussians, field by field."""
     columns = [
         grads.means + color_grads.means,
         grads.quats,
@@ -88,7 +91,7 @@ def _add_view(totals: list[Array], grads: Gradients, color_grads: ColorGradients
 def render_tensors(
     gaussians: Gaussians, cameras: Cameras, background: Array, *, with_depths: bool, **options: Any
 ) -> Rendering:
-    """Render tensors on the CPU with a backward pass; see :func:`gsmerge.render`."""
+    """Render tensors on the CPU so that images and alphas are differentiable; see :func:`gsmerge.render`."""
     tensors = (*vars(gaussians).values(), cameras.viewmats)
     cameras = replace(cameras, viewmats=cameras.viewmats.detach())
     drawn = _Render.apply(cameras, background, options, with_depths, *tensors)

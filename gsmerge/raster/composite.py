@@ -51,14 +51,14 @@ def blend(tiled: TiledView, colors: Array, background: Array) -> tuple[Array, Ar
 
 
 def depth_colors(tiled: TiledView, farthest: float = np.inf) -> Array:
-    """Return the depths of the Gaussians of a view, at most ``farthest``, as colours ``[m,3]``."""
+    """Return the depths of the Gaussians of a view as colours ``[m,3]``; larger depths become ``farthest``."""
     return np.repeat(np.minimum(tiled.depths, np.float32(farthest))[:, None], 3, 1)
 
 
 def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Array]:
-    """Blend the mean depth ``[h,w]`` of a view; also return the transmittance ``[h,w]``.
+    """Return the mean depth ``[h,w]`` of the blended Gaussians of a view, and the transmittance ``[h,w]``.
 
-    Depths of Gaussians are clipped at ``farthest``.
+    Larger depths than ``farthest`` become ``farthest``.
     """
     blended, transmittance = blend(tiled, depth_colors(tiled, farthest), np.zeros(3, np.float32))
     min_opacity = 1e-6  # blended depths are divided by the opacity of their pixel, or by this if it is smaller
@@ -68,9 +68,9 @@ def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Arr
 def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
     """Blend the Gaussians of a view front to back into an image.
 
-    ``colors [n,3]`` of all Gaussians may be negative. By default the spherical harmonics are evaluated for this view,
-    and their colours are clipped at 0. ``background`` has 1 or 3 numbers. Returns the image ``[h,w,3]`` and the
-    remaining transmittance ``[h,w]``, float32. Raises ValueError for other shapes.
+    ``colors [n,3]`` are those of all Gaussians, and may be negative. By default the spherical harmonics are evaluated
+    for this view, and their colours are clipped at 0. ``background`` has 1 or 3 numbers. Returns the image ``[h,w,3]``
+    and the remaining transmittance ``[h,w]``, float32. Raises ValueError for other shapes.
     """
     if colors is None:
         return blend(tiled, view_colors(tiled), background_color(background))
@@ -80,7 +80,7 @@ def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLi
 
 
 def splat_adjoint(tiled: TiledView, image: Array) -> Array:
-    """Sum, for each Gaussian, its blending weights times ``image [h,w,c]`` over the pixels; return ``[n,c]`` float32.
+    """Return, for each Gaussian, the sum ``[n,c]`` float32 of its blending weights times ``image [h,w,c]``.
 
     This map is the transpose of :func:`composite` (without background), which maps colours linearly to images. Four
     channels cost little more than one. Raises ValueError unless the image has the size of the view.
@@ -102,25 +102,26 @@ def splat_adjoint(tiled: TiledView, image: Array) -> Array:
 
 
 def survey(tiled: TiledView, colors: Array | None = None) -> tuple[Array, Array, Array]:
-    """Return the image of :func:`composite` over black, and the sums and maxima ``[m]`` of :func:`contributions`.
+    """Draw a view over black, and measure the contributions of its Gaussians in the same pass.
 
-    ``colors [n,3]`` are as in :func:`composite`.
+    Returns the image ``[h,w,3]`` of :func:`composite`, and the sum ``[m]`` and the maximum ``[m]`` of the blending
+    weights of each Gaussian of ``tiled.ids``. ``colors [n,3]`` are as in :func:`composite`.
     """
-    drawn = view_colors(tiled) if colors is None else np.ascontiguousarray(colors.take(tiled.ids, 0), np.float32)
+    own_colors = view_colors(tiled) if colors is None else np.ascontiguousarray(colors.take(tiled.ids, 0), np.float32)
     image, totals = np.empty((tiled.height, tiled.width, 3), np.float32), np.zeros((len(tiled.ids), 2), np.float32)
-    kernels.survey(*tiled.lists, drawn, image, totals)
+    kernels.survey(*tiled.lists, own_colors, image, totals)
     return image, totals[:, 0], totals[:, 1]
 
 
 def contributions(tiled: TiledView) -> tuple[Array, Array]:
-    """Return the sum (pixels) and the maximum ``[n]`` float32 of each Gaussian's blending weights; 0 if unseen."""
+    """Return the sum ``[n]`` (pixels) and the maximum ``[n]`` of each Gaussian's blending weights; 0 if unseen."""
     mass, peak = np.zeros((2, len(tiled.splats)), np.float32)
     mass[tiled.ids], peak[tiled.ids] = list_contributions(tiled)
     return mass, peak
 
 
 def list_contributions(tiled: TiledView) -> Array:
-    """Return :func:`contributions` for the listed Gaussians alone, ``[2,m]``: the sums, and the maxima."""
+    """Return the sums and maxima ``[2,m]`` of :func:`contributions` for the Gaussians ``tiled.ids`` alone."""
     totals = np.zeros((len(tiled.ids), 2), np.float32)
     kernels.contributions(*tiled.lists, tiled.height, tiled.width, totals)
     return totals.T
@@ -151,7 +152,7 @@ class Rendering(ArrayFields):
         return f"Rendering({count} of {width} x {height}{'' if self.depths is None else ', depths'})"
 
     def _repr_png_(self) -> bytes | None:
-        """Encode the first views, side by side, as the picture that a notebook shows."""
+        """Encode the first views, side by side, as the PNG that a notebook shows; None without views."""
         if len(self.images) == 0:
             return None
         notebook_views = 4  # number of a rendering's views that a notebook shows
@@ -160,9 +161,10 @@ class Rendering(ArrayFields):
 
 
 def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
-    """Return splats relative to the cameras' mean centre, and viewmats and intrinsics in float64.
+    """Return the Gaussians as splats, and the viewmats and the intrinsics of the cameras in float64.
 
-    The centre is subtracted in float64, so that scenes in geographic coordinates keep their detail.
+    The origin of the splats is the cameras' mean centre. It is subtracted in float64, so that scenes in geographic
+    coordinates keep their detail.
     """
     cameras = cameras.numpy()
     origin = cameras.centres.astype(np.float64).mean(0) if len(cameras) else np.zeros(3)
@@ -176,7 +178,10 @@ def draw_views(
     with_depths: bool,
     first_view: int = 0,
 ) -> Rendering:
-    """Tile and draw all views, numbered from ``first_view``; ``shape`` is (views, height, width)."""
+    """Draw the views from ``first_view`` on; ``shape`` is (number of views, height, width).
+
+    ``tile_one`` tiles the view of a number.
+    """
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.empty((*shape, 1), np.float32) if with_depths else None
 

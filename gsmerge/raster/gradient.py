@@ -1,6 +1,6 @@
-"""Compute gradients of a loss on the image of a view with respect to its Gaussians.
+"""Compute the gradients of a loss on the image of a view with respect to its Gaussians.
 
-:func:`gsmerge.render` is differentiable with the same kernels. Results do not depend on the number of threads.
+:func:`gsmerge.render` uses the same kernels for its gradients. Results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gsmerge.kernels.raster.project import BLOCK, POSE, SUMS, project_backward
 from gsmerge.raster.tiled_view import Array, TiledView, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-# Least number of intersections or Gaussians per thread. It is higher in the forward pass, which is faster per item
+# Least number of intersections or Gaussians per thread. The forward pass is faster per item, and has a higher one
 MIN_PER_THREAD = 1 << 12
 
 
@@ -26,7 +26,7 @@ class Gradients:
     """Gradients of a loss with respect to the Gaussians of a view."""
 
     ids: Array  # [m] int32, ascending: the Gaussians of the rows; all other Gaussians have a gradient of zero
-    means: Array  # [m,3] float32, through geometry only; color_gradients adds the part through the viewing direction
+    means: Array  # [m,3] float32, through geometry only; ColorGradients has the part through the viewing direction
     quats: Array  # [m,4] float32, with respect to the quaternions as stored, which may have any length
     scales: Array  # [m,3] float32, with respect to linear scales
     opacities: Array  # [m] float32
@@ -49,8 +49,8 @@ class ColorGradients:
     means: Array  # [m,3] float32, through the viewing direction only
 
 
-def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
-    """Split Gaussians into ranges for the threads; each range consists of whole blocks of the kernels."""
+def _block_ranges(count: int, threads: int) -> list[tuple[int, int]]:
+    """Split ``count`` Gaussians into ranges for the threads that consist of whole blocks of the kernels."""
     num_blocks = -(-count // BLOCK)
     num = max(1, min(threads, count // MIN_PER_THREAD))
     edges = [BLOCK * (num_blocks * i // num) for i in range(num)] + [count]
@@ -68,11 +68,11 @@ def gradients_of(
 ) -> Gradients:
     """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made of a view.
 
-    All arrays are float32 and contiguous. ``image [h,w,3]``, with its background, and ``transmittance [h,w]`` are the
-    results of ``composite``. ``colors [m,3]`` are the colours of the view's Gaussians. ``grad_image [h,w,3]`` and
-    ``grad_left [h,w]`` (None: zero) are the gradients of the loss with respect to image and transmittance. The
-    gradient of alpha is zero where alpha is clamped at 0.99. Thresholds that decide whether a Gaussian is drawn have no
-    gradient.
+    All arrays are float32 and contiguous. ``colors [m,3]`` are the colours of the view's Gaussians. ``image [h,w,3]``,
+    with its background, and ``transmittance [h,w]`` are the results of ``composite``. ``grad_image [h,w,3]`` and
+    ``grad_left [h,w]`` are the gradients of the loss with respect to these two; without ``grad_left`` the second is
+    zero. ``with_viewmat`` also asks for the gradient of the view matrix. The gradient of alpha is zero where alpha is
+    clamped at 0.99. Thresholds that decide whether a Gaussian is drawn have no gradient.
     """
     m, splats = len(tiled.ids), tiled.splats
     slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
@@ -95,15 +95,15 @@ def gradients_of(
 
     with use_threads() as threads:
         parallel_map(blend_tiles, tile_ranges(tiled, threads, MIN_PER_THREAD))
-        parallel_map(project, _blocks(m, threads))
+        parallel_map(project, _block_ranges(m, threads))
     viewmat = None if poses is None else viewmat_gradient(poses, splats.origin)
     return Gradients(tiled.ids, means, quats, scales, opacities, color_sums, viewmat)
 
 
 def viewmat_gradient(poses: Array, origin: Array) -> Array:
-    """Sum the gradients ``[blocks,POSE]`` of :func:`project_backward` to the gradient ``[4,4]`` float64 of the viewmat.
+    """Return the gradient ``[4,4]`` float64 of the view matrix from the sums ``[blocks,POSE]`` of the kernel.
 
-    ``origin [3]`` is the origin of the splats.
+    The kernel is :func:`project_backward`. ``origin [3]`` is the origin of the splats.
     """
     pose, viewmat = poses.sum(0, dtype=np.float64), np.zeros((4, 4))
     viewmat[:3, 3] = pose[9:]
@@ -117,16 +117,15 @@ def color_gradients(
     """Return the gradients of a loss through the spherical harmonics of the Gaussians of a view.
 
     ``grad_colors [m,3]`` are :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours; no gradient passes
-    where they are clipped at 0. ``used`` is a result that is no longer needed. Its memory is reused if it has the same
-    number of coefficients and enough rows, since new memory costs a quarter of the time or more. The gradient
-    of the eye is minus the sum of the gradients of the means.
+    where they are clipped at 0. ``used`` is an earlier result that is no longer needed. Its memory is reused if it has
+    the same number of coefficients and enough rows, since new memory costs a quarter of the time or more.
     """
     m, splats = len(tiled.ids), tiled.splats
-    rest = splats.shN.shape[1:]
-    if used is not None and len(used.ids) >= m and used.shN.shape[1:] == rest:
+    shape_N = splats.shN.shape[1:]
+    if used is not None and len(used.ids) >= m and used.shN.shape[1:] == shape_N:
         sh0, shN, means = used.sh0[:m], used.shN[:m], used.means[:m]
     else:
-        sh0, shN, means = (np.empty((m, *shape), np.float32) for shape in ((1, 3), rest, (3,)))
+        sh0, shN, means = (np.empty((m, *shape), np.float32) for shape in ((1, 3), shape_N, (3,)))
     with use_threads() as threads:
         parallel_map(
             lambda span: sh.view_colors_backward(
@@ -138,14 +137,14 @@ def color_gradients(
 
 
 def pose_gradient(tiled: TiledView, gradients: Gradients, color_grads: ColorGradients | None = None) -> Array:
-    """Return the gradient ``[4,4]`` float64 with respect to the view matrix.
+    """Return the gradient ``[4,4]`` float64 of a loss with respect to the view matrix.
 
-    It passes through the geometry and, if ``color_grads`` is given, through the colours.
+    It is that through the geometry and, with ``color_grads``, also through the colours.
     """
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
     if color_grads is not None:
-        # the eye is -R^T t, and moves against the means
+        # The eye is -R^T t. Only its position relative to the means counts, so its gradient is minus the sum of theirs
         eye = -color_grads.means.sum(0, dtype=np.float64)
         viewmat[:3, :3] -= np.outer(tiled.viewmat[:3, 3], eye)
         viewmat[:3, 3] -= matmul(tiled.viewmat[:3, :3], eye)

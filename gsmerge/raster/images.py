@@ -1,4 +1,4 @@
-"""Render Gaussians into every camera, and compute blending weights, depths and tile lists of a scene's views."""
+"""Render Gaussians into every camera, or tile every view of a scene."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from gsmerge.types import Cameras, Gaussians, Scene
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.arrays import Array, like
 
-ONE_AT_A_TIME = 4_000_000  # Gaussians; larger scenes tile one view at a time, since a tiled view takes as much memory
+# Gaussians. Larger scenes tile one view at a time, since a tiled view takes about as much memory as the Gaussians
+ONE_AT_A_TIME = 4_000_000
 BAND_PIXELS = 1 << 22  # largest number of pixels drawn at once; larger images are drawn in bands to save memory
 
 
 def _needs_gradient(gaussians: Gaussians, cameras: Cameras) -> bool:
+    """Return whether some tensor of the Gaussians or of the cameras' poses requires a gradient."""
     import torch
 
     return torch.is_grad_enabled() and any(t.requires_grad for t in (*vars(gaussians).values(), cameras.viewmats))
@@ -78,7 +80,7 @@ def render(
 
         drawn = render_tensors(gaussians, cameras, background_rgb, with_depths=with_depths, **options)
     else:
-        tile_one = _tiler(gaussians, cameras, options)
+        tile_one = _make_tiler(gaussians, cameras, options)
         drawn = draw_views(tile_one, (len(cameras), cameras.height, cameras.width), background_rgb, with_depths)
     if not tensors:
         return drawn
@@ -96,14 +98,14 @@ def render_in_batches(
     convert: Callable[[np.ndarray], np.ndarray] = np.asarray,
     columns: Sequence[tuple[int, int]] | None = None,
 ) -> Iterator[np.ndarray]:
-    """Yield the images ``[h,w,3]`` of :func:`render`, equal to the bit, each after ``convert``.
+    """Yield the images ``[h,w,3]`` that :func:`render` makes, equal to the bit, each after ``convert``.
 
     At most ``at_once`` images are in memory. Large images are drawn and converted in bands, so ``convert`` has to work
-    pixel by pixel. ``columns`` gives, for each image, the first and last + 1 column of pixels to draw. Tiles outside
+    pixel by pixel. ``columns`` has, for each image, the first and last + 1 column of pixels to draw. Tiles outside
     these columns may show the background only.
     """
     background_rgb = background_color(background)
-    tile_one = _tiler(gaussians, cameras, {"near": near}, columns)
+    tile_one = _make_tiler(gaussians, cameras, {"near": near}, columns)
     lines, band_lines = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
     if lines > band_lines:
         bands = [(first_line, min(first_line + band_lines, lines)) for first_line in range(0, lines, band_lines)]
@@ -118,10 +120,13 @@ def render_in_batches(
         yield from map(convert, drawn.images)
 
 
-def _tiler(
+def _make_tiler(
     gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any], columns: Sequence[tuple[int, int]] | None = None
 ) -> Callable[..., TiledView]:
-    """Prepare the Gaussians for cameras, and return a function that tiles a view, or a band of it, by its number."""
+    """Prepare the Gaussians for cameras, and return the function ``tile_one(view, band)`` that tiles a view.
+
+    ``band`` is that of :func:`tile_view`, and ``columns`` are those of :func:`render_in_batches`.
+    """
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
     spans = None if columns is None else [(left // TILE, -(-right // TILE)) for left, right in columns]  # of tiles
 
@@ -137,19 +142,19 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Seque
     splats, cameras = make_splats(scene.gaussians), scene.cameras
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
-    def one_view(view: int) -> None:
+    def tile_and_use(view: int) -> None:
         use(view, tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR_PLANE))
 
     view_ids = range(len(scene)) if views is None else views
     if len(splats) <= ONE_AT_A_TIME:
-        parallel_map(one_view, view_ids)
+        parallel_map(tile_and_use, view_ids)
         return
     for view in view_ids:
-        one_view(view)
+        tile_and_use(view)
 
 
 def thin_out(gaussians: Gaussians, count: int) -> Gaussians:
-    """Sample every k-th Gaussian, at most ``count``, and enlarge the samples to about the area of all together."""
+    """Sample every k-th Gaussian, at most ``count``, and enlarge the samples so that they cover about the same area."""
     step = max(1, -(-len(gaussians) // count))
     sample = gaussians[::step]
     return replace(sample, scales=sample.scales * math.sqrt(step))

@@ -11,10 +11,10 @@ from gsmerge.kernels.pictures import compare_windows
 from gsmerge.values.arrays import Array, as_array
 
 WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviation, pixels
-INNER = (slice(WINDOW // 2, -(WINDOW // 2)), slice(WINDOW // 2, -(WINDOW // 2)))  # centres of windows in the image
+INNER = (slice(WINDOW // 2, -(WINDOW // 2)), slice(WINDOW // 2, -(WINDOW // 2)))  # pixels that are centres of windows
 C1, C2 = 0.01**2, 0.03**2  # stabilisers of SSIM (K1 = .01, K2 = .03) for a data range of 1
 MAX_LOSS = 0.5  # dB of PSNR that a result may lose against its input without a warning
-SAMPLE_LOSS = 1.0  # dB by which a loss on a sample of photos may be wrong; on fifteen captures it is by .9 dB at most
+SAMPLE_LOSS = 1.0  # dB by which a loss that is measured on a sample may be wrong; at most .9 dB on fifteen captures
 MAX_PSNR = 120.0  # dB that replace the infinite PSNR of equal pictures
 POOR_PSNR = 30.0  # dB of PSNR between a result and its input; below it their views look different
 
@@ -45,10 +45,10 @@ def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
 
 
 def psnr_within(image: Array, reference: Array, masks: Sequence[Array | None]) -> list[float]:
-    """Return the :func:`psnr` (dB) within each of the ``masks [h,w]``; None: all pixels."""
+    """Return the :func:`psnr` (dB) within each of the ``masks [h,w]``, where None stands for all pixels."""
     first, second = image_pair(image, reference)
-    chosen = [None if mask is None else pixel_mask(mask, first) for mask in masks]
-    pairs = ((_select(first, mask), _select(second, mask)) for mask in chosen)
+    checked = [None if mask is None else pixel_mask(mask, first) for mask in masks]
+    pairs = ((_select(first, mask), _select(second, mask)) for mask in checked)
     means = [float((np.subtract(*pair, dtype=np.float64) ** 2).mean()) for pair in pairs]
     return [-10 * float(log10(error)) if error > 0 else float("inf") for error in means]
 
@@ -60,7 +60,7 @@ def _select(values: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
 
 
 def decibels(error: float) -> float:
-    """Convert a mean squared error of values in [0, 1] to PSNR, dB; at most 120."""
+    """Convert a mean squared error of values in [0, 1] to a PSNR (dB) of at most 120."""
     return -10 * float(log10(max(error, 1e-12)))
 
 
@@ -70,13 +70,16 @@ def psnr_words(psnr: float) -> str:
 
 
 def psnr_figure(psnr: float, choices: Mapping[str, object]) -> str:
-    """Write the PSNR of a scene's own views as exactly as it is known, by the ``choices`` of a report."""
+    """Write the PSNR (dB) of a scene's own views: with two digits if all views were scored, otherwise as an estimate.
+
+    The ``choices`` of a report say whether they were.
+    """
     return f"{psnr:.2f} dB" if choices.get("scored_all") else f"about {psnr:.1f} dB"
 
 
 def is_worse(before: float | None, after: float | None, spare: float = 0.0) -> bool:
-    """Return whether a PSNR (dB) falls by more than ``MAX_LOSS`` less a ``spare``; False if one of them is None."""
-    # the difference of infinities is NaN
+    """Return whether a PSNR (dB) falls by more than ``MAX_LOSS - spare``; False if one of the two is None."""
+    # False for two infinities, too, whose difference is NaN
     return before is not None and after is not None and before - after > MAX_LOSS - spare
 
 
@@ -119,9 +122,10 @@ def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
 
 
 def ssim_within(image: Array, reference: Array, masks: Sequence[Array | None]) -> list[float | None]:
-    """Return the :func:`ssim` within each of the ``masks [h,w]``; None: all pixels. Windows are compared once.
+    """Return the :func:`ssim` within each of the ``masks [h,w]``, where None stands for all pixels.
 
-    It is None where there is no window: for a small image, or a mask without the centre of a window.
+    A result is None if there is no window: for a small image, or a mask without the centre of a window. All masks take
+    one comparison of the images.
     """
     first, second = image_pair(image, reference)
     if min(first.shape[:2]) < WINDOW:

@@ -23,10 +23,12 @@ Score = TypeVar("Score")
 
 LEAST_OPACITY = 1 / 255  # rasterizers draw no smaller opacity
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
-# Gaussians. Larger scenes tile one view at a time, since a tiled view takes as much memory; threads share the view
+# Gaussians. Larger scenes are rendered one view at a time, since a tiled view takes about as much memory as the
+# Gaussians. Threads then share the view
 ERRORS_ONE_AT_A_TIME = 400_000
-# The scored tiles of a sample are shifted by TILE_STEP columns, a prime, from a line to the next. A sample has at least
-# LEAST_TILES of a view, so small views are scored whole: with 48, six views of 256 x 480 said a gain 1.0 dB too large
+# From a line of tiles to the next, the scored tiles of a sample are shifted by TILE_STEP columns, a prime. At least
+# LEAST_TILES of a view are scored, so small views are scored whole. With 48, a gain on six views of 256 x 480 was
+# measured 1.0 dB too large
 TILE_STEP, LEAST_TILES = 13, 100
 MASKED_WEIGHT = np.float32(0.1)  # weight of pixels outside masks; with a weight of 0 the Gaussians there would drift
 COVERED_TRANSMITTANCE = np.float32(0.5)  # transmittance below which a pixel counts as covered by Gaussians
@@ -36,17 +38,15 @@ WHOLE_SHARE = 0.98  # share of covered pixels from which on the whole view count
 class RenderScore(NamedTuple):
     """Score of one render against a photo."""
 
-    psnr: float  # dB over the scored pixels: pixels inside the mask, and inside the scored tiles
-    covered_psnr: (
-        float  # dB over the scored pixels that are covered; psnr from a share of WHOLE_SHARE on, NaN for share 0
-    )
+    psnr: float  # dB over the scored pixels, which are inside the photo's mask and inside the scored tiles
+    covered_psnr: float  # dB over the scored pixels that are covered; psnr if share >= WHOLE_SHARE, NaN if it is 0
     share: float  # share of the scored pixels that are covered
     covered: np.ndarray  # [h,w] bool, the scored pixels that are covered
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoScore:
-    """Mean score of renders against photos; see :class:`RenderScore`."""
+    """Mean of the scores of several renders; see :class:`RenderScore`."""
 
     psnr: float  # dB
     covered_psnr: float  # dB; NaN if no view has covered pixels
@@ -58,7 +58,7 @@ class PhotoScore:
 class Sample:
     """Pixels of a photo at equal distances: each ``stride``-th column and row from ``column`` and ``row`` on.
 
-    They form a smaller photo. Its camera projects to the centres of these pixels, with the low-pass of the full photo.
+    They form a smaller photo. Its camera projects to the centres of these pixels, with the low-pass of the whole photo.
     """
 
     stride: int = 1
@@ -78,13 +78,13 @@ WHOLE_PHOTO = Sample()
 class Photos:
     """V photos of one size, with their cameras and pixel weights."""
 
-    images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]; uint8 if the photos are larger than the grid, see image()
+    images: np.ndarray  # [v,h,w,3] float32 sRGB in [0, 1], or uint8 if photos are larger than the grid; see image()
     viewmats: np.ndarray  # [v,4,4] world to camera
     Ks: np.ndarray  # [v,3,3] intrinsics at this size
-    # Variance of the low-pass, square pixels of this size. It is the variance of the full-size image, scaled, so that
-    # a fit filters Gaussians as the final render does
+    # Variance of the low-pass, in square pixels of these photos. It is that of the full-size image, scaled, so that a
+    # fit filters Gaussians as the final render does
     eps2d: float
-    weights: np.ndarray | None = None  # [v,h,w] float32 of the pixels, in [0, 1]; None: all 1
+    weights: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in [0, 1]; None: all 1
     empty: np.ndarray | None = None  # [v,h,w] float32 share of each pixel that shows the background; None: 0
     importance: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in a fit; None: all 1
 
@@ -119,7 +119,7 @@ class Photos:
         return np.asarray(image + self.empty[view][sample.pixels][..., None] * background, np.float32)
 
     def camera(self, view: int, sample: Sample = WHOLE_PHOTO) -> dict[str, Any]:
-        """Return the arguments of :func:`gsmerge.raster.tile_view` for rendering into a photo, or a sample of it."""
+        """Return the arguments of :func:`gsmerge.raster.tile_view` for a view's photo, or a sample of it."""
         K, stride, offset = self.Ks[view], sample.stride, np.array([sample.column, sample.row])
         if stride > 1:  # column i of the sample is column stride * i + offset of the photo; both have centres at +0.5
             K = K / np.array([[stride], [stride], [1.0]])
@@ -154,7 +154,7 @@ def row_pictures(scene: Scene) -> np.ndarray:
 
 
 def scene_photos(scene: Scene, level: float = 1) -> Photos:
-    """Return the scene's photos with sides divided by ``level``, as area averages."""
+    """Return the scene's photos with their cameras, shrunk by area averages to sides divided by ``level``."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
     photos = photos_of(scene.images, scene.cameras, level)
@@ -162,14 +162,17 @@ def scene_photos(scene: Scene, level: float = 1) -> Photos:
 
 
 def with_pixel_values(photos: Photos, scene: Scene) -> Photos:
-    """Add the scene's pixel weights and importance to its photos, which may have any size."""
+    """Add the weights and the importance of the scene's pixels to its photos, which may have any size."""
     size = photos.width, photos.height
     important = None if scene.importance is None else shrink_pictures(scene.importance, *size)
     return replace(photos, weights=pixel_weights(scene.masks, *size), importance=important)
 
 
 def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
-    """Convert masks ``[v,h,w]`` to pixel weights ``[v,height,width]`` float32: 1 inside, ``MASKED_WEIGHT`` outside."""
+    """Convert masks ``[v,h,w]`` to pixel weights ``[v,height,width]``: 1 inside, ``MASKED_WEIGHT`` outside.
+
+    A pixel is inside if all of it is.
+    """
     if masks is None:
         return None
     size = width, height
@@ -178,7 +181,7 @@ def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarr
 
 
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
-    """Combine photos ``[v,h,w,3]`` with their cameras, with sides divided by ``level``, as area averages."""
+    """Combine photos ``[v,h,w,3]`` with their cameras; shrink them by area averages to sides divided by ``level``."""
     blank = blank_photos(cameras, level)
     return replace(blank, images=images if level == 1 else shrink_pictures(images, blank.width, blank.height))
 
@@ -195,7 +198,7 @@ def shrink_pictures(pictures: np.ndarray, width: int, height: int) -> np.ndarray
 
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
-    """Return black photos that take no memory, for their cameras; sides are divided by ``level``."""
+    """Return black photos of the cameras, which take no memory; sides are divided by ``level``."""
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     w, h = cameras.width, cameras.height
     width, height = max(1, round(w / level)), max(1, round(h / level))
@@ -215,12 +218,18 @@ def photo_errors(
     keep: Callable[[int], np.ndarray] | None = None,
     tiles: Callable[[int], np.ndarray | None] | None = None,
 ) -> list[Score]:
-    """Render Gaussians into the photos' cameras and score every render, several views at once.
+    """Render Gaussians into the photos' cameras, several views at once, and return the score of every render.
 
-    ``score`` is called with the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance ``[h,w]``.
-    The result is in the order of ``views``; None: all. ``near`` is in the unit of the Gaussians.
-    ``colors [n,3]`` replace the harmonics. ``keep(view)`` returns the mask ``[n]`` of the Gaussians to draw, and
-    ``tiles(view)`` the mask ``[tile_height,tile_width]`` of the tiles that must be complete; None: all.
+    Args:
+        gaussians: n Gaussians.
+        photos: The photos, whose cameras are used.
+        score: Called with the view, its render ``[h,w,3]`` float32, not clipped, and the transmittance ``[h,w]``.
+        views: The views, in the order of the result; None: all.
+        near: Near plane in the unit of the Gaussians.
+        colors: ``[n,3]`` that replace the harmonics.
+        keep: ``keep(view)`` returns the mask ``[n]`` of the Gaussians to draw; None: all.
+        tiles: ``tiles(view)`` returns the mask ``[tile_height,tile_width]`` of the tiles that must be complete; None:
+            all.
     """
     splats = gaussians if isinstance(gaussians, Splats) else make_splats(gaussians)
 
@@ -244,24 +253,25 @@ def score_photos(
     covered: Sequence[np.ndarray] | None = None,
     **settings: Any,
 ) -> PhotoScore:
-    """Score renders against the photos of ``views``, or one of ``every`` so many tiles; see :func:`photo_errors`.
+    """Score renders of Gaussians against the photos of ``views``.
 
-    ``covered`` is a mask ``[h,w]`` for each of the views. By default a pixel with an opacity of at least a half is
-    covered.
+    Of each ``every`` tiles one is scored, see :func:`scored_tiles`. ``covered`` has a mask ``[h,w]`` of the
+    covered pixels for each of the views. By default a pixel is covered if its opacity is above a half. ``settings`` are
+    options of :func:`photo_errors`.
     """
     masks = {} if covered is None else dict(zip(views, covered, strict=True))
 
     def tiles(view: int) -> np.ndarray | None:
         return scored_tiles(view, photos.width, photos.height, every)
 
-    def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> RenderScore:
-        return _score_view(image, masks.get(view, transmittance < COVERED_TRANSMITTANCE), photos, view, every)
+    def score_render(view: int, image: np.ndarray, transmittance: np.ndarray) -> RenderScore:
+        return _score_render(image, masks.get(view, transmittance < COVERED_TRANSMITTANCE), photos, view, every)
 
-    return _mean_score(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings))
+    return _average_scores(photo_errors(gaussians, photos, score_render, views, tiles=tiles, **settings))
 
 
-def _mean_score(scores: Sequence[RenderScore]) -> PhotoScore:
-    """Average the scores of views, each clipped at MAX_PSNR, so that a view with equal pictures does not dominate."""
+def _average_scores(scores: Sequence[RenderScore]) -> PhotoScore:
+    """Average the scores of views; each PSNR is at most MAX_PSNR, so that views with equal pictures do not dominate."""
     covered_psnrs = [min(score.covered_psnr, MAX_PSNR) for score in scores if score.share > 0]
     share = float(np.mean([score.share for score in scores]))
     mean = float(np.mean([min(score.psnr, MAX_PSNR) for score in scores]))
@@ -269,10 +279,10 @@ def _mean_score(scores: Sequence[RenderScore]) -> PhotoScore:
     return PhotoScore(mean, covered_mean, share, tuple(score.covered for score in scores))
 
 
-def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, every: int) -> RenderScore:
-    """Score a render ``[h,w,3]`` over all scored pixels and over ``covered [h,w]``; the render is clipped in place.
+def _score_render(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, every: int) -> RenderScore:
+    """Score a render ``[h,w,3]`` against a view's photo, over all scored pixels and over those in ``covered [h,w]``.
 
-    ``every`` is as in :func:`score_photos`.
+    The render is clipped in place. ``every`` is as in :func:`score_photos`.
     """
     mask = _scored_pixels(photos, view, every)
     covered = covered if mask is None else covered & mask
@@ -283,9 +293,9 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
 
 
 def _scored_pixels(photos: Photos, view: int, every: int) -> np.ndarray | None:
-    """Select the pixels ``[h,w]`` inside the view's mask and its scored tiles; None: all.
+    """Return the mask ``[h,w]`` of the pixels inside the photo's mask and inside the scored tiles; None: all pixels.
 
-    If no pixel is inside both, the mask alone selects; if the mask is empty, the tiles alone.
+    If no pixel is inside both, all pixels of the photo's mask are returned. If that is empty, those of the tiles are.
     """
     tiles = scored_tiles(view, photos.width, photos.height, every)
     in_tiles = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
@@ -297,9 +307,10 @@ def _scored_pixels(photos: Photos, view: int, every: int) -> np.ndarray | None:
 
 
 def scored_tiles(view: int, width: int, height: int, every: int) -> np.ndarray | None:
-    """Select one of ``every`` so many tiles of a view as a mask ``[tile_height,tile_width]``, more of a small one.
+    """Return the mask ``[tile_height,tile_width]`` of the tiles of a view that are scored; None: all tiles.
 
-    None: all tiles. The tiles are spread evenly, and are others in each view.
+    Of each ``every`` tiles one is scored. Of a small view more are, at least ``LEAST_TILES``. The tiles are spread
+    evenly, and differ from view to view.
     """
     tile_height, tile_width = -(-height // TILE), -(-width // TILE)
     every = min(every, tile_height * tile_width // LEAST_TILES)
@@ -310,5 +321,5 @@ def scored_tiles(view: int, width: int, height: int, every: int) -> np.ndarray |
 
 
 def render_photos(gaussians: Gaussians | Splats, photos: Photos, **settings: Any) -> list[np.ndarray]:
-    """Render every view ``[h,w,3]``, not clipped; ``settings`` are options of :func:`photo_errors`."""
+    """Return the render ``[h,w,3]`` of every view, not clipped; ``settings`` are options of :func:`photo_errors`."""
     return photo_errors(gaussians, photos, lambda _, image, __: image, **settings)

@@ -21,7 +21,8 @@ from gsmerge.values.arrays import distinct
 Array = NDArray[Any]
 
 THREAD_PIECE = 1 << 13  # least number of Gaussians or intersections per thread
-# Intersections of a view, and mean intersections per Gaussian. Above both, most Gaussians are hidden, so lists are cut
+# Intersections of a view, and mean intersections per Gaussian. Above both, most Gaussians are hidden. Then the list of
+# each tile ends at its last visible Gaussian
 CROWDED, CROWDED_EACH = 1 << 24, 16
 EPS2D = 0.3  # low-pass of the rasterizer, which widens Gaussians; square pixels of the full-size image
 WORLD_NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
@@ -51,7 +52,7 @@ class TiledView:
     """Gaussians projected into one view, sorted by depth and listed by tile."""
 
     splats: Splats
-    ids: Array  # [m] int32, ascending: the Gaussians that may touch the image; a few at its border may not
+    ids: Array  # [m] int32, ascending: the Gaussians that may touch the image; a few near its border do not
     conics: Array  # [m,8] float32, see gsmerge.kernels.raster.project
     depths: Array  # [m] float32, camera z
     flatten_ids: Array  # [intersections] int32 rows of `ids`, tile after tile, nearest first
@@ -71,8 +72,8 @@ class TiledView:
 
 
 def _spread_origin(means: Array) -> Array:
-    """Return zero, or the centre of Gaussians if they are too far from zero for float32."""
-    origin_sample = 4096  # least number of means, if there are as many, from which centre and spread are measured
+    """Return zero, or the centre of the means if they are too far from zero for float32."""
+    origin_sample = 4096  # least number of means, if there are as many, on which centre and spread are measured
     sample = means[:: max(1, len(means) // origin_sample)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
@@ -83,8 +84,8 @@ def _spread_origin(means: Array) -> Array:
     return centre if np.abs(centre).max() > far_origin * spread else np.zeros(3)
 
 
-def _shift(means: Array, origin: Array) -> Array:
-    """Subtract ``origin [3]`` from ``means [n,3]`` in float64 and round to float32."""
+def _shift_means(means: Array, origin: Array) -> Array:
+    """Subtract ``origin [3]`` from ``means [n,3]`` in float64, and round the result to float32."""
     shifted = np.empty(means.shape, np.float32)
     if means.dtype == np.float32:
         projection.shift_means(np.ascontiguousarray(means), np.ascontiguousarray(origin, np.float64), shifted)
@@ -103,12 +104,12 @@ def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats
     """
     gaussians = gaussians.numpy()
     zero = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
-    columns = vars(gaussians) | {"means": _shift(gaussians.means, zero) if zero.any() else gaussians.means}
+    columns = vars(gaussians) | {"means": _shift_means(gaussians.means, zero) if zero.any() else gaussians.means}
     return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}, origin=zero)
 
 
 def num_pieces(count: int, threads: int, least: int = THREAD_PIECE) -> int:
-    """Choose the number of pieces of work: up to four per thread, each with about ``least`` items or more."""
+    """Choose into how many pieces ``count`` items are split: up to four per thread, of ``least`` items or more."""
     return 1 if threads == 1 else max(1, min(4 * threads, count // least))
 
 
@@ -131,7 +132,7 @@ def camera_numbers(
     viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool,
     near: float = WORLD_NEAR_PLANE, far: float = FAR_PLANE,
 ) -> Array:  # fmt: skip
-    """Return the numbers of a camera in the order of the kernels."""
+    """Return a camera as the float32 numbers that the kernels read, in their order."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     spare_x, spare_y = SPARE_SHARE * width / fx, SPARE_SHARE * height / fy
     camera = np.zeros(projection.CAMERA, np.float32)
@@ -147,16 +148,19 @@ def camera_numbers(
 
 
 def _corner_sums(tiles: Array, tile_height: int, tile_width: int) -> Array:
-    """Count the True ``tiles`` above and to the left of each corner, ``[tile_height+1,tile_width+1]`` int32."""
+    """Count, for each corner of a tile, the True ``tiles`` above and to its left.
+
+    Returns ``[tile_height+1,tile_width+1]`` int32. ValueError if ``tiles`` have another shape.
+    """
     if tiles.shape != (tile_height, tile_width):
         raise ValueError(f"tiles: expected shape {[tile_height, tile_width]}, got {list(tiles.shape)}")
     return np.pad(tiles.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
 
 
-def _visible(
+def _find_visible(
     splats: Splats, opacities: Array, keep: Array | None, corner_sums: Array | None, camera: Array, threads: int
 ) -> Array:
-    """Return the ascending ids of the Gaussians that may touch the image, or its selected tiles."""
+    """Return the ascending ids of the Gaussians that may touch the image or, with ``corner_sums``, its chosen tiles."""
 
     def cull(span: tuple[int, int]) -> Array:
         rows, ids = slice(*span), np.empty(span[1] - span[0], np.int32)
@@ -178,7 +182,7 @@ def cache_line_rows(count: int, width: int) -> Array:
 
 
 def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, threads: int) -> tuple[Array, Array, Array]:
-    """Return conics, depths and tile boxes of the Gaussians ``ids``."""
+    """Return conics ``[m,8]``, depths ``[m]`` and boxes of tiles ``[m,4]`` of the Gaussians ``ids [m]``."""
     m = len(ids)
     conics, depths = cache_line_rows(m, projection.CONIC), np.empty(m, np.float32)
     boxes = np.empty((m, 4), np.int16)
@@ -199,17 +203,21 @@ def hides_most(num_intersections: int, num_visible: int) -> bool:
     return num_intersections > max(CROWDED, CROWDED_EACH * num_visible)
 
 
-def _bin(order: Array, boxes: Array, conics: Array, wanted: Array, threads: int) -> tuple[Array, Array]:
-    """Return the lists of the ``wanted [tile_height,tile_width]`` tiles and their starts; the other lists are empty."""
+def _list_by_tile(order: Array, boxes: Array, conics: Array, wanted: Array, threads: int) -> tuple[Array, Array]:
+    """List the Gaussians of each tile in their ``order`` of depth; return all lists in one array, and their starts.
+
+    Only ``wanted [tile_height,tile_width]`` tiles get a list; all others are empty. In crowded views, see
+    :func:`hides_most`, all tiles get one.
+    """
     # Boxes are gathered once in advance, 8 bytes each, since the loops below would wait for every cache miss
     boxes = boxes.view(np.uint64).reshape(-1).take(order).view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], *wanted.shape), spans))
     if hides_most(int(counts.sum()), len(order)):
-        return _bin_open(order, boxes, conics, wanted.shape[0], wanted.shape[1], threads)
+        return _list_open_tiles(order, boxes, conics, wanted.shape[0], wanted.shape[1], threads)
     totals, is_wanted = counts.sum(0), wanted.reshape(-1)
     isect_offsets = np.concatenate([[0], np.cumsum(totals * is_wanted)])
-    # the other lists stand behind these, and are cut off
+    # The lists of the other tiles are written behind these, and then cut off
     ends = np.where(is_wanted, isect_offsets[1:], isect_offsets[-1] + np.cumsum(totals * ~is_wanted))
     cursors = ends - totals + np.cumsum(counts, 0) - counts
     flatten_ids = np.empty(totals.sum(), np.int32)
@@ -222,10 +230,10 @@ def _bin(order: Array, boxes: Array, conics: Array, wanted: Array, threads: int)
     return flatten_ids[: isect_offsets[-1]], isect_offsets
 
 
-def _bin_open(
+def _list_open_tiles(
     order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
 ) -> tuple[Array, Array]:
-    """Return the tile lists of :func:`_bin`, each without the Gaussians behind its last visible one."""
+    """Return the lists of :func:`_list_by_tile`, each without the Gaussians behind its last visible one."""
     num = min(tile_height, 4 * threads)
     spans = [(tile_height * i // num, tile_height * (i + 1) // num) for i in range(num)]
 
@@ -244,6 +252,7 @@ def _bin_open(
 
 
 def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
+    """Raise ValueError for matrices of another shape, or a size or focal lengths that cannot be drawn."""
     if viewmat.shape != (4, 4) or K.shape != (3, 3):
         raise ValueError(f"expected a [4,4] view matrix and [3,3] K, got {list(viewmat.shape)} and {list(K.shape)}")
     if not (0 < width <= projection.MAX_SIZE and 0 < height <= projection.MAX_SIZE):
@@ -253,8 +262,11 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
         raise ValueError(f"expected positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
 
 
-def _convert_columns(splats: Splats, opacities: Array | None, keep: Array | None) -> tuple[Array, Array | None]:
-    """Convert opacities ``[n]`` (None: the splats' own) and the mask ``keep [n]`` to the types of the kernels."""
+def _convert_for_kernels(splats: Splats, opacities: Array | None, keep: Array | None) -> tuple[Array, Array | None]:
+    """Convert opacities ``[n]`` (None: the splats' own) and the mask ``keep [n]`` to the types of the kernels.
+
+    ValueError if they have another length than the splats.
+    """
     opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
     keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
     num_flags = len(splats) if keep is None else len(keep)
@@ -288,8 +300,8 @@ def tile_view(
     the Gaussians. Gaussians with a False ``keep [n]`` are left out.
 
     Tiles have 16 x 16 pixels. Only tiles with a True ``tiles [tile_height,tile_width]`` have to be complete. ``band``
-    gives the first and last + 1 line of tiles; the result is an image of these lines alone. ``columns`` gives the first
-    and last + 1 column of tiles; all other tiles are empty.
+    has the first and last + 1 line of tiles; the result is a view of these lines alone. ``columns`` has the first and
+    last + 1 column of tiles; all other tiles are empty.
 
     The size of the result depends on the number of visible Gaussians, not on n. Raises ValueError if a size or a number
     is out of range.
@@ -298,8 +310,8 @@ def tile_view(
     _check_view(viewmat, K, width, height)
     if not (0 < near < far and eps2d >= 0):
         raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
-    opacities, keep = _convert_columns(splats, opacities, keep)
-    local_viewmat = viewmat.copy()  # from the frame of the splats, whose zero is their origin
+    opacities, keep = _convert_for_kernels(splats, opacities, keep)
+    local_viewmat = viewmat.copy()  # from coordinates of the splats, whose zero is their origin
     local_viewmat[:3, 3] += matmul(local_viewmat[:3, :3], splats.origin)
     camera = camera_numbers(local_viewmat, K, width, height, eps2d, antialiased, near, far)
     tile_width, tile_height = -(-width // projection.TILE), -(-height // projection.TILE)
@@ -310,14 +322,14 @@ def tile_view(
         tiles[top:bottom, left:right] = True
     corner_sums = None if tiles is None else _corner_sums(tiles, tile_height, tile_width)
     with use_threads() as threads:
-        ids = _visible(splats, opacities, keep, corner_sums, camera, threads)
+        ids = _find_visible(splats, opacities, keep, corner_sums, camera, threads)
         conics, depths, boxes = _project(splats, opacities, ids, camera, threads)
         if is_part:
             boxes[:, :2] = boxes[:, :2].clip(left, right)
             boxes[:, 2:] = boxes[:, 2:].clip(top, bottom)
         order = depth_order(depths.view(np.uint32))
         wanted = np.ones((tile_height, tile_width), bool) if tiles is None else tiles
-        flatten_ids, isect_offsets = _bin(order, boxes, conics, wanted, threads)
+        flatten_ids, isect_offsets = _list_by_tile(order, boxes, conics, wanted, threads)
     eye, first_row = camera_centres(local_viewmat).astype(np.float32), top * projection.TILE
     return TiledView(
         splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width,

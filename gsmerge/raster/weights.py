@@ -1,7 +1,7 @@
 """Store the blending weights of a view as a sparse matrix, for stages that render one geometry many times.
 
-The image is W times the colours. W has one row per pixel and one column per Gaussian. With some twenty entries per
-pixel, a product takes a small share of the time of blending along the tile lists.
+The image is W times the colours. W has one row per pixel and one column per Gaussian. A row has some twenty entries, so
+a product takes a small share of the time of blending along the tile lists.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ViewWeights:
     ids: Array  # [m] int32: the Gaussians that may touch the image
     flatten_ids: Array  # [intersections] int32 rows of `ids`
     isect_offsets: Array  # [tiles + 1] int64 starts of the tiles' lists in `flatten_ids`
-    tile_width: int  # Tiles per row
+    tile_width: int  # tiles per row
     starts: Array  # [intersections + 1] int64 starts of the entries in `lanes` and `weights`
     lanes: Array  # uint8 pixel of each entry within its tile, row by row
     weights: Array  # float32 blending weight of each entry
@@ -45,9 +45,9 @@ def view_weights(tiled: TiledView) -> ViewWeights:
 
 
 def apply_transposed(view: ViewWeights, image: Array) -> Array:
-    """Multiply the transpose of W with ``image [h,w,c]``, up to four channels; return ``[m,c]`` float64.
+    """Multiply the transpose of W with an ``image [h,w,c]`` of up to four channels.
 
-    The rows of the result belong to ``view.ids``.
+    Returns ``[m,c]`` float64, with a row for each of ``view.ids``.
     """
     channels = image.shape[2]
     padded = np.zeros((view.height, view.width, kernels.LANES), np.float32)

@@ -18,10 +18,10 @@ from PIL import Image
 from gsmerge.errors import SceneError
 from gsmerge.io.image_names import is_clip
 from gsmerge.measure import clip
-from gsmerge.measure.preview import Picture
+from gsmerge.measure.preview import BytePicture
 
 
-def frames(count: int, height: int = 48, width: int = 64) -> Iterator[Picture]:
+def frames(count: int, height: int = 48, width: int = 64) -> Iterator[BytePicture]:
     """A red bar on grey that grows from the left."""
     for i in range(count):
         picture = np.full((height, width, 3), 90, np.uint8)
@@ -123,7 +123,7 @@ def test_a_folder_that_vanishes_is_not_blamed_on_opencv(before: int, tmp_path: P
     folder = tmp_path / "out"
     folder.mkdir()
 
-    def vanishing() -> Iterator[Picture]:
+    def vanishing() -> Iterator[BytePicture]:
         for done, picture in enumerate(frames(4)):
             if done == before:
                 shutil.rmtree(folder)
@@ -200,13 +200,13 @@ def test_an_interruption_does_not_wait_for_the_encoder(tmp_path: Path, monkeypat
     may_end, waited = Event(), list[bool]()
 
     class Writer:
-        def write(self, _: Picture) -> None:
+        def write(self, _: BytePicture) -> None:
             pass
 
         def release(self) -> None:
             waited.append(may_end.wait(20))
 
-    def interrupted() -> Iterator[Picture]:
+    def interrupted() -> Iterator[BytePicture]:
         yield from frames(3)
         raise KeyboardInterrupt
 

@@ -115,8 +115,8 @@ def test_scores_are_kept(views: np.ndarray, photos: list[np.ndarray]) -> None:
         return photos[photo]
 
     assigner = Assigner(lambda side: show(views, side), Candidates(read, VIEWS, lambda _: 0))
-    first = assigner.score([0, 2])
-    again = assigner.score([2, 0, 0])
+    first = assigner.score_in_views([0, 2])
+    again = assigner.score_in_views([2, 0, 0])
     assert sorted(reads) == [0, 2]
     np.testing.assert_array_equal(first.values[:, ::-1], again.values)
 
@@ -141,7 +141,7 @@ def test_parts_lie_elsewhere_where_others_do_not(
     photos: list[np.ndarray], pixels: Sequence[int], elsewhere: list[int]
 ) -> None:
     assigner, given = displaced(photos, pixels), {view: Assignment(view, 0) for view in range(VIEWS)}
-    assert [view for view in given if assigner.lies_elsewhere(view, given)] == elsewhere
+    assert [view for view in given if assigner.is_displaced(view, given)] == elsewhere
 
 
 def test_exchanged_photos_of_which_some_lie_on_their_side(views: np.ndarray, photos: list[np.ndarray]) -> None:

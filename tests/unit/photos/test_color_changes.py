@@ -137,7 +137,7 @@ def test_hues_are_taken_and_brightness_stays() -> None:
     dark = grey(photos[0]) * np.float32(0.9)
     cover = np.full(dark.shape[:2], True)
     cover[:5] = False
-    changed = PhotoChange(cover=cover, colors=photos[0], bright=False)(dark)
+    changed = PhotoChange(cover=cover, colors=photos[0], keeps_brightness=True)(dark)
     np.testing.assert_allclose(grey(changed), dark, atol=1e-4)
     np.testing.assert_allclose((changed - grey(changed))[5:], (photos[0] - grey(photos[0]))[5:], atol=1e-4)
     np.testing.assert_array_equal(changed[:5], dark[:5])

@@ -17,7 +17,7 @@ from gsmerge.photos.exposure import (
     FOLLOWS,
     NEAREST_VIEWS,
     UNEXPECTED,
-    _divide,
+    _divide_by_gains,
     _measure_pairs,
     _solve_gains,
     choose_partners,
@@ -114,9 +114,9 @@ def test_clipped_pixels_count_where_no_other_photo_shows_more(scene: Scene) -> N
     gains = elementary.exp(grey(0.4, -0.1, -0.1, -0.1, -0.1))
     one = scene.images.copy()
     one[0] = 1
-    masks = _divide(replace(scene, images=one), gains).masks
+    masks = _divide_by_gains(replace(scene, images=one), gains).masks
     assert masks is not None
     assert masks[0].mean() < 0.3  # what others see; borders and edges are seen by no other
     assert masks[1:].all()
     all_of_them = replace(scene, images=np.ones_like(scene.images))
-    assert _divide(all_of_them, np.full((5, 3), 1.5)).masks is None
+    assert _divide_by_gains(all_of_them, np.full((5, 3), 1.5)).masks is None
