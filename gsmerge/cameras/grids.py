@@ -47,7 +47,7 @@ class PlacedGrid:
     @property
     def cameras(self) -> Cameras:
         """The cameras in the frame of the Gaussians."""
-        return self.grid.cameras if self.frame is IDENTITY else self.frame.move(self.grid.cameras)
+        return self.grid.cameras if self.frame is IDENTITY else self.frame.move_cameras(self.grid.cameras)
 
     def notes(self, usual: Convention) -> list[str]:
         """List notes on what was adapted; ``usual`` is the convention that the format of the poses has."""

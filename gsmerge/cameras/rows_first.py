@@ -197,7 +197,7 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
 
     def accept(grid: Grid, frame: Similarity, limit: float) -> Recovery | None:
         """Return the result for a frame; None if a view's median distance from the pixels is above ``limit`` pixels."""
-        cameras = frame.move(grid.cameras)
+        cameras = frame.move_cameras(grid.cameras)
         alignment = check_pairs(pairs, cameras)
         far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
         is_right = alignment.ok and alignment.worst_px <= limit and median(pixel_errors(shuffled, cameras)) >= far_px
@@ -310,7 +310,7 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     camera_file, inputs = source.camera_file, source.inputs(grid)
     check_frame(inputs, camera_file)
     if source.scale is not None:
-        grid = replace(grid, cameras=scale_by(source.scale).move(grid.cameras))
+        grid = replace(grid, cameras=scale_by(source.scale).move_cameras(grid.cameras))
     no_pixels, more_notes = no_pixels_error(source.ply.info, grid.cameras), list[str]()
     rotation = upright_rotation(inputs)
     if rotation is None:

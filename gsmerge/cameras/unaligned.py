@@ -194,14 +194,16 @@ def choose_cameras(
     """
     rows, unchanged = (inputs.gaussians, inputs.valid), PlacedGrid(grid, IDENTITY)
     if frames:
-        checks = [check_cameras(*rows, frame.move(inputs.cameras), inputs.images) for frame in (IDENTITY, *frames)]
+        checks = [
+            check_cameras(*rows, frame.move_cameras(inputs.cameras), inputs.images) for frame in (IDENTITY, *frames)
+        ]
         best = int(np.argmax([check.score * check.ok for check in checks]))
         if best > 0:
             return replace(unchanged, frame=frames[best - 1]), []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
     frame = _choose_frame(inputs, check)
     if frame is not None:
-        _check_colors(inputs, frame.move(inputs.cameras), frame.description, no_pixels)
+        _check_colors(inputs, frame.move_cameras(inputs.cameras), frame.description, no_pixels)
         return PlacedGrid(grid, frame, "photos' colours"), []
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
@@ -259,7 +261,7 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMP
     """Return the score of the cameras in a frame, see :class:`CameraCheck`; 0 if the photos do not decide."""
     # the first camera is left out, because it may see all Gaussians at any scale
     later = slice(1 if len(inputs.cameras) > 1 else 0, None)
-    cameras = frame.move(inputs.cameras)[later]
+    cameras = frame.move_cameras(inputs.cameras)[later]
     check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images[later], samples)
     return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
 
@@ -327,7 +329,7 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
         return Similarity(np.eye(3), 1.0, shift, f"moved by {', '.join(f'{number:.10g}' for number in shift)}")
 
     def score(place: Sequence[float], samples: int) -> float:
-        check = check_cameras(*rows, make_frame(place).move(cameras), images, samples)
+        check = check_cameras(*rows, make_frame(place).move_cameras(cameras), images, samples)
         return float(np.nan_to_num(check.share_seen * (1 - check.color_ratio)))
 
     best: list[tuple[float, ...]] = sorted(product(*_PLACES), key=lambda place: -score(place, 300))[:8]
@@ -336,7 +338,7 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
         around = {tuple((place + offset).tolist()) for place in best for offset in offsets}
         best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]
     frame = make_frame(best[0])
-    views = [(frame.move(cameras[view : view + 1]), images[view : view + 1]) for view in range(len(cameras))]
+    views = [(frame.move_cameras(cameras[view : view + 1]), images[view : view + 1]) for view in range(len(cameras))]
     ratios = [check_cameras(*rows, *camera_and_image, foremost=True).color_ratio for camera_and_image in views]
     known = [ratio for ratio in ratios if not np.isnan(ratio)]
     return [frame] if len(known) > 1 and max(known) <= RANDOM_SHARE and np.mean(known) <= MAX_FRONT_RATIO else []

@@ -206,7 +206,7 @@ def _solve_agreed_frame(
         """Return the stretches whose rows are nearer to their pixels than ``limit`` pixels in a frame."""
         if frame is None:
             return stretches[:0]
-        errors = pixel_errors(pairs, frame.move(inputs.cameras))
+        errors = pixel_errors(pairs, frame.move_cameras(inputs.cameras))
         return stretches[[float(np.median(errors[parts == stretch])) < limit for stretch in stretches]]
 
     best = stretches[:0]

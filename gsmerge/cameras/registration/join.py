@@ -99,7 +99,7 @@ def move_scene(scene: Scene, similarity: Similarity) -> Scene:
     """Return a scene with its Gaussians and cameras moved by a similarity, and with the same photos."""
     if similarity.scale == 1 and np.array_equal(similarity.rotation, np.eye(3)) and not similarity.shift.any():
         return scene
-    gaussians, cameras = similarity.move_gaussians(scene.gaussians), similarity.move(scene.cameras)
+    gaussians, cameras = similarity.move_gaussians(scene.gaussians), similarity.move_cameras(scene.cameras)
     return replace(scene, gaussians=gaussians, cameras=cameras)
 
 
