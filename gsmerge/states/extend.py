@@ -115,8 +115,9 @@ def extend(
 def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
     """Compare the world of new views with that of the Gaussians ``before``.
 
-    Returns SAME_WORLD, ANOTHER_WORLD or UNKNOWN_WORLD. In the same world the pictures show the earlier Gaussians, except where the batch's Gaussians, at ``means [n,3]``,
-    hide them. In another world the colours differ from the pictures as much as from random pixels.
+    Returns SAME_WORLD, ANOTHER_WORLD or UNKNOWN_WORLD. In the same world the pictures show the earlier Gaussians,
+    except where the batch's Gaussians, at ``means [n,3]``, hide them. In another world the colours differ from the
+    pictures as much as from random pixels.
     """
     if not len(views):
         return UNKNOWN_WORLD

@@ -79,11 +79,7 @@ def extend_file(
         if state is not None and content in contents:
             number = contents.index(content) + 1
             note = f"{files.ply}: left out, since the same files are batch {number} of {path.name} already"
-            return document | {
-                "repeated": True,
-                "state": _describe_state_file(path, state),
-                **note_entries([note]),
-            }, state
+            return document | {"repeated": True, "state": _state_facts(path, state), **note_entries([note])}, state
         load_end = perf_counter()
         load = read_input(files, opacity=opacity, hints=hints, hashed=True)
         read_end = perf_counter()
@@ -102,7 +98,7 @@ def extend_file(
         document |= {
             **facts,
             "repeated": False,
-            "state": _describe_state_file(path, state),
+            "state": _state_facts(path, state),
             "options": dict(report.options),
             **seconds_document(seconds | {"write": perf_counter() - extend_end}),
             "peak_memory_bytes": peak_memory(),
@@ -127,7 +123,7 @@ def _record_source(state: State, content: str, comments: Sequence[str]) -> State
     return replace(state, about={**state.about, "batches": [*earlier, last], "comments": all_comments})
 
 
-def _describe_state_file(path: Path, state: State) -> dict[str, Any]:
+def _state_facts(path: Path, state: State) -> dict[str, Any]:
     """Return the part of a report about the file of a state; after a dry run the file may not exist."""
     num_bytes = path.stat().st_size if path.exists() else 0
     return {"path": str(path), "bytes": num_bytes, "num_batches": len(state.about["batches"])}
