@@ -66,6 +66,7 @@ def _find_line_lengths(points: np.ndarray) -> list[int]:
     x, y, z = points.T.astype(np.float32)
 
     def find_nearest(start: int) -> int:
+        """Return the distance in rows from a row to its nearest neighbour among the next rows, at least _MIN_SIDE."""
         rows = slice(start + _MIN_SIDE, start + longest)
         dx, dy, dz = x[rows] - x[start], y[rows] - y[start], z[rows] - z[start]
         return _MIN_SIDE + int(np.argmin(dx * dx + dy * dy + dz * dz))

@@ -53,6 +53,7 @@ def refine_poses(
         return new_K, new_poses, _linearise(points, pixels, new_K, new_poses, free)
 
     def step(state: _PoseFit, damping: float) -> _PoseFit:
+        """Return the fit after one damped Gauss-Newton step."""
         current_K, current_poses, (curvature, slope, _) = state
         with np.errstate(all="ignore"):  # an overflowing step does not reduce the error, so it is rejected
             change, motions = _solve_normal_equations(curvature, slope, damping)

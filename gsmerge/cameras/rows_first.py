@@ -43,7 +43,7 @@ from gsmerge.types import Cameras
 
 _EVIDENCE = "Gaussians' places in their pixels"  # what shows that a frame is right, in words
 _PLAIN_PX = 0.5  # if rows in order are nearer to their pixels than this, in pixels, no other cameras are tried
-_MOST_PLACES = 1 << 27  # rows times views, up to which rows are followed through the pixels; each takes four bytes
+_MOST_PLACES = 1 << 27  # largest number of rows times views for which rows are followed; each takes four bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +83,9 @@ class RowSource:
 class Recovery:
     """Rows that are the pixels of a grid, with the grid's cameras moved into the frame of the Gaussians."""
 
-    place: PlacedGrid
-    layout: Layout
-    alignment: Alignment
+    place: PlacedGrid  # the grid, and the frame of the Gaussians
+    layout: Layout  # the pixel of each row
+    alignment: Alignment  # how near the rows are to their pixels
 
     @property
     def frame(self) -> Similarity:
@@ -180,7 +180,10 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     else:  # several Gaussians of a pixel follow each other, or there are several layers of all pixels
         rows = np.arange(count)
         layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
-    min_rows, min_share = 24, 0.05  # finite rows needed to find pixels: this number, or this share of all rows
+    min_rows, min_share = (
+        24,
+        0.05,
+    )  # finite rows that are needed: this number or share of all rows, whichever is smaller
     if int(source.ply.valid.sum()) < min(min_rows, min_share * count):
         return None
     return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
@@ -200,21 +203,25 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
         cameras = frame.move_cameras(grid.cameras)
         alignment = check_pairs(pairs, cameras)
         far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
-        is_right = alignment.ok and alignment.worst_px <= limit and median(pixel_errors(shuffled, cameras)) >= far_px
         is_near = pixel_errors(pairs, cameras) <= max_correctable_px(*grid.size)
-        min_share = 0.75  # of rows near their pixels in layers; else one of two layers may belong to other views
-        is_right = is_right and (layout.ids is None or float(is_near.mean()) >= min_share)
+        min_share = 0.75  # least share of rows near their pixels; with less, one of two layers belongs to other views
+        is_right = (
+            alignment.ok
+            and alignment.worst_px <= limit
+            and median(pixel_errors(shuffled, cameras)) >= far_px
+            and (layout.ids is None or float(is_near.mean()) >= min_share)
+        )
         return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if is_right else None
 
     usual = exporter_frames(grid.cameras, source.scale)[0]
     if recovery := accept(grid, usual, _PLAIN_PX):
         return recovery
-    own = solve_poses(pairs, grid.cameras.Ks)
-    if len(own) == len(grid.cameras):
-        poses = np.stack([own[view] for view in range(len(own))])
-        own_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
-        rounding_px = 0.1  # by which cameras in one frame may fit worse than own poses, since files round numbers
-        limit = max(AS_NEAR * own_px, own_px + rounding_px)
+    solved = solve_poses(pairs, grid.cameras.Ks)
+    if len(solved) == len(grid.cameras):
+        poses = np.stack([solved[view] for view in range(len(solved))])
+        solved_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
+        rounding_px = 0.1  # the file's cameras may fit worse than solved poses by this, since files round numbers
+        limit = max(AS_NEAR * solved_px, solved_px + rounding_px)
         for other in _list_conventions(source, grid):
             frame = fit_frame(other.cameras, poses, source.scale)
             if recovery := accept(other, IDENTITY, limit) or accept(other, frame, limit):
@@ -273,7 +280,7 @@ def _follow_order(source: RowSource, grid: Grid, frames: Iterable[Similarity]) -
 
 
 def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
-    """Yield the frames of exporters, and the frame in which cameras lie where the rows themselves show them."""
+    """Yield the frames of exporters, and the frame that moves cameras to where the rows alone show them."""
     yield from exporter_frames(grid.cameras, source.scale)
     if source.own_cameras is not None and len(source.own_cameras) == len(grid.cameras):
         yield fit_frame(grid.cameras, source.own_cameras.viewmats, source.scale)
@@ -288,9 +295,9 @@ def _follow_pixels(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.n
     ids = None
     first_rows = 20_000  # rows that must follow the order of the pixels before all rows are tried
     min_placed = 0.99  # share of the rows that must have a pixel
-    for tried in (points[:first_rows], points):  # the first rows rule out most other orders
-        ids = follow_rows(tried, *matrices, cameras.width, cameras.height, mixed=mixed)
-        if (ids >= 0).sum() < min_placed * len(tried):
+    for part in (points[:first_rows], points):  # the first rows rule out most other orders
+        ids = follow_rows(part, *matrices, cameras.width, cameras.height, mixed=mixed)
+        if (ids >= 0).sum() < min_placed * len(part):
             return None
     return ids
 
@@ -307,8 +314,8 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     from gsmerge.cameras.unaligned import choose_cameras
     from gsmerge.cameras.upright import solve_upright, upright_rotation
 
-    camera_file, inputs = source.camera_file, source.inputs(grid)
-    check_frame(inputs, camera_file)
+    inputs = source.inputs(grid)
+    check_frame(inputs, source.camera_file)
     if source.scale is not None:
         grid = replace(grid, cameras=scale_by(source.scale).move_cameras(grid.cameras))
     no_pixels, more_notes = no_pixels_error(source.ply.info, grid.cameras), list[str]()

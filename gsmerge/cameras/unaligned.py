@@ -80,8 +80,9 @@ def check_cameras(
 ) -> CameraCheck:
     """Measure the share of sampled Gaussians that views see, and how well their colours fit ``images [c,h,w,3]``.
 
-    ``images`` may be empty. With ``foremost``, the colours of hidden Gaussians do not count. ``hiding`` are further
-    points ``[n,3]`` that hide Gaussians, but have no colours themselves.
+    About ``samples`` of the ``valid [n]`` Gaussians are measured. ``images`` may be empty. With ``foremost``, the
+    colours of hidden Gaussians do not count. ``hiding`` are further points ``[m,3]`` that hide Gaussians, but have no
+    colours themselves.
     """
     min_gaussians, max_projected = 200, 4_000_000  # least number of Gaussians, and most Gaussians times cameras
     samples = min(samples, max(min_gaussians, max_projected // len(cameras)))
@@ -269,7 +270,7 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMP
 def _best_frame(
     inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
 ) -> tuple[Similarity, float]:
-    """Return the first frame with the highest score, and the score."""
+    """Return the frame with the highest score, the first one of equals, and its score."""
     scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
     return max(scored, key=lambda frame_and_score: frame_and_score[1])
 
@@ -308,11 +309,13 @@ def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
 
 
 def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
-    """List the frame that only shifts the cameras, to where the photos show the Gaussians; empty if they do not.
+    """Solve for a shift of the cameras at which the photos show the Gaussians; return a list with its frame.
 
-    The middle of the Gaussians is looked for in the picture of the middle camera, at many depths.
+    The list is empty if there is no such shift. The middle of the Gaussians is looked for in the picture of the middle
+    camera, at many depths.
     """
-    max_views = 4  # views that shifts are tried on
+    # views that shifts are tried on; Gaussians of the first search, and places that it keeps
+    max_views, first_samples, first_places = 4, 300, 8
     even = slice(None, None, -(-len(inputs.cameras) // max_views))
     rows, cameras, images = (inputs.gaussians, inputs.valid), inputs.cameras[even], inputs.images[even]
     to_world = invert(cameras.viewmats)
@@ -329,11 +332,14 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
         return Similarity(np.eye(3), 1.0, shift, f"moved by {', '.join(f'{number:.10g}' for number in shift)}")
 
     def score(place: Sequence[float], samples: int) -> float:
+        """Return the score of the cameras in the frame of a place; 0 without colours to compare."""
         check = check_cameras(*rows, make_frame(place).move_cameras(cameras), images, samples)
         return float(np.nan_to_num(check.share_seen * (1 - check.color_ratio)))
 
-    best: list[tuple[float, ...]] = sorted(product(*_PLACES), key=lambda place: -score(place, 300))[:8]
+    places = sorted(product(*_PLACES), key=lambda place: -score(place, first_samples))
+    best: list[tuple[float, ...]] = places[:first_places]
     for samples, count, step in _SHIFT_STEPS:
+        # by a step in both directions of each axis of a place
         offsets = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
         around = {tuple((place + offset).tolist()) for place in best for offset in offsets}
         best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]

@@ -67,6 +67,7 @@ def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
     gaussians = replace(canonical.gaussians, sh0=rgb_to_sh0(colors), shN=np.zeros((len(rows), 0, 3), np.float32))
 
     def shows_rows(image: np.ndarray) -> np.ndarray:
+        """Return the mask ``[h,w]`` of one view from its render."""
         marked_opacity, opacity = image[..., 0], image[..., 1]
         return np.asarray(marked_opacity > MOSTLY * np.maximum(opacity, usual_opacity(opacity)))
 

@@ -121,6 +121,7 @@ def _with_large_drawings(large: LargePhotos, gaussians: Gaussians, cameras: Came
     first = max(large.ids) + 1
 
     def read(number: int) -> np.ndarray:
+        """Return a large photo, or draw a picture if the number is that of a placed camera."""
         if number < first:
             return large.read(number)
         image = render(gaussians, at_size[[number - first]]).images[0]

@@ -155,6 +155,7 @@ def _make_level(
     spread[:BORDER] = spread[-BORDER:] = spread[:, :BORDER] = spread[:, -BORDER:] = 0
 
     def sample_view(view: int) -> tuple[np.ndarray, ...]:
+        """Return the picture of a view, the points, greys and Gaussians of its sampled pixels, and all its depths."""
         grey = photos.images[view].mean(-1, dtype=np.float32)
         grey = blur(grey, POSE_BLUR) - (blur(grey, DETAIL) if detail else np.float32(0))
         down, right = np.gradient(grey)

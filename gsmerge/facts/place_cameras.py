@@ -290,6 +290,7 @@ def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndar
     splats, photos = make_splats(sample), blank_photos(candidates)
 
     def view_shares(view: int) -> np.ndarray:
+        """Return the part of each Gaussian's opacity that one candidate shows, ``[n]``."""
         sums, _ = contributions(tile_view(splats, **photos.camera(view), near=near))
         seen_weight = 1.0  # blending weight, summed over pixels, at which a Gaussian counts as seen
         return np.minimum(sums / np.float32(seen_weight), 1) * splats.opacities

@@ -32,6 +32,7 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     pictures = blank_photos(cameras, max(min_level, max(cameras.width, cameras.height) / max_side))
 
     def list_shown(view: int) -> np.ndarray:
+        """Return the rows of the Gaussians that a view shows."""
         tiled = tile_view(splats, **pictures.camera(view))
         return tiled.ids[list_contributions(tiled)[1] >= SHOWN_WEIGHT]
 

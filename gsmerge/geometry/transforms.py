@@ -171,6 +171,7 @@ def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
     rotations, means, quats = rotmat_to_quat(motions[:, :3, :3]), g.means.copy(), g.quats.copy()
 
     def move(view: int) -> None:
+        """Move the Gaussians of a view, in ``means`` and ``quats``."""
         rows = view_rows[view]
         means[rows] = matmul(g.means[rows], motions[view, :3, :3].T) + motions[view, :3, 3]
         quats[rows] = multiply_quats(rotations[view], g.quats[rows])

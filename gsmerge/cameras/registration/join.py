@@ -174,6 +174,7 @@ def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
     source_views = [(source, source_view) for source in sources for source_view in source.ids]
 
     def read(view: int) -> np.ndarray:
+        """Read the photo of a view from the source of its scene."""
         source, source_view = source_views[view]
         return source.read(source_view)
 

@@ -291,6 +291,7 @@ def _refine_similarities(
         return current, _normal_equations(current, matches, spread, free)
 
     def step(state: _SimilarityFit, damping: float) -> _SimilarityFit | None:
+        """Return the fit after one damped Gauss-Newton step; None if the step is not finite."""
         current, (_, curvature, slope) = state
         scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
         steps = -solve(curvature + np.diag(scale), slope).reshape(-1, NUM_PARAMETERS)
