@@ -50,7 +50,7 @@ class _Model:
     Ks: np.ndarray  # [v,3,3]
     poses: np.ndarray  # [v,4,4] world to camera
     free: int  # number of free intrinsics, over all views
-    errors: tuple[np.ndarray, ...]  # of each view, distances of its points from their pixels
+    errors: tuple[np.ndarray, ...]  # of each view: the distances of its points from their pixels
 
     @property
     def worst_px(self) -> float:
@@ -149,7 +149,7 @@ def _fit_model(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start
     Raises numpy.linalg.LinAlgError if the points do not determine them.
     """
     K, poses, near_points, near_pixels = start.Ks[0], start.poses, points, pixels
-    rounds = 2  # of solving; each round leaves out the points that the round before found far from their pixels
+    rounds = 2  # of solving; the second one leaves out points that are far from their pixels after the first
     for _ in range(rounds):
         K, poses = refine_poses(near_points, near_pixels, K, poses, free=free)
         errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]

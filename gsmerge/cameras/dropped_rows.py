@@ -28,7 +28,7 @@ _WRAP, _BELOW = 8.0, 0.25
 _MIN_LINES = 6  # fewest complete lines in a series
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # largest median distance of a view's rows from their pixels
-# Number of lines beyond the solved lines that a camera predicts: as a share of the solved lines, and at least
+# A camera is used for some lines beyond those from which it was solved: this share of their number, at least _MIN_AHEAD
 _AHEAD, _MIN_AHEAD = 0.3, 2
 _MIN_PLACED = 0.9  # share of the rows that must have a pixel
 
@@ -270,7 +270,7 @@ def _choose_shifts(views: Sequence[tuple[np.ndarray, float]]) -> tuple[list[int]
     starts = firsts - middles
     corners = np.rint(starts - np.median(starts[sizes == sizes.max()])).astype(int)  # relative to the largest view
     inside = corners.clip(0, sizes.max() - sizes)
-    tolerance = 2  # of the principal point, pixels
+    tolerance = 2  # difference of principal points, pixels, up to which views stay within the largest view
     corners = np.where(np.abs(corners - inside) <= tolerance, inside, corners)
     corners -= corners.min()
     return (corners - firsts).tolist(), int((corners + sizes).max())

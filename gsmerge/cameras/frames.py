@@ -28,7 +28,7 @@ from gsmerge.kernels.matrices import invert, matmul, solve_symmetric, transform
 from gsmerge.types import Cameras
 from gsmerge.values.arrays import distinct
 
-_ROUNDS = 4  # of reweighted least squares
+_ROUNDS = 4  # number of rounds of reweighted least squares
 _HALF = np.sqrt(0.5)
 # Rotation of the world by the pixelSplat family: axes swapped, then an eighth of a turn about the last axis
 UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])

@@ -170,7 +170,7 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     x, y = (np.ascontiguousarray(values.T) for values in (x, y))
     weights = np.ones(x.shape[1])
     with np.errstate(all="ignore"):
-        line_rounds = 4  # of reweighted least squares
+        line_rounds = 4  # number of rounds of reweighted least squares
         for _ in range(line_rounds):
             mean_x, mean_y = ((weights * values).sum(1, keepdims=True) / weights.sum() for values in (x, y))
             dx, dy = x - mean_x, y - mean_y

@@ -153,8 +153,8 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     down = np.concatenate([zero, local, -targets[:, 1:] * local], 1)
     weights = np.ones(len(points))
     camera, error = np.zeros((3, local.shape[1])), np.full(len(points), np.inf)
-    projective_rounds = 8  # of reweighted least squares
-    smallest_error = 1e-6  # divided by the standard deviation of the pixels
+    projective_rounds = 8  # number of rounds of reweighted least squares
+    smallest_error = 1e-6  # added to errors and depths; unit: standard deviation of the pixels
     for _ in range(projective_rounds):
         equations = np.concatenate([across * weights[:, None], down * weights[:, None]])
         camera = eigh(matmul(equations.T, equations))[1][:, 0].reshape(3, -1)

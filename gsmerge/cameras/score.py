@@ -21,8 +21,11 @@ SHUFFLED_MARGIN = 5.0  # factor by which Gaussians must be nearer to their pixel
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
 SCORED_GAUSSIANS, MIN_SCORED_GAUSSIANS = 6000, 60  # Gaussians of a score: in all views, and at least in each view
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
-MAX_PX, MAX_SHARE = 12.0, 0.05  # error up to which cameras are moved: pixels, and share of the side of small images
-MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some of them a little beyond
+MAX_PX, MAX_SHARE = (
+    12.0,
+    0.05,
+)  # largest error that moving a camera corrects: pixels, and share of the side of small images
+MAX_MEDIAN_PX = 1.5  # networks move a Gaussian within its pixel, and some of them a little beyond
 
 
 @dataclass(frozen=True, eq=False)

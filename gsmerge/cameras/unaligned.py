@@ -23,8 +23,8 @@ from gsmerge.types import Cameras, Gaussians
 RANDOM_SHARE = 0.85
 # Least score of another convention, divided by that of the usual one: with colours in the score, and without
 _COLOR_MARGIN, _MARGIN = 1.3, 2.0
-_FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the given frame
-_SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to count those that cameras see
+_FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the cameras as they are
+_SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to count those that cameras see
 # Gaussians compared in other conventions and frames. With so many, scores have an error of 0.4 %. Scores that matter
 # differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
@@ -36,7 +36,7 @@ _SCALES = np.geomspace(1 / 1300, 1300, 115)
 # Finer searches around the best scale: range (natural logarithm), steps, Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
 # Places in a picture at which the middle of the Gaussians is tried, to find a shift: x in widths, y in heights, and the
-# logarithm of the depth in radii of the scene. Colours agree over about a tenth of a picture, so steps are as large
+# logarithm of the depth in radii of the scene. Steps are a tenth of a picture, over which colours still agree
 _PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
 # Searches around the best places: number of Gaussians, number of places that are kept, and size of a step
 _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
@@ -84,7 +84,7 @@ def check_cameras(
     colours of hidden Gaussians do not count. ``hiding`` are further points ``[m,3]`` that hide Gaussians, but have no
     colours themselves.
     """
-    min_gaussians, max_projected = 200, 4_000_000  # least number of Gaussians, and most Gaussians times cameras
+    min_gaussians, max_projected = 200, 4_000_000  # least number of Gaussians, and largest product with the cameras
     samples = min(samples, max(min_gaussians, max_projected // len(cameras)))
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]

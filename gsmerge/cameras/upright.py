@@ -26,7 +26,7 @@ from gsmerge.types import Cameras
 
 _LENGTH, _STRETCHES = 48, 96  # rows of a stretch, and places in the file at which stretches begin
 _SLACK = 8  # pixels by which the range of a search is wider than the possible places, on both sides
-_ROUNDS = 3  # of solving for the frame from the stretches that agree with it
+_ROUNDS = 3  # times that the frame is solved for from the stretches that agree with it
 
 
 @dataclass(frozen=True)
@@ -44,15 +44,18 @@ class _Stretch:
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Return the rotation by which rows were turned upright from a camera; None if no camera explains them."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
-    rough_rows, rough = 2000, 1.0  # rows of a first check, and its tolerance before the rotation is undone
+    rough_rows, rough_tolerance = (
+        2000,
+        1.0,
+    )  # rows of a first check, and its tolerance while the rotation is still unknown
     sample = means[:: max(1, len(means) // rough_rows)]
-    if not len(sample) or _measure_deviation(sample) > rough:
+    if not len(sample) or _measure_deviation(sample) > rough_tolerance:
         return None
-    tolerance = 1e-3  # of the median and the quantile
+    tolerance = 1e-3  # largest deviation of the median and the quantile
     for view, viewmat in enumerate(inputs.cameras.viewmats):
         rotation = matmul(UPRIGHT, viewmat[:3, :3])
         if (
-            _measure_deviation(matmul(sample, rotation)) < rough / 2
+            _measure_deviation(matmul(sample, rotation)) < rough_tolerance / 2
             and _measure_deviation(matmul(means, rotation)) < tolerance
         ):
             source = "the first camera" if view == 0 else f"camera {view + 1}"
@@ -88,7 +91,7 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
     """
     grid, trim = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), TRIMS[0]
     trimmed, whole = grid[trim:-trim, trim:-trim].reshape(-1), grid.reshape(-1)
-    per_pixel_counts = (1, 2, 3)  # Gaussians of a pixel
+    per_pixel_counts = (1, 2, 3)  # possible numbers of Gaussians of a pixel
     for per_pixel in per_pixel_counts:
         stretches = _interleaved_stretches(count, len(cameras), per_pixel, len(trimmed))
         if stretches:

@@ -28,7 +28,7 @@ CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are lo
 AGREEMENT_SHARE, AGREEMENT_PIXELS = 1 / 120, 1.5
 SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LEAST_DEPTH = 1e-9  # least depth, canonical units
-# A result is poor if the share of confirmed pixels is below POOR_SHARE: this separates the poor results of 15 captures
+# A result is poor if the share of confirmed pixels is below POOR_SHARE, which separates the poor results of 15 captures
 # from the sound ones. If the share of alone pixels is above LONELY_SHARE, the reason is that too few views see the
 # pixels
 POOR_SHARE, LONELY_SHARE = 0.5, 0.2
@@ -40,7 +40,7 @@ THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
 }  # fmt: skip
-POOR_PART_SHARE = 0.5  # share of the pixels of a part
+POOR_PART_SHARE = 0.5  # share of the pixels of a part, above which the part is poor
 # Useful number of Gaussians per pixel. It is MOST_PER_PIXEL if the share of confirmed pixels is at least SOUND_SHARE,
 # and falls to the usual share, FEWEST, at a share of WRONG_SHARE. With more Gaussians a fit memorises the photos
 # (docs/guide/how-many.md). MOST_PER_PIXEL is the largest number at which no capture with as much confirmed depth lost
@@ -56,7 +56,8 @@ class Agreement:
     contradicted: float  # More views see through it than confirm it
     alone: float  # No other view sees the position
     num_pixels: int = field(default=CONFIRM_PIXELS, compare=False)  # Number of sampled pixels that count
-    # Part of the pictures in which most pixels are contradicted, or alone, as "left third of 4 of 7 views"; empty: none
+    # The part of the pictures in which most pixels are contradicted, and the part in which most are alone; for example
+    # "left third of 4 of 7 views"; empty if there is none
     contradicted_part: str = field(default="", compare=False)
     alone_part: str = field(default="", compare=False)
     # True if the cameras are so close together that no two views show things displaced by ``AGREEMENT_PIXELS``

@@ -71,8 +71,8 @@ def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
 class CountLimits:
     """Limits on the number of Gaussians that follow from the options."""
 
-    per_view: int  # Superpixels of each view by the options
-    default: int  # Gaussians by `superpixels` and K
+    per_view: int  # Superpixels of each view that the options ask for
+    default: int  # Gaussians that `superpixels` and K give
     min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
     max_count: int  # Most Gaussians that a budget, a size or a device allows
     exact: int | None  # Gaussians that a budget or a size requests; None if there is neither

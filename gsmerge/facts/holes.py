@@ -40,7 +40,7 @@ GAP_WIDTH = 1 / 53  # beside large empty parts, only gaps narrower than this sha
 MOST_EMPTY = 0.5  # from this share of empty pixels on, the scene may be only a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # candidate depths, relative to the depth of a view's farthest surface
 FARTHEST_QUANTILE = 0.99  # quantile of the depths that counts as the farthest
-HOLE_NEIGHBORS = 3  # nearest views that a picture is compared with
+HOLE_NEIGHBORS = 3  # number of nearest views that a picture is compared with
 DIFFERENCE_BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
 NEW_SIZE_PIXELS, NEW_OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
 BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
@@ -99,7 +99,7 @@ def _find_empty(opacity: np.ndarray, shown: np.ndarray, gap: int, *, is_cropped:
     if is_cropped:
         beside = np.ones((3, 3), np.uint8)  # a Gaussian never ends exactly between two pixels
         return np.asarray(cv2.erode((nothing & ~shown).astype(np.uint8), beside) > 0)
-    sparse = blur(opacity, gap / 4) < SPARSE * usual  # not at the edges of a scene that was cut out
+    sparse = blur(opacity, gap / 4) < SPARSE * usual  # so edges of a scene that was cut out do not count
     return large_parts(nothing & sparse)
 
 

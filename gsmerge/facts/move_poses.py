@@ -41,14 +41,14 @@ POSE_PIXELS = 1500  # compared pixels of a view, those with the largest gradient
 # Compared pixels of a view, and most steps, at the first size. They are fewer, because scenes with right poses
 # need them as well
 FIRST_PIXELS, FIRST_STEPS = 600, 2
-POSE_NEIGHBOURS = 4  # other views with which a view is compared
+POSE_NEIGHBOURS = 4  # number of other views with which a view is compared
 POSE_STEPS = 6  # most Gauss-Newton steps at each size
-TOGETHER = 16  # pairs per task
+TOGETHER = 16  # pairs of views that one task compares
 POSE_BLUR = 0.7  # blur of the photos, standard deviation in pixels
 # Detail of photos is finer than this blur, in pixels. Highlights are smooth. If new poses follow highlights, the detail
 # of surfaces agrees less than before. If it does so by more than CHANCE standard errors, the new poses are dropped
 DETAIL, CHANCE = 2.0, 2.0
-# Prior error of a pose, radians and canonical units, and the weight of this prior
+# Prior standard error of a pose, rotation in radians and shift in canonical units; and the weight of this prior
 PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
 # A gain is the share of the disagreement between photos that new poses remove. Poses are moved only if the gain of some
 # view is LEAST_GAIN at every size, and if at the largest size it is VIEW_GAIN, or MEAN_GAIN for all views together.

@@ -27,7 +27,7 @@ CANDIDATE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most thi
 AROUND_CAMERAS = 40  # candidate cameras around the scene
 FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
-INSIDE_DIRECTIONS = 8  # directions of a camera inside
+INSIDE_DIRECTIONS = 8  # directions in which cameras look from each position inside
 FIELD = 1.0  # width of the image, divided by the focal length
 # Field of cameras at the place of a viewer (80 degrees), and size of their pixels in standard deviations of Gaussians
 INSIDE_FIELD, INSIDE_PIXEL = 5 / 3, 1.5

@@ -66,8 +66,8 @@ class ViewSamples:
 class FeatureState:
     """Feature Gaussians of all views so far; the frame is that of the first batch."""
 
-    merged: FeatureGaussians  # g, canonical, after merging; later batches are matched with these
-    refined: FeatureGaussians  # g, canonical, after the refiner; the heads decode these
+    merged: FeatureGaussians  # g groups after merging, in the canonical frame; later batches are matched with these
+    refined: FeatureGaussians  # the same g groups after the refiner; the heads decode these
     views: np.ndarray  # [g] int64, the view in whose frame the networks see the group
     num_members: np.ndarray  # [g] int64, number of Gaussians that were pooled into the group
     saliency: np.ndarray  # [g] float64, mean corner response of the group's pixels, which decides a mixed K

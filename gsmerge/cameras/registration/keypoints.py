@@ -15,7 +15,7 @@ from gsmerge.raster.photos import row_pictures
 from gsmerge.types import Scene
 
 KEYPOINT_PIXELS = 1600  # longest side of a photo in which keypoints are searched, pixels
-GREY_WEIGHTS = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
+GREY_WEIGHTS = np.array([77, 150, 29], np.int32)  # of red, green and blue in a grey value; they sum to 256
 MATCH_RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
 
 

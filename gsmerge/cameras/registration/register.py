@@ -43,7 +43,7 @@ NORMAL_2D = 1 / 1.1774  # standard deviation of two normal components, divided b
 AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
 # Multiples of AGREE up to which matches are used in each round. The first are large because chains of scenes drift
 LOOSE = (100.0, 10.0, 2.0, 2.0)
-MIN_MATCHES = 16  # agreeing matches of two connected scenes; unrelated photos have up to 5
+MIN_MATCHES = 16  # least number of agreeing matches of two connected scenes; unrelated photos have up to 5
 SIMILARITY_DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
 NUM_PARAMETERS = 7  # parameters of a step: rotation, shift, logarithm of the scale
 
@@ -102,7 +102,7 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
     scores = [(1 - squares / AGREE).clip(0).sum() for squares in misses]
     similarities: Similarities = (trials[int(np.argmax(scores))], IDENTITY)
     agree = misses[int(np.argmax(scores))] < AGREE
-    rounds = 3  # of selecting the agreeing matches of a pair and refining its similarity
+    rounds = 3  # in each, the similarity is refined and the agreeing matches are selected anew
     for _ in range(rounds):
         if agree.sum() < MIN_MATCHES // 2:
             return None
@@ -120,7 +120,7 @@ def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
     rng = np.random.default_rng(0)
     p, q = (side.points for side in matches.sides)
     first_depths, second_depths = (camera_depths(side.points, side.viewmats) for side in matches.sides)
-    num_triples = 2000  # random triples of matches
+    num_triples = 2000  # number of random triples
     rows = rng.integers(0, len(matches), (num_triples, 3))
     weights = (1 / (first_depths * second_depths))[rows]
     rotations, scales, shifts = fit_similarities(p[rows], q[rows], weights)
@@ -149,7 +149,7 @@ class _Residuals:
     """Errors of points of one scene in the photos of another, in standard deviations."""
 
     moved: np.ndarray  # [m,3] points in the frame of the other scene
-    values: np.ndarray  # [m,3] two errors of the place in the photo, and one of the depth
+    values: np.ndarray  # [m,3] two errors of the position in the photo, and one of the depth
     slopes: np.ndarray  # [m,3,3] derivatives of ``values`` by ``moved``
 
 
@@ -168,7 +168,7 @@ def _one_way_residuals(
     projected = transform(other.Ks, camera)[:, :2] / z[:, None]
     by_camera = np.zeros((len(moved), 3, 3))
     by_camera[:, :2] = (other.Ks[:, :2] - projected[..., None] * np.eye(3)[2]) / z[:, None, None]
-    # movement of the place in the photo if a depth is wrong by one standard deviation
+    # shift of the position in the photo if a depth is wrong by one standard deviation
     poses = side.viewmats[:, :3, :3]
     eyes = -transform(poses.swapaxes(1, 2), side.viewmats[:, :3, 3])
     along = similarity.scale * transform(rotmats, matmul(side.points - eyes, similarity.rotation.T))
