@@ -22,7 +22,7 @@ def no_pixels_error(ply: FileInfo, cameras: Cameras) -> SceneError:
     return SceneError(ply.path, problem, "give the cameras of their views, in the frame of the Gaussians")
 
 
-def check_frame(inputs: AlignmentInput, camera_file: CameraFile) -> None:
+def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> None:
     """Raise SceneError if the rows are pixels in order, but of other cameras than most of the file's cameras.
 
     If the photos have the colours of the rows, no error is raised, because the views may just be in another order.

@@ -180,10 +180,8 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     else:  # several Gaussians of a pixel follow each other, or there are several layers of all pixels
         rows = np.arange(count)
         layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
-    min_rows, min_share = (
-        24,
-        0.05,
-    )  # finite rows that are needed: this number or share of all rows, whichever is smaller
+    # finite rows that are needed: this number or this share of all rows, whichever is smaller
+    min_rows, min_share = 24, 0.05
     if int(source.ply.valid.sum()) < min(min_rows, min_share * count):
         return None
     return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
@@ -310,12 +308,12 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
 
     Raises SceneError if no cameras see them, or if the rows turn out to be pixels of other cameras.
     """
-    from gsmerge.cameras.explain import check_frame, no_pixels_error
+    from gsmerge.cameras.explain import refuse_other_cameras, no_pixels_error
     from gsmerge.cameras.unaligned import choose_cameras
     from gsmerge.cameras.upright import solve_upright, upright_rotation
 
     inputs = source.inputs(grid)
-    check_frame(inputs, source.camera_file)
+    refuse_other_cameras(inputs, source.camera_file)
     if source.scale is not None:
         grid = replace(grid, cameras=scale_by(source.scale).move_cameras(grid.cameras))
     no_pixels, more_notes = no_pixels_error(source.ply.info, grid.cameras), list[str]()

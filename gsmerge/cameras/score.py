@@ -21,10 +21,8 @@ SHUFFLED_MARGIN = 5.0  # factor by which Gaussians must be nearer to their pixel
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
 SCORED_GAUSSIANS, MIN_SCORED_GAUSSIANS = 6000, 60  # Gaussians of a score: in all views, and at least in each view
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
-MAX_PX, MAX_SHARE = (
-    12.0,
-    0.05,
-)  # largest error that moving a camera corrects: pixels, and share of the side of small images
+# Largest error that moving a camera may correct: in pixels, and as a share of the side of small images
+MAX_PX, MAX_SHARE = 12.0, 0.05
 MAX_MEDIAN_PX = 1.5  # networks move a Gaussian within its pixel, and some of them a little beyond
 
 

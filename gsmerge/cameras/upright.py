@@ -44,10 +44,8 @@ class _Stretch:
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Return the rotation by which rows were turned upright from a camera; None if no camera explains them."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
-    rough_rows, rough_tolerance = (
-        2000,
-        1.0,
-    )  # rows of a first check, and its tolerance while the rotation is still unknown
+    # rows of a first check, and its tolerance while the rotation is still unknown
+    rough_rows, rough_tolerance = 2000, 1.0
     sample = means[:: max(1, len(means) // rough_rows)]
     if not len(sample) or _measure_deviation(sample) > rough_tolerance:
         return None

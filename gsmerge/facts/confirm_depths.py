@@ -81,8 +81,8 @@ class Agreement:
                 "all photos were taken from one point, like parts of a panorama, so no photo can confirm the depth of"
                 " another, and new views from elsewhere show guesses; photos from other places would help most"
             )
-        error = math.sqrt(self.confirmed * (1 - self.confirmed) / self.num_pixels)
-        if self.confirmed + CHANCE_ERRORS * error >= POOR_SHARE or self.num_pixels < NORMAL_SAMPLES:
+        standard_error = math.sqrt(self.confirmed * (1 - self.confirmed) / self.num_pixels)
+        if self.confirmed + CHANCE_ERRORS * standard_error >= POOR_SHARE or self.num_pixels < NORMAL_SAMPLES:
             return None
         problem = f"only {100 * self.confirmed:.0f} % of the pixels have a depth that another view confirms"
         if self.alone > LONELY_SHARE:

@@ -101,7 +101,7 @@ class _JoinContext(NetworkContext):
 
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
         """Compute the networks' inputs for Feature Gaussians, from the samples of all views."""
-        views, num_members = self.trace(features)
+        views, num_members = self.summarise_parts(features)
         height, width = self.samples.opacities.shape[1:]
         unused = np.zeros((0, 0), np.float32)  # the statistics do not read these columns
         samples = Members(
@@ -113,7 +113,7 @@ class _JoinContext(NetworkContext):
         stats = cross_view_stats(features.means, features.sh0, views, samples, grid_cameras)
         return describe_features(features, views, num_members, stats, self.cameras)
 
-    def trace(self, features: FeatureGaussians) -> tuple[np.ndarray, np.ndarray]:
+    def summarise_parts(self, features: FeatureGaussians) -> tuple[np.ndarray, np.ndarray]:
         """Find the view ``[g]`` with most of the weight of each Feature Gaussian, and its number of members ``[g]``."""
         num_views, rows = len(self.cameras), features.members
         owners = np.repeat(np.arange(len(features)), np.diff(features.starts))  # the Feature Gaussian of each part
@@ -248,7 +248,7 @@ def _refine_groups(
     refined = context.refine(merged)
     with stage("decode"):
         described = context.describe(refined)
-    num_members = context.trace(refined)[1] if isinstance(context, _JoinContext) else np.diff(refined.starts)
+    num_members = context.summarise_parts(refined)[1] if isinstance(context, _JoinContext) else np.diff(refined.starts)
     return FeatureState(
         merged=_without_members(merged),
         refined=_without_members(refined),
