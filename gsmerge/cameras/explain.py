@@ -36,8 +36,8 @@ def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> Non
         return  # most of the cameras fit
     max_multiple = 4.0  # rows nearer than this multiple of the limit are the pixels of some projective camera
     are_pixels = projective_error(first_view.points, first_view.pixels) < max_multiple * alignment.limit_px
-    shown = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True)
-    if are_pixels and not shown.color_ratio <= MAX_FRONT_RATIO:
+    check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True)
+    if are_pixels and not check.color_ratio <= MAX_FRONT_RATIO:
         raise misalignment_error(camera_file.path, alignment, None)
 
 

@@ -308,7 +308,7 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
 
     Raises SceneError if no cameras see them, or if the rows turn out to be pixels of other cameras.
     """
-    from gsmerge.cameras.explain import refuse_other_cameras, no_pixels_error
+    from gsmerge.cameras.explain import no_pixels_error, refuse_other_cameras
     from gsmerge.cameras.unaligned import choose_cameras
     from gsmerge.cameras.upright import solve_upright, upright_rotation
 

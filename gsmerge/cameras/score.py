@@ -140,7 +140,7 @@ def check_pixels(scene: Scene) -> Alignment:
 
     Only the foremost Gaussian of a pixel counts.
     """
-    free_pages(vars(scene.gaussians).values())
+    free_pages(vars(scene.gaussians).values())  # earlier steps have read all rows, and a sample is enough here
     width, views = scene.cameras.width, len(scene)
     step = spread_step(-(-scene.pixels_per_view // MAX_CHECKED), width)
     sample = np.arange(0, scene.pixels_per_view, step)
@@ -161,6 +161,7 @@ def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
         for view_errors in np.split(errors, ends[:-1])
     )
     count = max(1, len(errors))
+    # points behind their camera have an infinite error, so all finite errors are in front
     limits = sys.float_info.max, 1, max_correctable_px(cameras.width, cameras.height)
     in_front, within_1px, near = (float((errors <= px).sum()) / count for px in limits)
     is_near = [median_px < limit for median_px in medians if not math.isnan(median_px)]

@@ -134,14 +134,14 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
 
 def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
     """Concatenate the pixels of scenes; None if the views of any scene have no Gaussians of their own."""
-    homes, fronts, rows, views = list[np.ndarray](), list[np.ndarray](), 0, 0
+    homes, fronts, num_rows, num_views = list[np.ndarray](), list[np.ndarray](), 0, 0
     for scene in scenes:
         if not scene.has_own_pixels:
             return None
         pixels = scene.get_pixels()
-        homes.append(np.where(pixels.homes >= 0, pixels.homes + views * scene.pixels_per_view, -1))
-        fronts.append(np.where(pixels.shown, pixels.fronts + np.int32(rows), np.int32(-1)))
-        rows, views = rows + len(scene.gaussians), views + len(scene)
+        homes.append(np.where(pixels.homes >= 0, pixels.homes + num_views * scene.pixels_per_view, -1))
+        fronts.append(np.where(pixels.shown, pixels.fronts + np.int32(num_rows), np.int32(-1)))
+        num_rows, num_views = num_rows + len(scene.gaussians), num_views + len(scene)
     return Pixels(np.concatenate(homes), np.concatenate(fronts), own=True)
 
 
