@@ -1,11 +1,13 @@
 """Align rows with cameras: find the pixel of each row, and the cameras that show the Gaussians in place.
 
-``rows_first`` leads. It takes rows in plain order as the pixels of their cameras (``poses`` reads poses in other
-conventions and moves inexact cameras), follows rows of which some are missing (``dropped_rows``) in each frame of
-exporters (``frames``), and else chooses cameras alone: ``unaligned`` by the photos' colours, and ``upright`` for rows
-in a frame that no file stores. ``grids`` are the sizes that cameras and photos can have. ``estimate`` solves for
-cameras that no file gives, and ``explain`` reports why rows do not fit. Modules are private; those that few files need
-are loaded at first use.
+``rows_first`` tries three answers in turn. First, rows in plain order are the pixels of their cameras. ``poses`` helps
+there: it reads poses in other conventions and moves inexact cameras. Second, rows are in the order of the pixels, but
+some pixels have no row. ``dropped_rows`` follows such rows through the pixels, in each frame that exporters use
+(``frames``). Third, rows without pixels get cameras alone. ``unaligned`` chooses them by the colours of the photos, and
+``upright`` solves for them if no file stores the frame of the rows.
+
+``grids`` has the sizes that cameras and photos can have. ``estimate`` solves for the cameras if no file gives them, and
+``explain`` reports why rows do not fit. The modules are private. Those that few files need are loaded at first use.
 """
 
 # ruff: noqa: F401  names for other packages
@@ -35,6 +37,7 @@ _MODULES = {name: module for module, names in _LOADED_LATER.items() for name in 
 
 
 def __getattr__(name: str) -> Any:
+    """Import a name of ``_LOADED_LATER`` when it is first used."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

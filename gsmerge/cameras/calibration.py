@@ -31,7 +31,8 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
 _FREE_INTRINSICS = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
-_FAR, _FAR_PX = 3.0, 1.0  # a point is far beyond this multiple of the median distance and this number of pixels
+# A point is far from its pixel if its distance is above this multiple of the median, and above this number of pixels
+_FAR, _FAR_PX = 3.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class _Model:
     Ks: np.ndarray  # [v,3,3]
     poses: np.ndarray  # [v,4,4] world to camera
     free: int  # number of free intrinsics, over all views
-    errors: tuple[np.ndarray, ...]  # of each view, distances of its points from their pixels
+    errors: tuple[np.ndarray, ...]  # of each view: the distances of its points from their pixels
 
     @property
     def worst_px(self) -> float:
@@ -69,8 +70,8 @@ class _Model:
 def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | None:
     """Calibrate the cameras of views of ``width`` x ``height`` pixels from ``pairs`` of Gaussians and pixels.
 
-    A view without pairs gets the camera of the view before. None if the points do not determine the cameras, or if they
-    lie farther from their pixels than allowed.
+    A view without pairs gets the camera of the view before it. Returns None if the points do not determine the cameras,
+    or if they lie farther from their pixels than :func:`pixel_limit`.
     """
     if not len(pairs.points):
         return None
@@ -97,7 +98,10 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
 def _choose_model(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
 ) -> _Model | None:
-    """Choose the simplest intrinsics that explain the pixels; ``bound`` is the error of projective cameras, pixels."""
+    """Choose the simplest intrinsics that explain the pixels; None if the points determine no model.
+
+    ``bound`` is the error of projective cameras, pixels.
+    """
     models: list[_Model] = []
     with suppress(np.linalg.LinAlgError):  # raised at the first model that the points do not determine
         models.extend(_solve_models(points, pixels, size, bound))
@@ -115,16 +119,16 @@ def _solve_models(
     """
     one_focal_models = []
     first_focals = (1.2, 4.8)  # focal lengths, in longer sides of the picture, at which the search begins
-    for share in first_focals:
-        focal = share * max(size)
+    for focal_in_sides in first_focals:
+        focal = focal_in_sides * max(size)
         K = make_pinhole(focal, focal, size[0] / 2, size[1] / 2)
         starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
         poses = np.stack([pose for pose in starts if pose is not None] or [np.eye(4)])
-        if len(poses) < len(starts):
+        if len(poses) < len(starts):  # the points of a view determine no pose
             return
         start = _Model(np.tile(K, (len(starts), 1, 1)), poses, 0, ())
         for free in _FREE_INTRINSICS:
-            model = _solve(points, pixels, start, free)
+            model = _fit_model(points, pixels, start, free)
             one_focal_models += [model] if free == ONE_FOCAL else []
             start = start if free == ONE_FOCAL else model
             yield model
@@ -133,19 +137,19 @@ def _solve_models(
     model = min(one_focal_models, key=lambda model: model.worst_px)
     for free in _FREE_INTRINSICS if len(points) > 1 else ():
         view_starts = (replace(model, Ks=model.Ks[v : v + 1], poses=model.poses[v : v + 1]) for v in range(len(points)))
-        views = [_solve([p], [q], start, free) for p, q, start in zip(points, pixels, view_starts, strict=True)]
+        views = [_fit_model([p], [q], start, free) for p, q, start in zip(points, pixels, view_starts, strict=True)]
         Ks, poses = np.concatenate([view.Ks for view in views]), np.concatenate([view.poses for view in views])
         model = _Model(Ks, poses, free * len(views), tuple(view.errors[0] for view in views))
         yield model
 
 
-def _solve(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start: _Model, free: int) -> _Model:
-    """Solve for poses and ``free`` common intrinsics.
+def _fit_model(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start: _Model, free: int) -> _Model:
+    """Solve for the poses, and for ``free`` intrinsics common to all views, from the cameras of ``start``.
 
     Raises numpy.linalg.LinAlgError if the points do not determine them.
     """
     K, poses, near_points, near_pixels = start.Ks[0], start.poses, points, pixels
-    rounds = 2  # of solving; each round leaves out the points that the round before found far from their pixels
+    rounds = 2  # of solving; the second one leaves out points that are far from their pixels after the first
     for _ in range(rounds):
         K, poses = refine_poses(near_points, near_pixels, K, poses, free=free)
         errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]

@@ -17,15 +17,15 @@ from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, m
 def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> CameraFile | None:
     """Estimate the cameras of rows ``means [n,3]`` that are the pixels of a grid; None for other rows.
 
-    Rows are view by view, of which some pixels may have no row, or the views of a pixel follow each other. ``valid
-    [n]`` is bool, and ``path`` is for messages.
+    The rows have one of two orders. They are view by view, where some pixels may have no row, or the rows of one pixel
+    in all views follow each other. ``valid [n]`` bool marks the finite rows, and ``path`` is for messages.
     """
-    rows, num_mixed = np.arange(len(means)), _find_pixel_step(means)
-    mixed = [rows.reshape(-1, num_mixed).T.reshape(-1)] if num_mixed > 1 and len(rows) % num_mixed == 0 else []
-    # a row that is no number may be a pixel like others, or there may be none for its pixel
+    rows, step = np.arange(len(means)), _find_pixel_step(means)
+    orders = (rows, rows.reshape(-1, step).T.reshape(-1)) if step > 1 and len(rows) % step == 0 else (rows,)
+    # a row that is not finite may take the place of a pixel, or belong to none; both are tried
     filled = np.stack([np.interp(rows, rows[valid], values) for values in means[valid].T], 1).astype(np.float32)
     possible = [(means, valid)] if valid.all() else [(means, valid), (filled, np.ones_like(valid))]
-    for order, (points, used) in product((rows, *mixed), possible):
+    for order, (points, used) in product(orders, possible):
         grid = find_dropped_grid(points[order], used[order])
         if grid is not None:
             layout, calibration = grid
@@ -41,14 +41,14 @@ def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> Camera
 
 
 def _find_pixel_step(means: np.ndarray) -> int:
-    """Find the step in rows between neighbouring pixels, which is the number of views that follow each other.
+    """Find the step in rows from one pixel to the next; it is the number of views whose rows follow each other.
 
-    It is the step after which points ``means [n,3]`` are nearest; 1 for a few rows.
+    Points ``means [n,3]`` that are this step apart are nearest to each other. The step is 1 if the rows are few.
     """
-    most_views = 64  # views that may follow each other at every pixel
-    few_pixels = 256  # of a view, at least
-    longest = min(most_views, len(means) // few_pixels)
-    num_steps = 2000  # steps that are measured for each number of views
-    starts = np.linspace(0, max(0, len(means) - longest - 1), num_steps).astype(int)
-    lengths = [np.abs(means[starts + step] - means[starts]).sum(1) for step in range(1, longest + 1)]
-    return 1 + int(np.argmin([median(steps[np.isfinite(steps)]) for steps in lengths])) if lengths else 1
+    most_views = 64  # largest step that is tried
+    min_pixels = 256  # fewest pixels of a view
+    longest = min(most_views, len(means) // min_pixels)
+    num_samples = 2000  # pairs of rows whose distance is measured for each step
+    starts = np.linspace(0, max(0, len(means) - longest - 1), num_samples).astype(int)
+    distances = [np.abs(means[starts + step] - means[starts]).sum(1) for step in range(1, longest + 1)]
+    return 1 + int(np.argmin([median(values[np.isfinite(values)]) for values in distances])) if distances else 1

@@ -13,8 +13,8 @@ from gsmerge.io.formats.read import FileInfo
 from gsmerge.types import Cameras, Gaussians
 
 
-def count_error(ply: FileInfo, cameras: Cameras) -> SceneError:
-    """Make the SceneError for rows that are not the pixels of the cameras."""
+def no_pixels_error(ply: FileInfo, cameras: Cameras) -> SceneError:
+    """Make the SceneError for rows that are not the pixels of the cameras, with both numbers."""
     views, width, height = len(cameras), cameras.width, cameras.height
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
     actual = f"{ply.count} in no known order" if ply.count == views * height * width else str(ply.count)
@@ -22,29 +22,29 @@ def count_error(ply: FileInfo, cameras: Cameras) -> SceneError:
     return SceneError(ply.path, problem, "give the cameras of their views, in the frame of the Gaussians")
 
 
-def check_frame(inputs: AlignmentInput, camera_file: CameraFile) -> None:
-    """Raise SceneError if the rows are in order the pixels of some cameras, but not of most of the file's cameras.
+def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> None:
+    """Raise SceneError if the rows are pixels in order, but of other cameras than most of the file's cameras.
 
-    The views may be in another order if photos show the colours of the rows.
+    If the photos have the colours of the rows, no error is raised, because the views may just be in another order.
     """
     cameras = inputs.cameras
     if inputs.order == "none" or len(inputs.gaussians) != len(cameras) * cameras.width * cameras.height:
-        return
+        return  # the rows cannot be all pixels in order
     pairs = sample_pixels(inputs.gaussians, cameras, inputs.valid)
     alignment, first_view = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)
     if float(np.nanmedian([*alignment.median_px, np.inf])) < alignment.limit_px:
-        return
+        return  # most of the cameras fit
     max_multiple = 4.0  # rows nearer than this multiple of the limit are the pixels of some projective camera
     are_pixels = projective_error(first_view.points, first_view.pixels) < max_multiple * alignment.limit_px
-    shown = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True)
-    if are_pixels and not shown.color_ratio <= MAX_FRONT_RATIO:
+    check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True)
+    if are_pixels and not check.color_ratio <= MAX_FRONT_RATIO:
         raise misalignment_error(camera_file.path, alignment, None)
 
 
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
     """Make the SceneError for rows that are as many as the pixels, but do not lie in them.
 
-    ``reason``: another order that fits, see :func:`explain_misalignment`.
+    ``reason`` names another order that fits, see :func:`explain_misalignment`; None if no order does.
     """
     percent = f"{100 * alignment.share_in_front:.0f}"
     in_front = "" if percent == "100" else f" and only {percent} % in front of their camera"
@@ -57,7 +57,7 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
 
 
 def explain_misalignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> str | None:
-    """Describe another order in which the rows are the pixels of the cameras; None if none is."""
+    """Describe another order in which the rows are the pixels of the cameras; None if there is no such order."""
     views, width, height = len(cameras), cameras.width, cameras.height
     rows = np.arange(len(gaussians))
     orders = {

@@ -1,8 +1,8 @@
 """Solve for the frame of the Gaussians: the pose of each view, and the similarity that moves the cameras there.
 
-If rows are pixels, they determine the pose of each view, because a Gaussian lies on the ray of its pixel:
-``(x - c) x d = 0`` with the camera's centre c and the ray's direction d. The Gaussians stay in place, and the cameras
-are moved.
+If rows are pixels, they determine the pose of each view, because a Gaussian lies on the ray of its pixel. Its mean m
+satisfies ``cross(m - c, d) = 0`` with the camera's centre c and the ray's direction d. The Gaussians stay in place, and
+the cameras are moved.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gsmerge.kernels.matrices import invert, matmul, solve_symmetric, transform
 from gsmerge.types import Cameras
 from gsmerge.values.arrays import distinct
 
-_ROUNDS = 4  # of reweighted least squares
+_ROUNDS = 4  # number of rounds of reweighted least squares
 _HALF = np.sqrt(0.5)
 # Rotation of the world by the pixelSplat family: axes swapped, then an eighth of a turn about the last axis
 UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
@@ -36,16 +36,16 @@ _VIEWER = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # rotation of the wor
 
 
 def scale_by(scale: float, note: str = "") -> Similarity:
-    """Return the similarity that only scales."""
+    """Return the similarity that only scales; ``note`` is added to its description."""
     text = f"positions scaled by {scale:.4g}{note}"
     return Similarity(np.eye(3), scale, np.zeros(3), text)
 
 
 def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Similarity]:
-    """List the frames of exporters and viewers in which nothing has to be solved for.
+    """List the frames of exporters and viewers that follow from the cameras, as similarities from the cameras' frame.
 
-    The frame of the cameras comes first, and the frame of the first camera last. ``scale`` is the length of one unit of
-    the cameras' world in the world of the Gaussians, if known.
+    The frame of the cameras itself comes first, and the frame of the first camera last. ``scale`` is the length of one
+    unit of the cameras' world in the world of the Gaussians, if it is known.
     """
     unit, first, middle = scale or 1.0, cameras.viewmats[0], cameras.viewmats[len(cameras) // 2]
     rotations = (
@@ -64,7 +64,10 @@ def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Simila
 
 
 def fit_frame(cameras: Cameras, poses: np.ndarray, scale: float | None) -> Similarity:
-    """Fit the similarity that moves cameras to ``poses [c,4,4]``, and describe it in words."""
+    """Fit the similarity that moves cameras to ``poses [c,4,4]``, with a description in words.
+
+    ``scale`` (None: 1) is used if all cameras stand in one place, because they do not determine it then.
+    """
     frame = fit_similarity(cameras.viewmats, poses, scale or 1.0)
     angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
     shift = ", ".join(f"{value:.4g}" for value in frame.shift)
@@ -84,9 +87,10 @@ def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray
 def solve_frame(
     points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray
 ) -> Similarity | None:
-    """Solve robustly for the scale and shift that bring rotated and moved rays nearest to their points ``[t,3]``.
+    """Solve robustly for the frame in which rays pass nearest to their ``points [t,3]``.
 
-    ``rotation`` is given. None if the scale is not positive.
+    Its ``rotation`` is known, so scale and shift are solved for. ``rays_and_centres`` are the two results of
+    :func:`ray_directions`. Returns None if the scale would not be positive.
     """
     rays, centres = (matmul(vectors, rotation.T) for vectors in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
@@ -108,8 +112,8 @@ def solve_frame(
     return Similarity(rotation, float(solution[0]), shift)
 
 
-def own_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
-    """Solve for the pose ``[4,4]`` of each view from its own pixels only; leave out views where that fails."""
+def solve_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the pose ``[4,4]`` of each view, solved from its own pixels only; without views where that fails."""
     poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in distinct(pairs.views))
     return {view: pose for view, pose in poses if pose is not None}
 

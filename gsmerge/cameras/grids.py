@@ -1,4 +1,4 @@
-"""Bring cameras and photos to each size that the grid of the rows may have: that of the photos or of the cameras."""
+"""Bring cameras and photos to one size: that of the photos or of the cameras, of which one is the size of the grid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.cameras.layouts import ESTIMATED
-from gsmerge.cameras.poses import Poses, describe_convention
+from gsmerge.cameras.poses import PosesInConvention, describe_convention
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, sizes_of, to_cameras
@@ -27,7 +27,8 @@ class Grid:
     transform: PhotoTransform | None  # applied to the photos; None: nothing
     notes: tuple[str, ...]  # notes for the user, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
-    given: np.ndarray | None = None  # ``[c,4,4]`` given poses that the photos confirm; Gaussians move there
+    # ``[c,4,4]`` the poses as read if photos confirm them, so that the Gaussians have to move there; None otherwise
+    confirmed_viewmats: np.ndarray | None = None
 
     @property
     def size(self) -> Size:
@@ -37,7 +38,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class PlacedGrid:
-    """Cameras that show Gaussians in place: the cameras of a grid, moved into the frame of the Gaussians."""
+    """Cameras that show Gaussians in place: those of a grid, and the frame of the Gaussians into which they move."""
 
     grid: Grid
     frame: Similarity
@@ -46,10 +47,10 @@ class PlacedGrid:
     @property
     def cameras(self) -> Cameras:
         """The cameras in the frame of the Gaussians."""
-        return self.grid.cameras if self.frame is IDENTITY else self.frame.move(self.grid.cameras)
+        return self.grid.cameras if self.frame is IDENTITY else self.frame.move_cameras(self.grid.cameras)
 
     def notes(self, usual: Convention) -> list[str]:
-        """List notes on what was adapted; ``usual`` is the convention of the poses' format."""
+        """List notes on what was adapted; ``usual`` is the convention that the format of the poses has."""
         notes, convention = [*self.grid.notes], self.grid.camera_file.convention
         if convention != usual:
             fits = f"the poses fit when read as {describe_convention(convention)}"
@@ -60,16 +61,16 @@ class PlacedGrid:
         return notes
 
 
-def with_poses(grid: Grid, poses: Poses) -> Grid:
-    """Return a grid with the poses of its cameras in another convention."""
+def with_poses(grid: Grid, poses: PosesInConvention) -> Grid:
+    """Return a grid whose cameras have ``poses``, which are read in another convention."""
     file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
     return replace(grid, camera_file=file, cameras=replace(grid.cameras, viewmats=poses.viewmats))
 
 
 def with_photo_size(camera_file: CameraFile, size: Size | None) -> CameraFile:
-    """Give cameras the size of the photos if the cameras' own size differs by one pixel.
+    """Return cameras with the ``size`` of the photos if the cameras' own size differs from it by one pixel.
 
-    The own size may have been computed as twice the principal point. The same cameras are returned otherwise.
+    Such a size may have been computed as twice the principal point. Other cameras are returned as they are.
     """
     stored = sizes_of(camera_file)
     if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= 1:
@@ -79,9 +80,9 @@ def with_photo_size(camera_file: CameraFile, size: Size | None) -> CameraFile:
 
 
 def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
-    """Return the grid of the photos' size, or of the cameras' size without photos.
+    """Return the grid at the ``size`` of the photos, or at the size of the cameras if there are no photos (None).
 
-    Raises SceneError if the shapes of cameras and photos differ.
+    Raises SceneError if cameras and photos have different ratios of width to height.
     """
     if size is None:
         return Grid(camera_file, to_cameras(camera_file), None, ())
@@ -101,15 +102,16 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
     return Grid(camera_file, to_cameras(camera_file, size), None, notes)
 
 
-def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform: PhotoTransform) -> Grid:
-    """Return the grid of photos that a known ``transform`` of ``file_size`` resizes or crops.
+def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, file_transform: PhotoTransform) -> Grid:
+    """Return the grid of photos that a known transform resizes or crops.
 
-    ``size`` is the size of the photos in memory, which may be reduced from ``file_size``.
+    ``file_transform`` is the transform of photos of ``file_size``. The photos in memory have ``size``, which may be
+    smaller.
     """
-    x, y = (file_side / side for file_side, side in zip(file_size, size, strict=True))
-    transform = replace(transform, scale_x=x * transform.scale_x, scale_y=y * transform.scale_y)
+    across, down = (file_side / side for file_side, side in zip(file_size, size, strict=True))
+    transform = replace(file_transform, scale_x=across * file_transform.scale_x, scale_y=down * file_transform.scale_y)
     note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
-    max_difference = 0.1  # relative difference of the scales of width and height above which few models resize photos
+    max_difference = 0.1  # few models resize width and height by factors with a larger relative difference
     if camera_file.source == ESTIMATED and abs(transform.scale_x / transform.scale_y - 1) > max_difference:
         note += "; if the model did not squeeze them, rows were left out of the file: name its cameras with --cameras"
     is_same = file_size == (transform.width, transform.height)
@@ -117,9 +119,10 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
 
 
 def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
-    """List the grids of photos at the size of the cameras, or of cameras cropped to another shape of the photos.
+    """List the grid at the size of the cameras, to which photos are resized, if that is another size than ``size``.
 
-    ``size`` is the size of the photos. Empty without photos, and if cameras and photos have the same size.
+    ``size`` is the size of the photos. If shapes differ, cameras are cropped to the photos instead. The list is empty
+    without photos, if sizes are equal, and if the photos would be enlarged too much.
     """
     sizes = sizes_of(camera_file)
     if size is None or len(sizes) != 1 or sizes[0] == size or camera_file.photo_map is not None:
@@ -127,9 +130,9 @@ def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
     (camera_size,) = sizes
     cameras, transform = to_cameras(camera_file, camera_size), resize_to(size, camera_size)
     if not same_shape(camera_size, size):
-        transform = resize_and_crop(camera_size, size)
-        note = f"cameras of {camera_size[0]} x {camera_size[1]} are {transform.description}, the images' size"
-        return [Grid(camera_file, transform.cameras(cameras), None, (note,))]
+        crop = resize_and_crop(camera_size, size)
+        note = f"cameras of {camera_size[0]} x {camera_size[1]} are {crop.description}, the images' size"
+        return [Grid(camera_file, crop.cameras(cameras), None, (note,))]
     max_enlarged = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
     if max(transform.scale_x, transform.scale_y) > max_enlarged:
         return []  # the photos are previews, and a fit to them would blur the Gaussians

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-ESTIMATED = "estimated from the grid"  # source of cameras
-NO_CAMERAS_USED = "no cameras are used"  # a note on cameras that are estimated begins so
+ESTIMATED = "estimated from the grid"  # the `source` of cameras that no file gives
+NO_CAMERAS_USED = "no cameras are used"  # first words of the note on such cameras
 TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every border
 
 
@@ -18,8 +18,9 @@ class Layout:
     views: int
     width: int  # pixels
     height: int
-    order: str = "view-major"  # view by view and line by line; or "view-fastest": the views of a pixel together
-    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 without one; None if the rows are all pixels in order
+    # "view-major": view by view and line by line. "view-fastest": the rows of one pixel in all views follow each other
+    order: str = "view-major"
+    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 if it has none; None if the rows are all pixels in order
     ids: np.ndarray | None = None
 
     @property
@@ -39,7 +40,10 @@ class Layout:
         return np.arange(count, dtype=np.int32 if count <= np.iinfo(np.int32).max else np.int64)
 
     def sample(self, per_view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return about ``per_view`` rows of each view, spread over its columns and lines, and their pixels."""
+        """Choose about ``per_view`` rows of each view, spread over its columns and lines; return them and their pixels.
+
+        The result is two arrays ``[t]``.
+        """
         area, parts = self.width * self.height, []
         if self.ids is None:
             pixels = np.arange(0, area, spread_step(-(-area // per_view), self.width))

@@ -1,8 +1,9 @@
 """Read poses in another convention, and move inexact cameras.
 
 Models that predict poses write Gaussians that lie a little beside the pixels of their cameras. The pixels of a view and
-their Gaussians determine its pose. Here the cameras are moved to these poses; whether the cameras or the Gaussians were
-wrong is decided later, from the photos (``gsmerge/facts/move_poses.py``).
+their Gaussians determine its pose. Here the cameras are moved to these poses. If the photos agree better from the poses
+as read, the Gaussians are wrong, and the result says so. Views whose photos disagree are moved later
+(``gsmerge/facts/move_poses.py``).
 """
 
 from __future__ import annotations
@@ -13,7 +14,14 @@ from typing import Any
 import numpy as np
 
 from gsmerge.cameras.frames import solve_pose
-from gsmerge.cameras.score import Correspondences, check_pairs, is_as_near, max_pixels, photo_colors, pixel_errors
+from gsmerge.cameras.score import (
+    Correspondences,
+    check_pairs,
+    is_as_near,
+    max_correctable_px,
+    photo_colors,
+    pixel_errors,
+)
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import camera_depths, is_inside, project_points, robust_weights
 from gsmerge.io.cameras.camera_file import (
@@ -30,8 +38,8 @@ from gsmerge.types import Cameras
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses in one convention: ``viewmats [c,4,4]`` float64, world to camera."""
+class PosesInConvention:
+    """Poses as they are when read in one convention: ``viewmats [c,4,4]`` float64, world to camera."""
 
     convention: Convention
     viewmats: np.ndarray
@@ -47,15 +55,18 @@ def describe_convention(convention: Convention) -> str:
     return f"{convention[0]} matrices with {convention[1]} axes"
 
 
-def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
-    """List the poses ``viewmats [c,4,4]`` as they are in each other convention, without duplicates."""
-    stored, all_poses = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
+def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[PosesInConvention]:
+    """List what poses ``viewmats [c,4,4]``, read in ``convention``, become in each other convention.
+
+    Poses that are equal in two conventions are listed once.
+    """
+    stored, all_poses = from_viewmats(viewmats, convention), [PosesInConvention(convention, viewmats)]
     tolerance = 1e-6  # tolerance for equal poses, relative to the largest number in them
     for other in CONVENTIONS:
         converted = to_viewmats(stored, other)
         stacks = [poses.viewmats for poses in all_poses]
         if not any(np.allclose(converted, stack, atol=tolerance * (1 + np.abs(stack).max())) for stack in stacks):
-            all_poses.append(Poses(other, converted))
+            all_poses.append(PosesInConvention(other, converted))
     return all_poses[1:]
 
 
@@ -66,11 +77,11 @@ class MovedCameras:
     cameras: Cameras
     worst_px: float  # largest median distance of a view's Gaussians from their pixels, before the move
     moves: list[dict[str, Any]]  # of every view, see list_moves; empty if only the principal points were wrong
-    confirmed: bool = False  # True if photos confirm the given cameras, so the Gaussians have to be moved instead
+    confirmed: bool = False  # True if photos confirm the cameras as read, so the Gaussians have to be moved instead
 
     @property
     def note(self) -> str:
-        """Note about the move, one sentence."""
+        """Note for the user about the move, one sentence."""
         if not self.moves:
             x, y = (self.cameras.Ks[:, :2, 2] - (self.cameras.width / 2, self.cameras.height / 2)).mean(0)
             return f"principal points lie ({x:.1f}, {y:.1f}) px from the middle, as the Gaussians' pixels show"
@@ -91,13 +102,14 @@ def move_cameras(
 ) -> MovedCameras | None:
     """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far off.
 
-    ``images [c,h,w,3]`` are photos, which may confirm the given poses.
+    ``images [c,h,w,3]`` are photos, which may confirm the poses as read, or none.
 
-    If changed intrinsics fit as well as moved poses, only principal points in the middle of the image are moved,
-    because these are probably just assumed. Other changes of intrinsics raise SceneError, which names ``source``.
+    If changed intrinsics fit as well as moved poses, the intrinsics are changed instead. Only principal points in the
+    middle of the image may change, because these were probably just assumed. Any other change raises SceneError, which
+    names ``source``. ``names`` are those of the views.
     """
     before = check_pairs(pairs, cameras)
-    if not before.worst_px <= max_pixels(cameras.width, cameras.height):
+    if not before.worst_px <= max_correctable_px(cameras.width, cameras.height):
         return None
     viewmats, errors = cameras.viewmats.astype(np.float64), pixel_errors(pairs, cameras)
     near_px = 0.5  # cameras with smaller errors are not moved
@@ -111,50 +123,54 @@ def move_cameras(
     after = check_pairs(pairs, moved)
     if not after.ok:
         return None
-    other = _fit_intrinsics(pairs, cameras, after.worst_px)
-    if other is not None:
-        _check_assumed(cameras, other, before.worst_px, source)
-        return MovedCameras(other, before.worst_px, [])
+    refitted = _fit_intrinsics(pairs, cameras, after.worst_px)
+    if refitted is not None:
+        _check_assumed(cameras, refitted, before.worst_px, source)
+        return MovedCameras(refitted, before.worst_px, [])
     depth = float(np.median(camera_depths(pairs.points, viewmats[pairs.views])))
     confirmed = len(images) > 0 and _photos_confirm(pairs, images, cameras, moved)
     return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth), confirmed)
 
 
-def _photos_confirm(pairs: Correspondences, images: np.ndarray, given: Cameras, moved: Cameras) -> bool:
-    """Return True if photos agree better from the given poses than from the moved poses.
+def _photos_confirm(pairs: Correspondences, images: np.ndarray, cameras: Cameras, moved: Cameras) -> bool:
+    """Return True if photos agree better from the poses of ``cameras`` than from the ``moved`` poses.
 
-    To compare photos from the given poses, the Gaussians of each view are moved with its camera.
+    The Gaussians lie where the moved cameras show them. For the poses of ``cameras``, the Gaussians of each view are
+    moved back with its camera.
     """
-    motions = matmul(invert(given.viewmats), moved.viewmats)[pairs.views]
+    motions = matmul(invert(cameras.viewmats), moved.viewmats)[pairs.views]
     points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
-    better_share = 0.96  # the given poses are better if they reduce the disagreement between photos to this share
-    limit = better_share * _disagreement(pairs.points, pairs, images, moved)
-    return _disagreement(points, pairs, images, given) < limit
+    better_share = 0.96  # the poses are better if they reduce the disagreement between photos to this share
+    limit = better_share * _measure_disagreement(pairs.points, pairs, images, moved)
+    return _measure_disagreement(points, pairs, images, cameras) < limit
 
 
-def _disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
-    """Measure the median difference in colour between photos of the same points; inf if no point is in two photos."""
+def _measure_disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
+    """Measure the median difference in colour between photos of the same points; inf if no point is in two photos.
+
+    A point's own colour is that of its pixel in ``pairs``. Other views show it where ``points [t,3]`` project.
+    """
     x, y = pairs.pixels.astype(np.int64).T
-    own, errors = photo_colors(images, pairs.views, y, x), []
+    own_colors, errors = photo_colors(images, pairs.views, y, x), []
     for view in range(len(cameras)):
         with np.errstate(all="ignore"):
             xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
         inside = (depth > 0) & is_inside(xy, cameras) & (pairs.views != view)
         column, row = xy[inside].astype(np.int64).T
-        errors.append(np.abs(photo_colors(images, np.full(len(row), view), row, column) - own[inside]).mean(1))
+        errors.append(np.abs(photo_colors(images, np.full(len(row), view), row, column) - own_colors[inside]).mean(1))
     values = np.concatenate(errors)
     return float(np.median(values)) if len(values) else np.inf
 
 
 def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit ``y = slope * x + height`` to each column of points ``[n,d]`` by reweighted least squares.
+    """Fit ``y = slope * x + height`` to each column of ``x [n,d]`` and ``y [n,d]`` by reweighted least squares.
 
     Returns slopes ``[d]``, heights ``[d]`` and the distances ``[n]`` of the points from the lines.
     """
     x, y = (np.ascontiguousarray(values.T) for values in (x, y))
     weights = np.ones(x.shape[1])
     with np.errstate(all="ignore"):
-        line_rounds = 4  # of reweighted least squares
+        line_rounds = 4  # number of rounds of reweighted least squares
         for _ in range(line_rounds):
             mean_x, mean_y = ((weights * values).sum(1, keepdims=True) / weights.sum() for values in (x, y))
             dx, dy = x - mean_x, y - mean_y
@@ -166,9 +182,9 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -> Cameras | None:
-    """Scale and shift the intrinsics of all views alike, so that they fit as well as moved poses; None if they cannot.
+    """Scale and shift the intrinsics of all views alike; None if they then fit worse than moved poses.
 
-    ``moved_px`` is the largest median error of the moved poses, pixels.
+    ``moved_px`` is the largest median error of a view with moved poses, pixels.
     """
     if len(np.unique(pairs.views)) < 2:  # in a single view a shift of the picture looks like a rotation
         return None
@@ -181,23 +197,23 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
     factors, shifts = np.array(lines)[:, :, 0].T
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]
     Ks[:, :2, 2] += shifts
-    other = replace(cameras, Ks=Ks)
-    check = check_pairs(pairs, other)
-    return other if check.ok and is_as_near(check.worst_px, moved_px) else None
+    refitted = replace(cameras, Ks=Ks)
+    check = check_pairs(pairs, refitted)
+    return refitted if check.ok and is_as_near(check.worst_px, moved_px) else None
 
 
-def _check_assumed(cameras: Cameras, other: Cameras, before_px: float, source: str) -> None:
-    """Raise SceneError if ``other`` cameras differ in more than assumed principal points.
+def _check_assumed(cameras: Cameras, refitted: Cameras, before_px: float, source: str) -> None:
+    """Raise SceneError if ``refitted`` intrinsics change more than the assumed principal points of ``cameras``.
 
-    Principal points count as assumed if all are in the middle of the image. ``before_px`` is the median error of the
-    stored cameras, pixels.
+    Principal points count as assumed if all are in the middle of the image. ``before_px`` is the median error of
+    ``cameras``, pixels.
     """
-    factors = other.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
+    factors = refitted.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
     middle = cameras.width / 2, cameras.height / 2
     same_focal = 0.01  # largest relative difference of focal lengths that count as equal
     if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= same_focal).all():
         return
-    x, y = (other.Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
+    x, y = (refitted.Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
     raise SceneError(
         source,
         f"expected intrinsics that fit the Gaussians, found ones that put them {before_px:.1f} px off their pixels in"

@@ -12,9 +12,11 @@ from gsmerge.geometry.transforms import Damping, descend, median, medians, motio
 from gsmerge.kernels import reproject
 from gsmerge.kernels.matrices import eigh, matmul, solve
 
-DAMPING = Damping(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
-ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4  # numbers of free intrinsics: fx = fy; fx, fy; fx, fy, cx, cy
-_Fit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]  # intrinsics, poses, normal equations
+POSE_DAMPING = Damping(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
+# Numbers of intrinsics that are solved for: one for fx = fy, two for fx and fy, four for fx, fy, cx and cy
+ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4
+# Intrinsics, poses, and their curvature, slope and squared error; see _linearise
+_PoseFit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]
 
 
 def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
@@ -42,30 +44,32 @@ def refine_poses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
 
-    Also solves for ``free`` intrinsics that are common to the views: none, ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS.
-    Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the points do not determine
-    them.
+    ``free`` is the number of intrinsics, common to all views, that are solved for as well: 0, ONE_FOCAL, TWO_FOCALS or
+    ALL_INTRINSICS. Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the points do
+    not determine them.
     """
 
-    def fit(new_K: np.ndarray, new_poses: np.ndarray) -> _Fit:
+    def linearise(new_K: np.ndarray, new_poses: np.ndarray) -> _PoseFit:
         return new_K, new_poses, _linearise(points, pixels, new_K, new_poses, free)
 
-    def step(state: _Fit, damping: float) -> _Fit:
+    def step(state: _PoseFit, damping: float) -> _PoseFit:
+        """Return the fit after one damped Gauss-Newton step."""
         current_K, current_poses, (curvature, slope, _) = state
         with np.errstate(all="ignore"):  # an overflowing step does not reduce the error, so it is rejected
-            change, motions = _step(curvature, slope, damping)
-            return fit(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
+            change, motions = _solve_normal_equations(curvature, slope, damping)
+            return linearise(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
 
-    K, poses, _ = descend(fit(K, poses), lambda state: state[2][2], step, DAMPING)
+    K, poses, _ = descend(linearise(K, poses), lambda state: state[2][2], step, POSE_DAMPING)
     return K, poses
 
 
 def _linearise(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray, free: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return Gauss-Newton's curvature ``[v,6+f,6+f]`` and slope ``[v,6+f]`` of the squared error, and the error.
+    """Return Gauss-Newton's curvature ``[v,6+f,6+f]`` and slope ``[v,6+f]`` of the squared error, and this error.
 
-    The parameters are rotation and shift of each camera, the logarithms of focal lengths, and the principal point.
+    The 6 parameters of a view are rotation and shift of its camera. The f = ``free`` other ones are logarithms of focal
+    lengths, and then the principal point.
     """
     size = 6 + free
     curvature, slope, error = np.empty((len(poses), size, size)), np.empty((len(poses), size)), 0.0
@@ -79,12 +83,12 @@ def _linearise(
     return curvature, slope, error
 
 
-def _step(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return changes ``[f]`` of the common intrinsics and motions ``[v,6]`` of the cameras."""
+def _solve_normal_equations(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Solve for the changes ``[f]`` of the common intrinsics and the motions ``[v,6]`` of the cameras."""
     size = curvature.shape[1]
     damped = curvature + damping * np.eye(size) * curvature
     pose_slope, mixed = slope[:, :6, None], damped[:, :6, 6:]
-    if size == 6:
+    if size == 6:  # no intrinsics are free, so each view has a solution of its own
         return np.empty(0), -solve(damped, pose_slope)[..., 0]
     # the Schur complement eliminates the poses
     solved = solve(damped[:, :6, :6], np.concatenate([pose_slope, mixed], 2))
@@ -97,7 +101,7 @@ def _step(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.
 
 
 def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Apply changes of the logarithms of focal lengths and of the principal point; see :func:`_linearise`."""
+    """Return intrinsics changed by the parameters ``change [f]`` of :func:`_linearise`."""
     K = K.copy()
     if len(change):
         K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]
@@ -108,13 +112,13 @@ def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
 def focal_uncertainty(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], Ks: np.ndarray, poses: np.ndarray
 ) -> float:
-    """Estimate the relative standard error of one focal length for all views, if pixels have an error of 1.
+    """Estimate the relative standard error of one focal length for all views, if pixels have an error of 1 pixel.
 
-    ``points [n,3]`` and ``pixels [n,2]`` are given for each view. The result is inf for points in a plane.
+    Each view has ``points [n,3]`` and their ``pixels [n,2]``. The result is inf for points in a plane.
     """
-    weight = 0.0
-    for p, q, K, pose in zip(points, pixels, Ks, poses, strict=True):
-        (curvature,), _, _ = _linearise([p], [q], K, pose[None], ONE_FOCAL)
+    weight = 0.0  # inverse of the squared error
+    for view_points, view_pixels, K, pose in zip(points, pixels, Ks, poses, strict=True):
+        (curvature,), _, _ = _linearise([view_points], [view_pixels], K, pose[None], ONE_FOCAL)
         try:
             explained = matmul(curvature[6, :6], solve(curvature[:6, :6], curvature[:6, 6]))
         except np.linalg.LinAlgError:  # all points coincide
@@ -135,8 +139,8 @@ def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
 def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, float]:
     """Solve for the projective camera ``[3,4]`` that shows points ``[n,3]`` nearest to their ``pixels [n,2]``.
 
-    A projective camera is any ``[3,4]`` matrix. It is solved by the direct linear transform with reweighting (Hartley
-    and Zisserman 2004, section 7.1). Also returns the median distance from the pixels.
+    A projective camera is any ``[3,4]`` matrix. It is solved for by the direct linear transform with reweighting
+    (Hartley and Zisserman 2004, section 7.1). Also returns the median distance of the points from their pixels.
     """
     middle = medians(points)
     unit = median(np.abs(points - middle)) or 1.0
@@ -144,12 +148,13 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     centre, size = pixels.mean(0), float(pixels.std()) or 1.0
     targets = (pixels - centre) / size
     zero = np.zeros_like(local)
+    # equations of the camera's entries that are 0 if a point projects to the column, and the row, of its pixel
     across = np.concatenate([local, zero, -targets[:, :1] * local], 1)
     down = np.concatenate([zero, local, -targets[:, 1:] * local], 1)
     weights = np.ones(len(points))
     camera, error = np.zeros((3, local.shape[1])), np.full(len(points), np.inf)
-    projective_rounds = 8  # of reweighted least squares
-    smallest_error = 1e-6  # divided by the standard deviation of the pixels
+    projective_rounds = 8  # number of rounds of reweighted least squares
+    smallest_error = 1e-6  # added to errors and depths; unit: standard deviation of the pixels
     for _ in range(projective_rounds):
         equations = np.concatenate([across * weights[:, None], down * weights[:, None]])
         camera = eigh(matmul(equations.T, equations))[1][:, 0].reshape(3, -1)

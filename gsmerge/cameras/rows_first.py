@@ -1,8 +1,8 @@
 """Find the cameras that show the Gaussians of a file in place, and the pixel of each row if rows are pixels in order.
 
-Rows in plain order are recognised by one formula: the pose of each view follows from its rows, and one similarity moves
-the file's cameras there. Other rows are followed through the pixels in each frame that exporters use, since some pixels
-may have no row. All other rows get cameras alone, which the colours of the photos choose.
+Rows in plain order determine the pose of each view. They are recognised if one similarity moves the file's cameras to
+these poses. If some pixels may have no row, the rows are followed through the pixels, in each frame that exporters use.
+Rows that are in neither order get cameras alone, which are chosen by the colours of the photos.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from gsmerge.cameras.dropped_rows import follow_rows
 from gsmerge.cameras.estimate import estimate_cameras
-from gsmerge.cameras.frames import exporter_frames, fit_frame, own_poses, scale_by
+from gsmerge.cameras.frames import exporter_frames, fit_frame, scale_by, solve_poses
 from gsmerge.cameras.grids import Grid, PlacedGrid, file_grids, photo_grid, with_photo_size, with_poses
 from gsmerge.cameras.layouts import ESTIMATED, NO_CAMERAS_USED, Layout
 from gsmerge.cameras.poses import move_cameras, other_conventions
@@ -29,7 +29,7 @@ from gsmerge.cameras.score import (
     Alignment,
     AlignmentInput,
     check_pairs,
-    max_pixels,
+    max_correctable_px,
     pixel_errors,
 )
 from gsmerge.errors import SceneError
@@ -41,9 +41,9 @@ from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, PhotoTransform, Size,
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
-_EVIDENCE = "Gaussians' places in their pixels"  # for a frame, in words
-_PLAIN_PX = 0.5  # rows in order that are nearer to their pixels, pixels, need no other cameras
-_MOST_PLACES = 1 << 27  # largest product of rows and views that are followed; each takes four bytes
+_EVIDENCE = "Gaussians' places in their pixels"  # what shows that a frame is right, in words
+_PLAIN_PX = 0.5  # if rows in order are nearer to their pixels than this, in pixels, no other cameras are tried
+_MOST_PLACES = 1 << 27  # largest number of rows times views for which rows are followed; each takes four bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class RowSource:
 
     @cached_property
     def own_cameras(self) -> CameraFile | None:
-        """Cameras that the rows themselves show; None if they are no grid."""
+        """Cameras that are estimated from the rows alone; None if the rows are no grid."""
         return estimate_cameras(Path(self.ply.info.path), self.ply.gaussians.means, self.ply.valid)
 
     def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
@@ -83,9 +83,9 @@ class RowSource:
 class Recovery:
     """Rows that are the pixels of a grid, with the grid's cameras moved into the frame of the Gaussians."""
 
-    place: PlacedGrid
-    layout: Layout
-    alignment: Alignment
+    place: PlacedGrid  # the grid, and the frame of the Gaussians
+    layout: Layout  # the pixel of each row
+    alignment: Alignment  # how near the rows are to their pixels
 
     @property
     def frame(self) -> Similarity:
@@ -112,9 +112,11 @@ class AlignmentResult:
     transform: PhotoTransform | None = None  # applied to the photos
     recovery: Recovery | None = None  # where the pixels of the rows lie; None without pixels
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
-    given: np.ndarray | None = None  # ``[c,4,4]`` given poses, to which views are to be moved with their Gaussians
+    # ``[c,4,4]`` poses that photos confirm, to which views are to be moved with their Gaussians; None without any
+    confirmed_viewmats: np.ndarray | None = None
     problem: str | None = None  # why the rows belong to no pixels; None if they do
-    own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
+    # If rows are no pixels of these cameras, but are a grid by themselves: the number of its views; otherwise 0
+    own_views: int = 0
 
 
 def align(
@@ -132,7 +134,7 @@ def align(
 
     Args:
         ply: The file's rows.
-        camera_file: Its cameras.
+        camera_file: The file's cameras.
         photos: c uint8 photos of one size, or none.
         order: The order of the rows if it is known, see :class:`gsmerge.settings.reading.ReadHints`.
         scale: Length of one unit of the cameras' world in the world of the Gaussians, if it is given.
@@ -144,31 +146,31 @@ def align(
     """
     camera_file = with_photo_size(camera_file, photo_size(photos))
     source = RowSource(ply, camera_file, photos, order, scale)
-    grids, problem = file_grids(camera_file, source.size), None
+    grids, shape_error = file_grids(camera_file, source.size), None
     try:
         grids.insert(0, photo_grid(camera_file, source.size))
     except SceneError as error:  # photos of another shape, to which cameras may have to be cropped
-        problem = error
-    recovery = next(filter(None, (_find_pixels(source, grid) for grid in grids)), None)
+        shape_error = error
+    recovery = next(filter(None, (_recover_pixels(source, grid) for grid in grids)), None)
     if recovery is not None:
         return _make_result(source, recovery)
-    if problem is not None and not grids:
-        raise problem
+    if shape_error is not None and not grids:
+        raise shape_error
     try:
-        return _choose_cameras(source, grids[0], frames)
+        return _align_without_pixels(source, grids[0], frames)
     except SceneError as error:
-        raise problem or error from error
+        raise shape_error or error from error
 
 
-def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
-    """Find the pixels of the rows in a grid; None if they are not the pixels in order."""
+def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
+    """Find the pixels of the rows in a grid, and the frame of its cameras; None if the rows are not pixels in order."""
     if source.order == "none":
         return None
     count, num_pixels = len(source.ply.gaussians), len(grid.cameras) * math.prod(grid.size)
     layout, layers = Layout(len(grid.cameras), *grid.size), count // num_pixels
     if source.camera_file.pixel_ids is not None:
         layouts = [replace(layout, ids=source.camera_file.pixel_ids)]
-    elif count != layers * num_pixels or source.order == "view-fastest":
+    elif count != layers * num_pixels or source.order == "view-fastest":  # some pixels may have no row
         return _follow_order(source, grid, _list_frames(source, grid))
     elif layers == 1:  # views are in the order of the camera file, or of the names
         names = source.camera_file.names
@@ -178,7 +180,8 @@ def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     else:  # several Gaussians of a pixel follow each other, or there are several layers of all pixels
         rows = np.arange(count)
         layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
-    min_rows, min_share = 24, 0.05  # finite rows needed to find pixels: this number, or this share of all rows
+    # finite rows that are needed: this number or this share of all rows, whichever is smaller
+    min_rows, min_share = 24, 0.05
     if int(source.ply.valid.sum()) < min(min_rows, min_share * count):
         return None
     return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
@@ -187,74 +190,84 @@ def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
 def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | None:
     """Find cameras under which rows lie in the pixels of a layout; None if there are none.
 
-    The cameras are those of the grid, as stored, in another frame or convention, or else each moved to its rows.
+    The cameras of the grid are tried as stored, then in another frame or convention, and last each moved to its rows.
     """
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(layout)
     shuffled = replace(pairs, pixels=np.random.default_rng(0).permutation(pairs.pixels))
 
     def accept(grid: Grid, frame: Similarity, limit: float) -> Recovery | None:
-        cameras = frame.move(grid.cameras)
+        """Return the result for a frame; None if a view's median distance from the pixels is above ``limit`` pixels."""
+        cameras = frame.move_cameras(grid.cameras)
         alignment = check_pairs(pairs, cameras)
         far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
-        is_right = alignment.ok and alignment.worst_px <= limit and median(pixel_errors(shuffled, cameras)) >= far_px
-        is_near = pixel_errors(pairs, cameras) <= max_pixels(*grid.size)
-        max_share = 0.75  # share of rows near their pixels in layers: of two layers, one may belong to other views
-        is_right = is_right and (layout.ids is None or float(is_near.mean()) >= max_share)
+        is_near = pixel_errors(pairs, cameras) <= max_correctable_px(*grid.size)
+        min_share = 0.75  # least share of rows near their pixels; with less, one of two layers belongs to other views
+        is_right = (
+            alignment.ok
+            and alignment.worst_px <= limit
+            and median(pixel_errors(shuffled, cameras)) >= far_px
+            and (layout.ids is None or float(is_near.mean()) >= min_share)
+        )
         return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if is_right else None
 
     usual = exporter_frames(grid.cameras, source.scale)[0]
     if recovery := accept(grid, usual, _PLAIN_PX):
         return recovery
-    own = own_poses(pairs, grid.cameras.Ks)
-    if len(own) == len(grid.cameras):
-        poses = np.stack([own[view] for view in range(len(own))])
-        own_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
-        rounding_px = 0.1  # by which cameras in one frame may fit worse than own poses, since files round numbers
-        limit = max(AS_NEAR * own_px, own_px + rounding_px)
-        for other in _conventions(source, grid):
+    solved = solve_poses(pairs, grid.cameras.Ks)
+    if len(solved) == len(grid.cameras):
+        poses = np.stack([solved[view] for view in range(len(solved))])
+        solved_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
+        rounding_px = 0.1  # the file's cameras may fit worse than solved poses by this, since files round numbers
+        limit = max(AS_NEAR * solved_px, solved_px + rounding_px)
+        for other in _list_conventions(source, grid):
             frame = fit_frame(other.cameras, poses, source.scale)
             if recovery := accept(other, IDENTITY, limit) or accept(other, frame, limit):
                 return recovery
-    return accept(_move_cameras(source, grid, layout), IDENTITY, np.inf)
+    return accept(_move_to_rows(source, grid, layout), IDENTITY, np.inf)
 
 
-def _conventions(source: RowSource, grid: Grid) -> Iterator[Grid]:
-    """Yield a grid with its poses as stored, then in each other convention."""
+def _list_conventions(source: RowSource, grid: Grid) -> Iterator[Grid]:
+    """Yield the grid with its poses as stored, then with its poses in each other convention."""
     yield grid
     for poses in other_conventions(source.camera_file.viewmats, source.camera_file.convention):
         yield with_poses(grid, poses)
 
 
-def _move_cameras(source: RowSource, grid: Grid, layout: Layout) -> Grid:
-    """Move inexact cameras so that they show rows in their pixels; the same grid if they are too far off."""
+def _move_to_rows(source: RowSource, grid: Grid, layout: Layout) -> Grid:
+    """Return a grid whose inexact cameras are moved to show rows in their pixels; the same grid if they are too far.
+
+    If photos confirm the poses as read, the new grid has these as ``confirmed_viewmats``.
+    """
     inputs = source.inputs(grid, photos=False)
     moved_gaussians = 2000  # Gaussians of a view that its moved pose is solved from
     pairs = inputs.pairs(layout, moved_gaussians)
-    if not check_pairs(pairs, grid.cameras).worst_px <= max_pixels(*grid.size):
+    if not check_pairs(pairs, grid.cameras).worst_px <= max_correctable_px(*grid.size):
         return grid
     path, names = str(source.camera_file.path), source.camera_file.names
     moved = move_cameras(pairs, grid.cameras, names, path, source.inputs(grid).images)
     if moved is None:
         return grid
-    given, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
-    return replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
+    confirmed, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
+    return replace(
+        grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, confirmed_viewmats=confirmed
+    )
 
 
 def _follow_order(source: RowSource, grid: Grid, frames: Iterable[Similarity]) -> Recovery | None:
-    """Take rows as pixels in order of which some have no row, in one of the ``frames``; None for rows in another order.
+    """Find the pixels of rows that are in the order of the pixels, where some pixels have no row; None if they are not.
 
-    The rows of a view follow each other, or else those of a pixel.
+    Each of ``frames`` is tried. Either the rows of a view follow each other, or the rows of one pixel in all views do.
     """
     rows = np.flatnonzero(source.ply.valid)
     if len(rows) > len(grid.cameras) * math.prod(grid.size) or len(rows) * len(grid.cameras) > _MOST_PLACES:
-        return None
+        return None  # there are more rows than pixels, or too many to follow
     orders = [order for order in ("view-major", "view-fastest") if source.order in ("auto", order)]
     points = np.ascontiguousarray(source.ply.gaussians.means[rows], np.float32)
     for frame in frames:
         place = PlacedGrid(grid, frame, _EVIDENCE)
         for order in orders:
-            ids = _follow(points, place.cameras, mixed=order == "view-fastest")
+            ids = _follow_pixels(points, place.cameras, mixed=order == "view-fastest")
             if ids is not None:
                 pixel_ids = np.full(len(source.ply.gaussians), -1)
                 pixel_ids[rows] = ids
@@ -265,21 +278,24 @@ def _follow_order(source: RowSource, grid: Grid, frames: Iterable[Similarity]) -
 
 
 def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
-    """Yield the frames of exporters, and the frame in which cameras lie where the rows themselves show them."""
+    """Yield the frames of exporters, and the frame that moves cameras to where the rows alone show them."""
     yield from exporter_frames(grid.cameras, source.scale)
     if source.own_cameras is not None and len(source.own_cameras) == len(grid.cameras):
         yield fit_frame(grid.cameras, source.own_cameras.viewmats, source.scale)
 
 
-def _follow(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
-    """Find the pixels ``[n]`` of rows in the order of pixels, -1 for a few rows; None for rows in another order."""
+def _follow_pixels(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
+    """Find the pixels ``[n]`` of rows in the order of the pixels; None for rows in another order.
+
+    A few rows may have no pixel, -1. ``mixed``: the rows of one pixel in all views follow each other.
+    """
     matrices = np.ascontiguousarray(cameras.viewmats, np.float64), np.ascontiguousarray(cameras.Ks, np.float64)
     ids = None
     first_rows = 20_000  # rows that must follow the order of the pixels before all rows are tried
     min_placed = 0.99  # share of the rows that must have a pixel
-    for tried in (points[:first_rows], points):  # the first rows rule out most other orders
-        ids = follow_rows(tried, *matrices, cameras.width, cameras.height, mixed=mixed)
-        if (ids >= 0).sum() < min_placed * len(tried):
+    for part in (points[:first_rows], points):  # the first rows rule out most other orders
+        ids = follow_rows(part, *matrices, cameras.width, cameras.height, mixed=mixed)
+        if (ids >= 0).sum() < min_placed * len(part):
             return None
     return ids
 
@@ -287,20 +303,20 @@ def _follow(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray 
 # Rows without pixels, and results
 
 
-def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
-    """Choose cameras that see rows without pixels.
+def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
+    """Choose the cameras that see rows for which no pixels were found.
 
     Raises SceneError if no cameras see them, or if the rows turn out to be pixels of other cameras.
     """
-    from gsmerge.cameras.explain import check_frame, count_error
+    from gsmerge.cameras.explain import no_pixels_error, refuse_other_cameras
     from gsmerge.cameras.unaligned import choose_cameras
     from gsmerge.cameras.upright import solve_upright, upright_rotation
 
-    camera_file, inputs = source.camera_file, source.inputs(grid)
-    check_frame(inputs, camera_file)
+    inputs = source.inputs(grid)
+    refuse_other_cameras(inputs, source.camera_file)
     if source.scale is not None:
-        grid = replace(grid, cameras=scale_by(source.scale).move(grid.cameras))
-    no_pixels, more_notes = count_error(source.ply.info, grid.cameras), list[str]()
+        grid = replace(grid, cameras=scale_by(source.scale).move_cameras(grid.cameras))
+    no_pixels, more_notes = no_pixels_error(source.ply.info, grid.cameras), list[str]()
     rotation = upright_rotation(inputs)
     if rotation is None:
         place, more_notes = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)
@@ -310,7 +326,7 @@ def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence
     cameras, camera_file = place.cameras, place.grid.camera_file
     if place.frame is not IDENTITY:
         recovery = None if source.order == "none" else _follow_order(source, grid, [place.frame])
-        if recovery is not None:  # rows that say too little of their scale, which photos show
+        if recovery is not None:  # the rows alone did not show their scale, but the photos did
             return _make_result(source, recovery)
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
     notes = (*place.notes(source.camera_file.convention), *more_notes)
@@ -327,9 +343,9 @@ def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence
 
 
 def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
-    """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
+    """Make the result for rows that are pixels, with cameras and poses in the frame of the Gaussians."""
     place, grid, usual = recovery.place, recovery.place.grid, source.camera_file
-    inputs, notes = source.inputs(grid), place.notes(usual.convention)
+    inputs, notes, confirmed = source.inputs(grid), place.notes(usual.convention), grid.confirmed_viewmats
     free_pages(vars(inputs.gaussians).values())  # the search has read all rows
     if usual.source == ESTIMATED:
         separate = len(set(map(bytes, usual.Ks))) > 1
@@ -344,5 +360,5 @@ def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
         transform=grid.transform,
         recovery=recovery,
         moves=grid.moves,
-        given=None if grid.given is None else place.frame.move_viewmats(grid.given),
+        confirmed_viewmats=None if confirmed is None else place.frame.move_viewmats(confirmed),
     )

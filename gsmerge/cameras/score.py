@@ -19,10 +19,11 @@ SHUFFLED_MARGIN = 5.0  # factor by which Gaussians must be nearer to their pixel
 # 0.72 / sqrt(n) of the median, so a ratio of 1.15 is three standard errors. Files round the numbers of cameras, which
 # displaces projections by up to 0.02 pixels
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
-SCORED_GAUSSIANS, MIN_SCORED_GAUSSIANS = 6000, 60  # Gaussians of a score: of all views, and least of each view
+SCORED_GAUSSIANS, MIN_SCORED_GAUSSIANS = 6000, 60  # Gaussians of a score: in all views, and at least in each view
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
-MAX_PX, MAX_SHARE = 12.0, 0.05  # error up to which cameras are moved: pixels, and share of the side of small images
-MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some of them a little beyond
+# Largest error that moving a camera may correct: in pixels, and as a share of the side of small images
+MAX_PX, MAX_SHARE = 12.0, 0.05
+MAX_MEDIAN_PX = 1.5  # networks move a Gaussian within its pixel, and some of them a little beyond
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,10 @@ class AlignmentInput:
     scale: float | None = None  # length of one unit of the cameras' world in the Gaussians' world, if given
 
     def pairs(self, layout: Layout, per_view: int = 0) -> Correspondences:
-        """Return a sample of the valid rows of a layout, with their pixels and views; 0: as many as for a score."""
+        """Return about ``per_view`` valid rows of each view of a layout, with their pixels and views.
+
+        ``per_view`` 0: as many as a score needs.
+        """
         per_view = per_view or max(MIN_SCORED_GAUSSIANS, SCORED_GAUSSIANS // layout.views)
         return find_correspondences(self.gaussians.means, self.valid, layout, per_view)
 
@@ -84,7 +88,7 @@ class Alignment:
     median_px: tuple[float, ...]
     share_in_front: float  # share of all checked Gaussians with positive depth in their own view
     share_within_1px: float  # share of all checked Gaussians at most one pixel from their pixel's centre
-    share_near: float  # share of all checked Gaussians with a distance up to that at which cameras are moved
+    share_near: float  # share of all checked Gaussians that are near enough for moving a camera to correct them
     limit_px: float  # largest median that counts as aligned
     ok: bool  # True if every view's median is below the limit and most Gaussians are in front
 
@@ -109,7 +113,7 @@ def pixel_limit(width: int, height: int) -> float:
     return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
 
 
-def max_pixels(width: int, height: int) -> float:
+def max_correctable_px(width: int, height: int) -> float:
     """Return the largest median error, pixels, that moving a camera may correct."""
     return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
 
@@ -136,7 +140,7 @@ def check_pixels(scene: Scene) -> Alignment:
 
     Only the foremost Gaussian of a pixel counts.
     """
-    free_pages(vars(scene.gaussians).values())
+    free_pages(vars(scene.gaussians).values())  # earlier steps have read all rows, and a sample is enough here
     width, views = scene.cameras.width, len(scene)
     step = spread_step(-(-scene.pixels_per_view // MAX_CHECKED), width)
     sample = np.arange(0, scene.pixels_per_view, step)
@@ -157,7 +161,8 @@ def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
         for view_errors in np.split(errors, ends[:-1])
     )
     count = max(1, len(errors))
-    limits = sys.float_info.max, 1, max_pixels(cameras.width, cameras.height)
+    # points behind their camera have an infinite error, so all finite errors are in front
+    limits = sys.float_info.max, 1, max_correctable_px(cameras.width, cameras.height)
     in_front, within_1px, near = (float((errors <= px).sum()) / count for px in limits)
     is_near = [median_px < limit for median_px in medians if not math.isnan(median_px)]
     is_ok = bool(is_near) and all(is_near) and in_front > 0.5

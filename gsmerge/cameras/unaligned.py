@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.cameras.frames import exporter_frames
 from gsmerge.cameras.grids import Grid, PlacedGrid, with_poses
-from gsmerge.cameras.poses import Poses, other_conventions
+from gsmerge.cameras.poses import PosesInConvention, other_conventions
 from gsmerge.cameras.score import AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
@@ -21,22 +21,24 @@ from gsmerge.types import Cameras, Gaussians
 
 # Colour error, divided by the colour error of shuffled pixels. Above this share colours agree no better than at random
 RANDOM_SHARE = 0.85
-# Least score of another convention, divided by the score of the usual one: if photos decide, and if none do
+# Least score of another convention, divided by that of the usual one: with colours in the score, and without
 _COLOR_MARGIN, _MARGIN = 1.3, 2.0
-_FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the given frame
-_SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to count those that cameras see
-# Gaussians compared in other conventions and frames. They have 0.4 % of noise; scores that matter differ by 5 % or more
+_FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the cameras as they are
+_SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to count those that cameras see
+# Gaussians compared in other conventions and frames. With so many, scores have an error of 0.4 %. Scores that matter
+# differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
 MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
 # Largest depth of a foremost Gaussian, divided by the least depth in its cell; and mean number of Gaussians per cell
 _FRONT, _PER_CELL = 1.05, 3
-_SCALES = np.geomspace(1 / 1300, 1300, 115)  # of the cameras' positions, tried in turn: engines' units differ by 1000
+# Scales of the cameras' positions, tried in turn; the units of programs differ by factors of up to 1000
+_SCALES = np.geomspace(1 / 1300, 1300, 115)
 # Finer searches around the best scale: range (natural logarithm), steps, Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
-# Where the Gaussians' middle is tried in a picture to find a shift: x and y in widths and heights, and logarithm of
-# the depth in radii of the scene. Colours agree over about a tenth of a picture
+# Places in a picture at which the middle of the Gaussians is tried, to find a shift: x in widths, y in heights, and the
+# logarithm of the depth in radii of the scene. Steps are a tenth of a picture, over which colours still agree
 _PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
-# Searches around the best places: number of Gaussians, places that are kept, and steps
+# Searches around the best places: number of Gaussians, number of places that are kept, and size of a step
 _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
 
 
@@ -49,7 +51,7 @@ class CameraCheck:
     # or if the colours hardly vary
     color_ratio: float
     ok: bool  # True if these are probably the cameras of these Gaussians
-    num_compared: int = 0  # Gaussians whose colours were compared in at least one photo
+    num_compared: int = 0  # number of Gaussians whose colours were compared in at least one photo
     ratio_error: float = np.nan  # standard error of the ratio, from sampling alone
 
     @property
@@ -78,10 +80,11 @@ def check_cameras(
 ) -> CameraCheck:
     """Measure the share of sampled Gaussians that views see, and how well their colours fit ``images [c,h,w,3]``.
 
-    ``images`` may be empty. With ``foremost``, the colours of hidden Gaussians do not count. ``hiding`` are further
-    points ``[n,3]`` that hide Gaussians, but have no colours themselves.
+    About ``samples`` of the ``valid [n]`` Gaussians are measured. ``images`` may be empty. With ``foremost``, the
+    colours of hidden Gaussians do not count. ``hiding`` are further points ``[m,3]`` that hide Gaussians, but have no
+    colours themselves.
     """
-    min_gaussians, max_projected = 200, 4_000_000  # least number of Gaussians, and most Gaussians times cameras
+    min_gaussians, max_projected = 200, 4_000_000  # least number of Gaussians, and largest product with the cameras
     samples = min(samples, max(min_gaussians, max_projected // len(cameras)))
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
@@ -103,9 +106,9 @@ def check_cameras(
             seen = np.flatnonzero(inside[view])
             column, row = xy[view, seen].astype(np.int64).T
             if foremost:
-                counts = _are_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
-                counts &= seen < len(rows)
-                seen, column, row = seen[counts], column[counts], row[counts]
+                is_front = _find_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
+                is_front &= seen < len(rows)  # the other points only hide
+                seen, column, row = seen[is_front], column[is_front], row[is_front]
             photo = photo_colors(images, np.full(len(seen), first_view + view), row, column)
             if (photo == photo[:1]).all():  # a view without a photo is black
                 continue
@@ -137,11 +140,11 @@ def _mean_difference(colors: np.ndarray, other_colors: np.ndarray) -> np.ndarray
     return np.asarray((red + green + blue) / 3)
 
 
-def _are_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
-    """Return True for each of n points that is about as near as the nearest point of its cell.
+def _find_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
+    """Return a mask ``[n]`` of the points that are about as near as the nearest point of their cell.
 
     ``column [n]`` and ``row [n]`` are the pixels of the points, and ``depth [n]`` their depths. A cell is a square of
-    pixels; its side follows from the ``area`` of the picture, pixels.
+    pixels. The picture has ``area`` pixels, and cells are so large that each has a few points.
     """
     if not len(row):
         return np.zeros(0, bool)
@@ -155,12 +158,12 @@ def _are_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: 
 
 def choose_poses(
     gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray, convention: Convention
-) -> tuple[Poses | None, CameraCheck, str | None]:
+) -> tuple[PosesInConvention | None, CameraCheck, str | None]:
     """Choose the pose convention in which the cameras see most Gaussians and the colours fit best.
 
-    ``cameras`` are in the usual ``convention``; for the other arguments see :func:`check_cameras`. Returns the poses in
-    another convention, or None if none is clearly better than the usual one. Also returns the check of the chosen
-    poses, and a note if another convention fits the photos as well.
+    ``cameras`` are in the usual ``convention``; for the other arguments see :func:`check_cameras`. Returns three
+    results: the poses in another convention, or None if none is clearly better than the usual one; the check of the
+    chosen poses; and a note, if another convention fits the photos as well, or None.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
@@ -184,25 +187,28 @@ def choose_poses(
 def choose_cameras(
     inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], no_pixels: SceneError
 ) -> tuple[PlacedGrid, list[str]]:
-    """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; also return notes.
+    """Choose the cameras that see the Gaussians: unchanged, in another frame, or in another convention.
 
-    ``frames`` are the frames that a file gives. The usual frames of exporters are tried next. The error ``no_pixels``
-    explains why the rows have no pixels. It is raised, with what was tried, if no camera sees the Gaussians.
+    ``frames`` are the frames that a file gives, which are tried first. The usual frames of exporters are tried next.
+    Returns the grid with these cameras, and notes. The error ``no_pixels`` explains why the rows have no pixels. It is
+    raised, with what was tried, if no cameras see the Gaussians.
     """
     rows, unchanged = (inputs.gaussians, inputs.valid), PlacedGrid(grid, IDENTITY)
     if frames:
-        checks = [check_cameras(*rows, frame.move(inputs.cameras), inputs.images) for frame in (IDENTITY, *frames)]
+        checks = [
+            check_cameras(*rows, frame.move_cameras(inputs.cameras), inputs.images) for frame in (IDENTITY, *frames)
+        ]
         best = int(np.argmax([check.score * check.ok for check in checks]))
         if best > 0:
             return replace(unchanged, frame=frames[best - 1]), []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
-    other = _choose_frame(inputs, check)
-    if other is not None:
-        _check_colors(inputs, other.move(inputs.cameras), other.description, no_pixels)
-        return PlacedGrid(grid, other, "photos' colours"), []
+    frame = _choose_frame(inputs, check)
+    if frame is not None:
+        _check_colors(inputs, frame.move_cameras(inputs.cameras), frame.description, no_pixels)
+        return PlacedGrid(grid, frame, "photos' colours"), []
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
-        if check.share_seen > 0.5:  # of the Gaussians: where these lie does not speak against the cameras
+        if check.share_seen > 0.5:  # most Gaussians are in view, so only the colours contradict the cameras
             remedy += "; if the cameras are right, the photos or the colours of the file are wrong: --images none keeps"
             remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"
         raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
@@ -229,10 +235,11 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels
 
 
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
-    """Choose an exporter's frame in which the colours fit the photos clearly better than in the given frame; or None.
+    """Choose a frame in which the colours fit the photos clearly better than in the frame of the cameras; else None.
 
-    Colours fit best at the true scale. The chosen frame must therefore fit better than the same frame at nearby scales.
-    If no frame does so at the scale of the cameras, the scale is solved for.
+    The frames are those of exporters. ``usual`` is the check of the cameras as they are. Colours fit best at the true
+    scale, so the chosen frame must fit better than the same frame at nearby scales. If no frame does so at the scale of
+    the cameras, the scale is solved for.
     """
     if not len(inputs.images):
         return None
@@ -241,20 +248,21 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     stands_out = _stands_out(inputs, best, score)
     # views without a photo are black; a single photo fits somewhere in any scene
     if inputs.scale is None and not stands_out and inputs.images.any((1, 2, 3)).sum() > 1:
+        # rotated into the first camera, turned to y up, and moved into the first camera
         solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
         best, score = _best_frame(inputs, [best, *solved, *([] if usual.ok else _solve_shift(inputs))])
         stands_out = _stands_out(inputs, best, score)
     if best is IDENTITY or not stands_out:
         return None
-    given_score = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
-    return best if score > _FRAME_GAIN * given_score else None
+    usual_score = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
+    return best if score > _FRAME_GAIN * usual_score else None
 
 
 def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
-    """Score the cameras in a frame; 0 if the photos do not decide."""
+    """Return the score of the cameras in a frame, see :class:`CameraCheck`; 0 if the photos do not decide."""
     # the first camera is left out, because it may see all Gaussians at any scale
     later = slice(1 if len(inputs.cameras) > 1 else 0, None)
-    cameras = frame.move(inputs.cameras)[later]
+    cameras = frame.move_cameras(inputs.cameras)[later]
     check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images[later], samples)
     return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
 
@@ -262,13 +270,13 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMP
 def _best_frame(
     inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
 ) -> tuple[Similarity, float]:
-    """Return the first frame with the highest score, and the score."""
+    """Return the frame with the highest score, the first one of equals, and its score."""
     scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
     return max(scored, key=lambda frame_and_score: frame_and_score[1])
 
 
 def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool:
-    """Return True if the ``score`` of a frame is clearly higher than at scales two steps away."""
+    """Return True if the ``score`` of a frame is clearly higher than its scores at scales two steps of _SCALES away."""
     two_steps = float(_SCALES[2] / _SCALES[0])
     neighbour_scores = (_score_frame(inputs, _scale_frame(frame, factor)) for factor in (1 / two_steps, two_steps))
     peak_gain = 1.05  # least score of a scale chosen by colours, divided by the score of a scale two steps away
@@ -276,7 +284,7 @@ def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool
 
 
 def _scale_frame(frame: Similarity, factor: float) -> Similarity:
-    """Multiply the scale of a frame by ``factor``, about the origin of the Gaussians."""
+    """Return a frame whose scale is ``factor`` times that of ``frame``, about the origin of the Gaussians."""
     scale = factor * frame.scale
     text = f"positions scaled by {scale:.4g} (--hint scene_scale={scale:.4g})"
     name = frame.description.partition("positions scaled")[0].removesuffix(", ")
@@ -285,10 +293,10 @@ def _scale_frame(frame: Similarity, factor: float) -> Similarity:
 
 
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
-    """Solve for the scale of a frame by the colours in the photos, in ever smaller steps.
+    """Return a frame at the scale at which its colours fit the photos best; the steps of the search become smaller.
 
-    The search begins where the score exceeds the scores two steps away most. Far from the true scale all cameras may be
-    in one place, so that scores are high, but equal.
+    The search begins where the score exceeds the scores two steps away most, not where it is highest. Far from the true
+    scale all cameras may be in one place, and scores there may be high, but equal.
     """
     scaled = [_scale_frame(frame, float(scale)) for scale in _SCALES]
     scale_gaussians = 2000  # Gaussians that the scales are tried on
@@ -301,13 +309,15 @@ def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
 
 
 def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
-    """Solve for the shift of cameras that have the scale and the axes of the Gaussians; empty if no photos show it.
+    """Solve for a shift of the cameras at which the photos show the Gaussians; return a list with its frame.
 
-    The middle of the Gaussians is looked for in the picture of the middle camera, at many depths.
+    The list is empty if there is no such shift. The middle of the Gaussians is looked for in the picture of the middle
+    camera, at many depths.
     """
-    shift_views = 4  # views that shifts are tried on
-    some = slice(None, None, -(-len(inputs.cameras) // shift_views))
-    rows, cameras, images = (inputs.gaussians, inputs.valid), inputs.cameras[some], inputs.images[some]
+    # views that shifts are tried on; Gaussians of the first search, and places that it keeps
+    max_views, first_samples, first_places = 4, 300, 8
+    even = slice(None, None, -(-len(inputs.cameras) // max_views))
+    rows, cameras, images = (inputs.gaussians, inputs.valid), inputs.cameras[even], inputs.images[even]
     to_world = invert(cameras.viewmats)
     centres, points = to_world[:, :3, 3], inputs.gaussians.means[inputs.valid].astype(np.float64)
     view = int(np.argmin(np.linalg.norm(centres - np.median(centres, 0), axis=1)))
@@ -315,22 +325,26 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
     radius = np.median(np.linalg.norm(points - middle, axis=1))
     to_ray = radius * matmul(to_world[view, :3, :3], invert(cameras.Ks[view]))
 
-    def move(place: Sequence[float]) -> Similarity:
+    def make_frame(place: Sequence[float]) -> Similarity:
+        """Return the frame in which the middle of the Gaussians is at a place in the picture; see _PLACES."""
         pixel = np.array([place[0] * cameras.width, place[1] * cameras.height, 1.0])
         shift = middle - centres[view] - matmul(to_ray, pixel) * exp(np.array(place[2]))
         return Similarity(np.eye(3), 1.0, shift, f"moved by {', '.join(f'{number:.10g}' for number in shift)}")
 
     def score(place: Sequence[float], samples: int) -> float:
-        found = check_cameras(*rows, move(place).move(cameras), images, samples)
-        return float(np.nan_to_num(found.share_seen * (1 - found.color_ratio)))
+        """Return the score of the cameras in the frame of a place; 0 without colours to compare."""
+        check = check_cameras(*rows, make_frame(place).move_cameras(cameras), images, samples)
+        return float(np.nan_to_num(check.share_seen * (1 - check.color_ratio)))
 
-    best: list[tuple[float, ...]] = sorted(product(*_PLACES), key=lambda place: -score(place, 300))[:8]
+    places = sorted(product(*_PLACES), key=lambda place: -score(place, first_samples))
+    best: list[tuple[float, ...]] = places[:first_places]
     for samples, count, step in _SHIFT_STEPS:
-        moves = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
-        around = {tuple((place + move).tolist()) for place in best for move in moves}
+        # by a step in both directions of each axis of a place
+        offsets = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
+        around = {tuple((place + offset).tolist()) for place in best for offset in offsets}
         best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]
-    frame = move(best[0])
-    each = [(frame.move(cameras[view : view + 1]), images[view : view + 1]) for view in range(len(cameras))]
-    ratios = [check_cameras(*rows, *one, foremost=True).color_ratio for one in each]
+    frame = make_frame(best[0])
+    views = [(frame.move_cameras(cameras[view : view + 1]), images[view : view + 1]) for view in range(len(cameras))]
+    ratios = [check_cameras(*rows, *camera_and_image, foremost=True).color_ratio for camera_and_image in views]
     known = [ratio for ratio in ratios if not np.isnan(ratio)]
     return [frame] if len(known) > 1 and max(known) <= RANDOM_SHARE and np.mean(known) <= MAX_FRONT_RATIO else []

@@ -1,11 +1,11 @@
 """Solve for the frame of rows that an exporter of the pixelSplat family centred, rescaled and turned upright.
 
 The exporter subtracts the median, divides by the 95 % quantile of the widest axis and rotates the world upright from
-the first camera. It saves none of these. Often the rows do not determine their cameras: views were fused (FreeSplat),
-layers of a pixel have gaps, or so many far pixels were cut that no lines repeat. But the file is recognised by its
-median and quantile, so the rotation is known. Scale and shift are solved from rows whose pixels are found by colours:
-a stretch of rows without a gap has the colours of a stretch of a photo. Stretches that agree on one frame are right,
-and all other matches are wrong.
+the first camera. It saves none of these. Often the rows do not determine their cameras, because views were fused
+(FreeSplat), because layers of a pixel have gaps, or because so many far pixels were cut that no lines repeat. But the
+file is recognised by its median and quantile, so the rotation is known. Scale and shift are solved for from rows whose
+pixels are found by colours. A stretch of rows without a gap has the colours of a stretch of pixels of a photo.
+Stretches that agree on one frame are right, and all other matches are wrong.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from gsmerge.geometry.transforms import Similarity, sh0_to_rgb
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
-_LENGTH, _STRETCHES = 48, 96  # rows of a stretch, and number of stretches that are searched
-_SLACK = 8  # pixels beyond the bounds on both sides that are searched too
-_ROUNDS = 3  # of solving for the frame from the stretches that agree with it
+_LENGTH, _STRETCHES = 48, 96  # rows of a stretch, and places in the file at which stretches begin
+_SLACK = 8  # pixels by which the range of a search is wider than the possible places, on both sides
+_ROUNDS = 3  # times that the frame is solved for from the stretches that agree with it
 
 
 @dataclass(frozen=True)
@@ -36,28 +36,33 @@ class _Stretch:
     view: int
     start: int  # first row
     step: int  # from one row to the next
-    low: int  # first place, among the pixels of a photo, at which the first row is searched
-    high: int  # end of the places, exclusive
+    # its first row is searched at these places among the pixels of a photo
+    low: int
+    high: int  # exclusive
 
 
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
-    """Find the camera from which rows were centred, rescaled and turned upright; return the rotation, or None."""
+    """Return the rotation by which rows were turned upright from a camera; None if no camera explains them."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
-    rough_rows, rough = 2000, 1.0  # rows of a first check, and its tolerance before the rotation is undone
+    # rows of a first check, and its tolerance while the rotation is still unknown
+    rough_rows, rough_tolerance = 2000, 1.0
     sample = means[:: max(1, len(means) // rough_rows)]
-    if not len(sample) or _deviation(sample) > rough:
+    if not len(sample) or _measure_deviation(sample) > rough_tolerance:
         return None
-    tolerance = 1e-3  # of the median and the quantile
+    tolerance = 1e-3  # largest deviation of the median and the quantile
     for view, viewmat in enumerate(inputs.cameras.viewmats):
         rotation = matmul(UPRIGHT, viewmat[:3, :3])
-        if _deviation(matmul(sample, rotation)) < rough / 2 and _deviation(matmul(means, rotation)) < tolerance:
+        if (
+            _measure_deviation(matmul(sample, rotation)) < rough_tolerance / 2
+            and _measure_deviation(matmul(means, rotation)) < tolerance
+        ):
             source = "the first camera" if view == 0 else f"camera {view + 1}"
             return Similarity(rotation, 1.0, np.zeros(3), f"rotated upright from {source}")
     return None
 
 
-def _deviation(points: np.ndarray) -> float:
-    """Measure how far points ``[n,3]`` are from a median of 0 and a quantile of 1."""
+def _measure_deviation(points: np.ndarray) -> float:
+    """Measure how far the median of points ``[n,3]`` is from 0, or their quantile from 1, whichever is farther."""
     widest_quantile = 0.95  # this quantile of the distances along the widest axis is 1 in these files
     quantile = float(np.quantile(np.abs(points), widest_quantile, axis=0).max())
     return max(float(np.abs(np.median(points, 0)).max()), abs(quantile - 1))
@@ -66,7 +71,7 @@ def _deviation(points: np.ndarray) -> float:
 def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Similarity:
     """Solve for the frame of upright rows from their colours in the photos; SceneError if too few stretches agree."""
     for pixels, stretches in _possible_orders(len(inputs.gaussians), inputs.cameras) if len(inputs.images) else ():
-        frame = _solve_agreed_frame(inputs, *_match(inputs, stretches, pixels), rotation)
+        frame = _solve_agreed_frame(inputs, *_match_stretches(inputs, stretches, pixels), rotation)
         if frame is not None:
             return frame
     raise SceneError(
@@ -78,10 +83,13 @@ def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Si
 
 
 def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Stretch]]]:
-    """Yield the orders that ``count`` rows may have, as pixels ``[p]`` of a photo and the stretches to search."""
+    """Yield the orders that ``count`` rows may have.
+
+    An order is a pair: the pixels ``[p]`` of a photo that have rows, and the stretches of rows to search among them.
+    """
     grid, trim = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), TRIMS[0]
     trimmed, whole = grid[trim:-trim, trim:-trim].reshape(-1), grid.reshape(-1)
-    per_pixel_counts = (1, 2, 3)  # Gaussians of a pixel
+    per_pixel_counts = (1, 2, 3)  # possible numbers of Gaussians of a pixel
     for per_pixel in per_pixel_counts:
         stretches = _interleaved_stretches(count, len(cameras), per_pixel, len(trimmed))
         if stretches:
@@ -92,9 +100,9 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
 
 
 def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: int) -> list[_Stretch]:
-    """List stretches of rows in the order line, column, layer, view, of which some are dropped.
+    """List stretches of rows that are sorted by line, column, layer and view, where some rows are missing.
 
-    Each view has ``num_pixels`` pixels with ``per_pixel`` rows. Empty if ``count`` rows do not have this order.
+    Each view has ``num_pixels`` pixels with ``per_pixel`` rows. Empty if ``count`` rows cannot have this order.
     """
     step = views * per_pixel
     dropped = num_pixels * step - count
@@ -106,7 +114,7 @@ def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: i
 
 
 def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
-    """List runs of rows of the first and of the last view where views of ``num_pixels`` were fused in order.
+    """List stretches of rows of the first and of the last view, for views of ``num_pixels`` that were fused in order.
 
     The rows of the first view come first, and the rows of the last view last. Empty for too few or too many rows.
     """
@@ -121,13 +129,13 @@ def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
     return first_view + last_view
 
 
-def _match(
+def _match_stretches(
     inputs: AlignmentInput, stretches: Sequence[_Stretch], pixels: np.ndarray
 ) -> tuple[Correspondences, np.ndarray]:
-    """Search for stretches in the photos; return a sample of the rows of all stretches that match a photo.
+    """Search for stretches in the photos; return a sample of the rows of those that match, and the stretch of each row.
 
-    A stretch matches if a single place of its photo has nearly the colours of its rows. Also returns the stretch
-    ``[t]`` of each row.
+    A stretch matches if a single place of its photo has nearly the colours of its rows. The rows are returned with
+    their pixels. The stretches ``[t]`` are numbered among those that match.
     """
     rows = np.array([stretch.start + stretch.step * np.arange(_LENGTH) for stretch in stretches])
     places, sums, next_sums = _place_stretches(inputs, stretches, rows, pixels).T
@@ -154,9 +162,8 @@ def _place_stretches(
 ) -> np.ndarray:
     """Return for each stretch its place, its sum and its next sum ``[s,3]``.
 
-    The place has the least sum of squared differences of colours; the next sum is that of the second-best place that is
-    more than two pixels away. ``rows [s,l]`` are the rows of the stretches, and ``pixels [p]`` the pixels of a photo in
-    which they are searched.
+    The place has the least sum of squared differences of colours. The next sum is the least sum at places more than two
+    pixels away. ``rows [s,l]`` are the rows of the stretches. They are searched among the ``pixels [p]`` of a photo.
     """
     with np.errstate(invalid="ignore"):
         colors = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1).astype(np.float32)
@@ -184,20 +191,23 @@ def _solve_agreed_frame(
     """
     stretches = np.unique(parts)
     views = np.array([pairs.views[parts == stretch][0] for stretch in stretches])
-    min_views, min_stretches, min_agreeing = 2, 3, 0.25  # views that agree, stretches of each, share of all stretches
+    # least number of views with agreeing stretches, of such stretches in each, and their share of all stretches
+    min_views, min_stretches, min_agreeing = 2, 3, 0.25
     if len(np.unique(views)) < min_views:
         return None
     limit, rng = pixel_limit(inputs.cameras.width, inputs.cameras.height), np.random.default_rng(0)
 
     def solve(some_stretches: np.ndarray) -> Similarity | None:
+        """Solve for the frame of some stretches."""
         selected = pairs.select(np.isin(parts, some_stretches))
         rays = ray_directions(selected, inputs.cameras)
         return solve_frame(selected.points, rays, rotation.rotation)
 
     def find_agreeing(frame: Similarity | None, limit: float) -> np.ndarray:
+        """Return the stretches whose rows are nearer to their pixels than ``limit`` pixels in a frame."""
         if frame is None:
             return stretches[:0]
-        errors = pixel_errors(pairs, frame.move(inputs.cameras))
+        errors = pixel_errors(pairs, frame.move_cameras(inputs.cameras))
         return stretches[[float(np.median(errors[parts == stretch])) < limit for stretch in stretches]]
 
     best = stretches[:0]

@@ -70,4 +70,4 @@ def place(
     if frame is IDENTITY:
         return gaussians, cameras
     in_float64 = replace(gaussians, means=gaussians.means.astype(np.float64))  # until the file is written
-    return frame.move_gaussians(in_float64), frame.move(cameras)
+    return frame.move_gaussians(in_float64), frame.move_cameras(cameras)

@@ -1,9 +1,9 @@
 """Scene with pixels -> the share of its depth that other views confirm, which predicts whether a fit can succeed.
 
-Each pixel's Gaussian is projected into the other views. The Gaussian in front there is projected back. If the two
-agree, the depth of the pixel is confirmed. It is contradicted if more views see through it than confirm it, and alone
-if its position is outside of all other views. A pixel does not count if other views have no Gaussian at its position,
-as beyond a crop.
+Each pixel's Gaussian is projected into the other views. The Gaussian in front there is projected back. If it returns
+near the pixel, at about the same depth, the depth of the pixel is confirmed. It is contradicted if more views see
+through it than confirm it, and alone if its position is outside of all other views. A pixel does not count if other
+views have no Gaussian at its position, for example beyond a crop.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are lo
 AGREEMENT_SHARE, AGREEMENT_PIXELS = 1 / 120, 1.5
 SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LEAST_DEPTH = 1e-9  # least depth, canonical units
-# A result is poor if the share of confirmed pixels is below POOR_SHARE: this separates the poor results of 15 captures
+# A result is poor if the share of confirmed pixels is below POOR_SHARE, which separates the poor results of 15 captures
 # from the sound ones. If the share of alone pixels is above LONELY_SHARE, the reason is that too few views see the
 # pixels
 POOR_SHARE, LONELY_SHARE = 0.5, 0.2
-# Standard errors that chance may cause; samples from which on the error is about normal
+# Difference that chance may cause, in standard errors; and number of samples from which on errors are about normal
 CHANCE_ERRORS, NORMAL_SAMPLES = 2.0, 30
 # Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if more than the share POOR_PART_SHARE
 # of its pixels is poor
@@ -40,7 +40,7 @@ THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
 }  # fmt: skip
-POOR_PART_SHARE = 0.5  # share of the pixels of a part
+POOR_PART_SHARE = 0.5  # share of the pixels of a part, above which the part is poor
 # Useful number of Gaussians per pixel. It is MOST_PER_PIXEL if the share of confirmed pixels is at least SOUND_SHARE,
 # and falls to the usual share, FEWEST, at a share of WRONG_SHARE. With more Gaussians a fit memorises the photos
 # (docs/guide/how-many.md). MOST_PER_PIXEL is the largest number at which no capture with as much confirmed depth lost
@@ -56,10 +56,11 @@ class Agreement:
     contradicted: float  # More views see through it than confirm it
     alone: float  # No other view sees the position
     num_pixels: int = field(default=CONFIRM_PIXELS, compare=False)  # Number of sampled pixels that count
-    # Part of the pictures in which most pixels are contradicted, or alone, as "left third of 4 of 7 views"; empty: none
+    # The part of the pictures in which most pixels are contradicted, and the part in which most are alone; for example
+    # "left third of 4 of 7 views"; empty if there is none
     contradicted_part: str = field(default="", compare=False)
     alone_part: str = field(default="", compare=False)
-    # No two views show things displaced by ``AGREEMENT_PIXELS``
+    # True if the cameras are so close together that no two views show things displaced by ``AGREEMENT_PIXELS``
     from_one_point: bool = field(default=False, compare=False)
 
     def to_dict(self) -> dict[str, float]:
@@ -80,8 +81,8 @@ class Agreement:
                 "all photos were taken from one point, like parts of a panorama, so no photo can confirm the depth of"
                 " another, and new views from elsewhere show guesses; photos from other places would help most"
             )
-        error = math.sqrt(self.confirmed * (1 - self.confirmed) / self.num_pixels)
-        if self.confirmed + CHANCE_ERRORS * error >= POOR_SHARE or self.num_pixels < NORMAL_SAMPLES:
+        standard_error = math.sqrt(self.confirmed * (1 - self.confirmed) / self.num_pixels)
+        if self.confirmed + CHANCE_ERRORS * standard_error >= POOR_SHARE or self.num_pixels < NORMAL_SAMPLES:
             return None
         problem = f"only {100 * self.confirmed:.0f} % of the pixels have a depth that another view confirms"
         if self.alone > LONELY_SHARE:
@@ -114,14 +115,14 @@ def confirm_depths(scene: Scene) -> Agreement | None:
 
 
 def _count_view(scene: Scene, view: int) -> np.ndarray:
-    """Count sampled pixels of a view by kind, ``[part,4]``: all counted pixels, confirmed, contradicted, alone.
+    """Return numbers of sampled pixels of a view, ``[part,4]``: all that count, confirmed, contradicted, alone.
 
     The first part is the whole picture; the other parts are ``THIRDS``.
     """
     width, height = scene.cameras.width, scene.cameras.height
     rows = np.flatnonzero(scene.get_pixels().fronts[view].reshape(-1) >= 0)
     rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), CONFIRM_PIXELS))]
-    num_same, num_through, is_alone, is_counted = _look_up(scene, view, rows)
+    num_same, num_through, is_alone, is_counted = _look_up_pixels(scene, view, rows)
     kinds = (num_same > 0) & (num_same >= num_through), num_through > num_same, is_alone
     column, row = 3 * (rows % width) // width, 3 * (rows // width) // height  # in thirds of the picture
     parts = [is_counted]
@@ -130,7 +131,7 @@ def _count_view(scene: Scene, view: int) -> np.ndarray:
     return np.array([[part.sum(), *((part & kind).sum() for kind in kinds)] for part in parts])
 
 
-def _look_up(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _look_up_pixels(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Look up n pixels ``rows`` of a view in the nearest other views.
 
     Returns four arrays ``[n]``: the number of views that confirm the depth of a pixel, the number of views that see
@@ -143,7 +144,7 @@ def _look_up(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarray, np.
     pixels, depths = project(points, cameras[neighbors])
     x, y = pixels[..., 0], pixels[..., 1]
     inside = (depths > LEAST_DEPTH) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
-    # pairs of a neighbour and a point inside its picture, first all pairs, then those with a Gaussian in the pixel
+    # pairs of a neighbour and a point inside its picture: first all pairs, and below those with a Gaussian in the pixel
     neighbor_ids, ids = np.nonzero(inside)
     column, row = x[neighbor_ids, ids].astype(np.int64), y[neighbor_ids, ids].astype(np.int64)
     front = fronts[neighbors[neighbor_ids], row * cameras.width + column]
@@ -165,7 +166,7 @@ def _look_up(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarray, np.
 def _distance_back(points: np.ndarray, rows: np.ndarray, camera: Cameras) -> np.ndarray:
     """Project points ``[m,3]`` into a camera; return their distances ``[m]`` from the pixels ``rows [m]``.
 
-    The unit is the distance up to which a point agrees with its pixel; behind the camera it is infinite.
+    The unit is the distance up to which a point agrees with its pixel. Points behind the camera are infinitely far.
     """
     pixels = np.stack([rows % camera.width, rows // camera.width], 1) + 0.5
     (projected,), (depths,) = project(points, camera)
@@ -175,7 +176,7 @@ def _distance_back(points: np.ndarray, rows: np.ndarray, camera: Cameras) -> np.
 
 
 def _is_from_one_point(scene: Scene) -> bool:
-    """Return whether the cameras' largest distance shifts points at the scene's depth by under ``AGREEMENT_PIXELS``."""
+    """Return whether cameras are so close that points at the scene's depth shift by under ``AGREEMENT_PIXELS``."""
     cameras = scene.cameras
     baseline = np.linalg.norm(np.ptp(cameras.centres, axis=0))
     return bool(baseline * cameras.Ks[:, 0, 0].max() < AGREEMENT_PIXELS * scene_depth(scene))
@@ -184,7 +185,8 @@ def _is_from_one_point(scene: Scene) -> bool:
 def _worst_part(poor: np.ndarray, pixels: np.ndarray) -> str:
     """Name the part of the pictures that is poor in most views, as "left third of 4 of 7 views".
 
-    ``poor [v,part]`` and ``pixels [v,part]`` are numbers of pixels. Empty if all parts are poor in equally many views.
+    ``poor [v,part]`` are numbers of poor pixels, and ``pixels [v,part]`` of all pixels that count. The result is empty
+    if all parts are poor in equally many views.
     """
     views = (poor > POOR_PART_SHARE * np.maximum(pixels, 1)).sum(0)
     worst = int(views.argmax())

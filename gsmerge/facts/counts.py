@@ -10,18 +10,21 @@ from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 
-STREAMED_LEVELS = 3  # of a lod-meta.json; the coarsest level, a sixteenth, loads at once
+STREAMED_LEVELS = 3  # levels of detail of a lod-meta.json; the coarsest, a sixteenth of the Gaussians, loads at once
 LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
 FEW_PIXELS = 1 << 18  # pixels of a few small photos
-# A scene has few Gaussians below this number per pixel of the photos, counting at most FEW_PIXELS pixels. Then a share
-# of superpixels is a share of pixels, and at most this share of the Gaussians
+# A scene has few Gaussians if it has less than this number per pixel of the photos, of which at most FEW_PIXELS pixels
+# count. The superpixels are then a share of the pixels, but at most this share of the Gaussians
 FEW = 0.5
 
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
-    """Return the number of Gaussians requested by a budget or a file size; None without either."""
+    """Return the number of Gaussians that a budget or a file size requests; None if there is neither.
+
+    ``num_input`` is the number that a share refers to, and ``sh_degree`` decides how many Gaussians a file holds.
+    """
     device = DEVICES.get(str(options.budget))
-    if device is not None:  # only a limit, unless it is to be filled, or the useful number for the scene is known
+    if device is not None:  # a device only sets a limit, unless it is to be filled or the useful number is known
         device_limit = num_input if options.fill else options.most
         return None if device_limit is None else min(device, device_limit)
     if options.budget in (None, AUTO):
@@ -41,12 +44,12 @@ class FileSize:
 
     @property
     def packed(self) -> bool:
-        """Whether the size in bytes depends on the content, so that it can only be measured by making the file."""
+        """Whether the size in bytes depends on the content, so that the file has to be made to measure it."""
         return self.file.count is None
 
 
 def file_size(options: BudgetOptions) -> FileSize | None:
-    """Return the file size requested by a budget in bytes; None for any other budget.
+    """Return the file size that a budget in bytes requests; None for any other budget.
 
     Raises UsageError if the size of the output's format does not follow from its Gaussians.
     """
@@ -68,11 +71,11 @@ def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
 class CountLimits:
     """Limits on the number of Gaussians that follow from the options."""
 
-    per_view: int  # Superpixels of each view by the options
-    default: int  # Gaussians by `superpixels` and K
+    per_view: int  # Superpixels of each view that the options ask for
+    default: int  # Gaussians that `superpixels` and K give
     min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
     max_count: int  # Most Gaussians that a budget, a size or a device allows
-    exact: int | None  # Gaussians requested by a budget or a size; None without either
+    exact: int | None  # Gaussians that a budget or a size requests; None if there is neither
     num_pixels: int  # Pixels of all views
     num_input: int  # Gaussians of the scene
     most: int  # Most Gaussians that are useful for the scene; if unknown, the number of its Gaussians
@@ -160,7 +163,7 @@ def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptio
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Return the number of superpixels per view; UsageError if it exceeds the number of pixels."""
+    """Return the number of superpixels of a view with ``height`` x ``width`` pixels; UsageError if there are fewer."""
     if options.per_view is not None:
         if options.per_view > height * width:
             limit = f"{height * width}, one per pixel of {width} x {height}"

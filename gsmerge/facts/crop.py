@@ -1,4 +1,4 @@
-"""Scene -> the scene inside a crop: the Gaussians inside, and masks of the pixels that mostly show them."""
+"""Scene -> the scene inside a crop: the Gaussians inside it, and masks of the pixels that mostly show these."""
 
 from __future__ import annotations
 
@@ -60,15 +60,16 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
 
 
 def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[v,h,w]`` of the pixels that mostly show Gaussians of the mask ``rows [n]``."""
+    """Return a mask ``[v,h,w]`` of the pixels that mostly show Gaussians marked in the mask ``rows [n]``."""
     canonical, _ = canonicalise(scene)
-    colors = np.ones((len(rows), 1, 3), np.float32)  # red for Gaussians of the mask, green for all
+    colors = np.ones((len(rows), 1, 3), np.float32)  # in red only marked Gaussians are 1, in green all are
     colors[~rows, :, 0] = 0
     gaussians = replace(canonical.gaussians, sh0=rgb_to_sh0(colors), shN=np.zeros((len(rows), 0, 3), np.float32))
 
     def shows_rows(image: np.ndarray) -> np.ndarray:
-        mask_opacity, opacity = image[..., 0], image[..., 1]
-        return np.asarray(mask_opacity > MOSTLY * np.maximum(opacity, usual_opacity(opacity)))
+        """Return the mask ``[h,w]`` of one view from its render."""
+        marked_opacity, opacity = image[..., 0], image[..., 1]
+        return np.asarray(marked_opacity > MOSTLY * np.maximum(opacity, usual_opacity(opacity)))
 
     with use_threads() as threads:
         return np.stack(list(render_in_batches(gaussians, canonical.cameras, at_once=threads, convert=shows_rows)))

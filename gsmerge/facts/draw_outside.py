@@ -23,20 +23,20 @@ from gsmerge.raster.photos import blank_photos, photo_errors
 from gsmerge.runtime.record import choose, note
 from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels, make_scene
 
-# Share of the Gaussians from which on cameras are placed, and of the pixels of a placed camera's picture that have to
-# show mainly such Gaussians. Views of fifteen captures in voxels miss at most .001 of them, at their edges; two
-# of four views of a narrow capture miss .02, and two of five of another .006
+# Cameras are placed if views miss at least this share of the Gaussians. A placed camera is used if at least this share
+# of its pixels shows mainly such Gaussians. Views of fifteen captures in voxels miss at most .001 of the Gaussians, at
+# their edges. Two of four views of a narrow capture miss .02, and two of five views of another capture miss .006
 LEAST_OUTSIDE = 0.005
-SOURCES, STEPS_BACK = 4, 8  # most views beside which cameras are placed, and cameras for each that step back
-# Bounds of these: step back as a share of the depth, rotation to the sides, and rotation up or down, degrees
+SOURCES, STEPS_BACK = 4, 8  # most views beside which cameras are placed, and number of cameras for each that step back
+# Bounds of the steps: back as a share of the depth, rotation to the sides, and rotation up or down, both in degrees
 BESIDE_LOW, BESIDE_HIGH = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
 
 
 def draw_outside(scene: PicturedScene) -> PicturedScene:
-    """Add pictures of the input from placed cameras, which come last, if views miss a part of the Gaussians.
+    """Add pictures of the input from placed cameras, with a note, if the views miss a part of the Gaussians.
 
-    A note says so. Only pixels that show mainly Gaussians which no view sees count like those of photos. The scene is
-    canonical, and its rows are not pixels.
+    The placed cameras come last. Of their pixels, only those count that show mainly Gaussians which no view sees. The
+    scene is canonical, and its rows are not pixels. Without such a part the same scene is returned.
     """
     outside = scene.get_pixels().homes < 0
     if outside.mean() < LEAST_OUTSIDE or outside.all():  # cameras that see nothing are wrong, which is said later
@@ -45,40 +45,44 @@ def draw_outside(scene: PicturedScene) -> PicturedScene:
     white = np.repeat(outside.astype(np.float32)[:, None], 3, 1)  # all other Gaussians are black
 
     def is_outside(_: int, image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
+        """Return a mask ``[h,w]`` of the pixels of a render that show mainly Gaussians outside of all views."""
         return np.asarray(image[..., 0] > (1 - transmittance) / 2)
 
-    counts = np.stack(photo_errors(scene.gaussians, blank_photos(placed), is_outside, colors=white))
-    useful = np.flatnonzero(counts.mean((1, 2)) > LEAST_OUTSIDE)
+    counting = np.stack(photo_errors(scene.gaussians, blank_photos(placed), is_outside, colors=white))
+    useful = np.flatnonzero(counting.mean((1, 2)) > LEAST_OUTSIDE)
     if len(useful) == 0:
         return scene
-    placed, counts = placed[useful], counts[useful]
+    placed, counting = placed[useful], counting[useful]
     note(
         f"no view sees {100 * outside.mean():.0f} % of the Gaussians; pictures of the input from {len(placed)} places"
         " beside the views stand for photos there"
     )
     choose(placed_views=len(placed))
-    return _with_drawings(scene, placed, counts)
+    return _with_drawings(scene, placed, counting)
 
 
 def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -> Cameras:
-    """Place cameras that together show most of the Gaussians ``outside [n]`` of all views.
+    """Place cameras that together show most of the Gaussians in the mask ``outside [n]``, which no view sees.
 
-    Candidates step back from some of the views, or turn about their centres by halves of their field, all around.
+    Candidates step back from some of the views, or turn about the centre of a view.
     """
     sample, step = thin_out(gaussians, CANDIDATE_GAUSSIANS), max(1, -(-len(gaussians) // CANDIDATE_GAUSSIANS))
     sources = cameras[even_views(len(cameras), min(len(cameras), SOURCES))]
     back = outside_cameras(sample.means, sources, STEPS_BACK * len(sources), BESIDE_LOW, BESIDE_HIGH)
-    candidates = concat_cameras(back, _turn(sources))
+    candidates = concat_cameras(back, _turn_around(sources))
     least_added = 0.2  # a further camera is placed if it adds more than this share of what those before it show
     return candidates[choose_showing(sample, candidates, outside[::step], least_added)]
 
 
-def _turn(cameras: Cameras) -> Cameras:
-    """Turn cameras about their centres: to the sides by halves of their field, all around, and up and down by one."""
+def _turn_around(cameras: Cameras) -> Cameras:
+    """Return copies of cameras that are turned about their centres, all around in steps of half their field.
+
+    In each of these directions a copy looks straight ahead, one up by half the field, and one down.
+    """
     viewmats, views = [], []
     for view, (viewmat, K) in enumerate(zip(cameras.viewmats.astype(np.float64), cameras.Ks, strict=True)):
         wide, high = (arctan2(side / 2, focal) for side, focal in ((cameras.width, K[0, 0]), (cameras.height, K[1, 1])))
-        for azimuth in np.arange(0, 2 * np.pi, wide):
+        for azimuth in np.arange(0, 2 * np.pi, wide):  # `wide` and `high` are half the field, in radians
             for elevation in (-high, 0.0, high):
                 motions = motion_matrices(np.array([[0.0, azimuth, 0, 0, 0, 0], [elevation, 0, 0, 0, 0, 0]]))
                 viewmats.append(matmul(matmul(motions[1], motions[0]), viewmat))
@@ -86,8 +90,8 @@ def _turn(cameras: Cameras) -> Cameras:
     return replace(cameras, viewmats=np.stack(viewmats), Ks=cameras.Ks[views])
 
 
-def _with_drawings(scene: PicturedScene, cameras: Cameras, counts: np.ndarray) -> PicturedScene:
-    """Add drawings of a scene in ``cameras``; they count as photos at the pixels ``counts [c,h,w]``."""
+def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray) -> PicturedScene:
+    """Add drawings of a scene in ``cameras``; they count like photos at the pixels in the mask ``counting [c,h,w]``."""
     masks = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     importance, empty, large = scene.importance, scene.empty, scene.large_photos
     if large is not None:
@@ -96,14 +100,14 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counts: np.ndarray) -
         scene, cameras=concat_cameras(scene.cameras, cameras), pixels=_with_pixels_of(scene, cameras),
         large_photos=large, names=(*scene.names, *(f"placed {view}" for view in range(len(cameras)))),
         images=np.concatenate([scene.images, render(scene.gaussians, cameras).images.clip(0, 1)]),
-        masks=np.concatenate([masks, counts]),
-        importance=None if importance is None else np.concatenate([importance, np.ones(counts.shape, np.float32)]),
-        empty=None if empty is None else np.concatenate([empty, np.zeros(counts.shape, empty.dtype)]),
+        masks=np.concatenate([masks, counting]),
+        importance=None if importance is None else np.concatenate([importance, np.ones(counting.shape, np.float32)]),
+        empty=None if empty is None else np.concatenate([empty, np.zeros(counting.shape, empty.dtype)]),
     )  # fmt: skip
 
 
 def _with_pixels_of(scene: PicturedScene, cameras: Cameras) -> Pixels:
-    """Return the pixels of a scene with those of further ``cameras``, which take no Gaussian from its views."""
+    """Return the pixels of a scene with those of further ``cameras``; Gaussians keep the pixels that they have."""
     pixels, placed = scene.get_pixels(), find_pixels(make_scene(scene.gaussians, cameras))
     placed_homes = np.where(placed.homes < 0, -1, placed.homes + len(scene) * scene.pixels_per_view)
     homes = np.where(pixels.homes < 0, placed_homes, pixels.homes)
@@ -111,12 +115,13 @@ def _with_pixels_of(scene: PicturedScene, cameras: Cameras) -> Pixels:
 
 
 def _with_large_drawings(large: LargePhotos, gaussians: Gaussians, cameras: Cameras) -> LargePhotos:
-    """Add drawings in ``cameras`` to the larger photos; they are drawn whenever they are read."""
+    """Add drawings of the Gaussians in ``cameras`` to large photos; each is drawn when it is read."""
     Ks = cameras.Ks * np.array([[large.width / cameras.width], [large.height / cameras.height], [1.0]])
     at_size = replace(cameras, Ks=Ks, width=large.width, height=large.height)
     first = max(large.ids) + 1
 
     def read(number: int) -> np.ndarray:
+        """Return a large photo, or draw a picture if the number is that of a placed camera."""
         if number < first:
             return large.read(number)
         image = render(gaussians, at_size[[number - first]]).images[0]

@@ -1,9 +1,9 @@
 """Fill the holes of an export: add Gaussians at pixels that no Gaussian covers.
 
 Exporters drop borders, far regions and faint rows, and voxels have gaps. Each view is drawn from its own camera. Each
-empty pixel of the drawing gets a Gaussian with the colour of the picture. The candidate depths are the depth of the
-surface beside the pixel, and depths beyond the view's farthest surface. The depth is chosen at which the pictures of
-the nearest other views agree best.
+empty pixel of the drawing gets a Gaussian with the colour of the picture. The candidates for its depth are the depth of
+the surface beside the pixel, and depths beyond the view's farthest surface. The depth is chosen at which the pictures
+of the nearest other views agree best.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, fill_pixels
 
-# Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
+# These numbers were chosen on exports of eight captures as Depth Anything 3 writes them, and on the same exports with
+# shuffled and with merged rows
 HOLE_OPACITY = 0.75  # opacity of the drawing below which a pixel is empty
 # Shares of the usual opacity of a view, which is low if the export has few rows. A pixel shows nothing if its opacity
-# is below NOTHING. There is nothing around a pixel if the mean opacity around it is below SPARSE
+# is below the share NOTHING. There is nothing around a pixel if the mean opacity around it is below the share SPARSE
 NOTHING, SPARSE = 0.5, 0.25
-# Parts that stay empty hold squares with sides of the share LARGE_SIDE of the picture's longer side, cover at least the
-# share LARGE_AREA of the picture, and are reduced by a rim of RIM_PIXELS pixels
+# A part stays empty if it holds a square whose sides are the share LARGE_SIDE of the picture's longer side. The squares
+# must cover at least the share LARGE_AREA of the picture. Parts are reduced by a rim of RIM_PIXELS pixels
 LARGE_SIDE, LARGE_AREA, RIM_PIXELS = 1 / 12, 0.12, 2
 GAP_WIDTH = 1 / 53  # beside large empty parts, only gaps narrower than this share of the longer side are filled
-MOST_EMPTY = 0.5  # share of empty pixels from which on the scene may be only a part of what the photos show
+MOST_EMPTY = 0.5  # from this share of empty pixels on, the scene may be only a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # candidate depths, relative to the depth of a view's farthest surface
 FARTHEST_QUANTILE = 0.99  # quantile of the depths that counts as the farthest
-HOLE_NEIGHBORS = 3  # nearest views that a picture is compared with
+HOLE_NEIGHBORS = 3  # number of nearest views that a picture is compared with
 DIFFERENCE_BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
 NEW_SIZE_PIXELS, NEW_OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
 BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
@@ -66,7 +67,8 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     holes, empty, edges = np.zeros_like(free), np.zeros_like(free), dict[int, _Edges]()
     gap = 2 * round(GAP_WIDTH * max(shown.shape[1:]) / 2) + 1
 
-    def find(view: int, tiled: TiledView) -> None:
+    def find_holes(view: int, tiled: TiledView) -> None:
+        """Fill the rows of a view in ``empty``, ``bare`` and ``holes``, and add its depths to ``edges``."""
         depths, transmittance = blend_depths(tiled)
         covered = transmittance <= 1 - HOLE_OPACITY
         if is_cropped or not everywhere:
@@ -80,7 +82,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             beside = fill_gaps(depths[..., None], covered)[..., 0][holes[view]]
             edges[view] = _Edges(beside, float(np.quantile(depths[covered], FARTHEST_QUANTILE)))
 
-    tile_views(scene, find, views)
+    tile_views(scene, find_holes, views)
     filled = scene
     if edges and np.count_nonzero(bare[views]) < MOST_EMPTY * np.count_nonzero(~empty[views]):
         filled = _fill_views(scene, holes, edges)
@@ -90,14 +92,14 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
 def _find_empty(opacity: np.ndarray, shown: np.ndarray, gap: int, *, is_cropped: bool) -> np.ndarray:
     """Find the pixels ``[h,w]`` of a view that stay empty, from the ``opacity [h,w]`` of its drawing.
 
-    ``gap``: width in pixels of gaps that are filled.
+    ``shown [h,w]`` marks pixels with a usable picture, and ``gap`` is the width in pixels up to which gaps are filled.
     """
     usual = usual_opacity(opacity)
     nothing = opacity < NOTHING * usual
     if is_cropped:
         beside = np.ones((3, 3), np.uint8)  # a Gaussian never ends exactly between two pixels
         return np.asarray(cv2.erode((nothing & ~shown).astype(np.uint8), beside) > 0)
-    sparse = blur(opacity, gap / 4) < SPARSE * usual  # not at the edges of a scene that was cut out
+    sparse = blur(opacity, gap / 4) < SPARSE * usual  # so edges of a scene that was cut out do not count
     return large_parts(nothing & sparse)
 
 
@@ -115,7 +117,10 @@ class _Edges:
 
 
 def _fill_views(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edges]) -> PicturedScene:
-    """Add Gaussians to a scene in the ``holes [v,h,w]`` of views with ``edges``, with a note."""
+    """Return a scene with Gaussians added in the ``holes [v,h,w]`` of views with ``edges``, with a note.
+
+    The holes of all other views are removed from ``holes``.
+    """
     views = sorted(edges)
     added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), views))
     holes[[view for view in range(len(scene)) if view not in edges]] = False
@@ -129,10 +134,10 @@ def _fill_views(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Ed
 
 
 def large_parts(empty: np.ndarray) -> np.ndarray:
-    """Return the connected parts of a mask ``[h,w]`` that hold a large square, reduced by a rim of some pixels.
+    """Return a mask ``[h,w]`` of the connected parts of ``empty [h,w]`` that hold a large square, without their rim.
 
-    There are none if the squares cover little of the picture. Gaps, and borders that exporters leave out, are narrower
-    than the squares. Depth Anything 3 leaves out the farthest tenth of the pixels, which is less than the share
+    The mask is empty if the squares cover little of the picture. Gaps, and borders that exporters leave out, are
+    narrower than the squares. Depth Anything 3 leaves out the farthest tenth of the pixels, which is less than
     LARGE_AREA.
     """
     if empty.mean() < LARGE_AREA:
@@ -148,9 +153,9 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
 
 
 def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
-    """Make pictures black and exclude them from scores, at pixels that stay ``empty [v,h,w]``.
+    """Return a scene whose pictures are black, and do not count in scores, at pixels that stay ``empty [v,h,w]``.
 
-    If photos counted at these pixels, a note says that they no longer count.
+    If photos counted at these pixels before, a note says that they no longer do.
     """
     if not empty.any() or empty.all():
         return scene
@@ -205,7 +210,7 @@ def _choose_depths(
 ) -> np.ndarray:
     """Choose one of ``depths [d,n]`` for each of ``rays [n,3]``: where the nearest other views show the same colour.
 
-    Differences of colours are averaged over neighbouring ``holes [h,w]``. The first depth is chosen in doubt.
+    Differences of colours are averaged over neighbouring ``holes [h,w]``. If nothing decides, it is the first depth.
     """
     centres = scene.cameras.centres
     neighbors = [i for i in nearest_views(centres, view) if (centres[i] != centres[view]).any()][:HOLE_NEIGHBORS]
@@ -213,7 +218,7 @@ def _choose_depths(
     colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
     best_depths, best_costs = depths[0], np.full(len(rays), np.inf, np.float32)
     min_gain = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
-    min_weight = 1e-3  # least weight in this window of pixels that other views see
+    min_weight = 1e-3  # least weight, in the window of DIFFERENCE_BLUR, of pixels that other views see
     for step, depth in enumerate(depths):
         sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and their number
         for neighbor, (start, along) in zip(neighbors, neighbor_rays, strict=True):
@@ -225,9 +230,9 @@ def _choose_depths(
 
 
 def _rays_in(cameras: Cameras, view: int, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project rays ``[n,3]`` from ``eye`` into a view; return start ``[3]`` and directions ``[3,n]``.
+    """Project rays ``[n,3]`` from ``eye`` into a view; return their start ``[3]`` and directions ``[3,n]``.
 
-    A ray at a depth is at the homogeneous pixel start + depth * direction.
+    The point of a ray at a depth has the homogeneous pixel start + depth * direction.
     """
     K, (rotation, translation) = cameras.Ks[view], np.split(cameras.viewmats[view, :3], [3], 1)
     start = matmul(K, matmul(rotation, eye) + translation[:, 0])

@@ -1,4 +1,4 @@
-"""Scene -> the scene with cameras, and their pixels' Gaussians, moved to where the photos agree.
+"""Scene -> the scene with its cameras, and the Gaussians of their pixels, moved to poses at which the photos agree.
 
 Poses that a network predicts are wrong by some pixels. Its Gaussians have the same error, so every view agrees with
 itself but not with other views. The pixels of a view, at their depths, are projected into the photos of its neighbours.
@@ -6,8 +6,9 @@ All poses are moved at once until the greys agree. This is direct image alignmen
 Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. Scenes with right poses stay unchanged
 bit for bit, after one step at the smallest size.
 
-Highlights move over their surfaces with the camera, as points do under wrong poses. What harmonics say of this is part
-of the comparison, and a move that was found on greys must not spoil how far the detail of the photos agrees.
+Highlights move over their surfaces with the camera, and so look like wrong poses. The comparison therefore expects the
+changes of colour that the harmonics describe. New poses are kept only if the fine detail of the photos agrees no worse
+than before.
 """
 
 from __future__ import annotations
@@ -37,37 +38,39 @@ from gsmerge.types import PicturedScene
 SIDES = (60, 120, 240)  # longer side of the photos in pixels, one size after the other
 BORDER = 2  # width in pixels of the border that is not compared
 POSE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
-# Compared pixels of a view, and most steps, at the first size. They are fewer, because right poses need them as well
+# Compared pixels of a view, and most steps, at the first size. They are fewer, because scenes with right poses
+# need them as well
 FIRST_PIXELS, FIRST_STEPS = 600, 2
-POSE_NEIGHBOURS = 4  # other views with which a view is compared
+POSE_NEIGHBOURS = 4  # number of other views with which a view is compared
 POSE_STEPS = 6  # most Gauss-Newton steps at each size
-TOGETHER = 16  # pairs per task
+TOGETHER = 16  # pairs of views that one task compares
 POSE_BLUR = 0.7  # blur of the photos, standard deviation in pixels
-# Detail of photos is finer than this blur, in pixels. Highlights are smooth, and move with the camera as if its pose
-# were wrong. If poses follow them, what is drawn on the surfaces agrees less, by more than CHANCE standard errors
+# Detail of photos is finer than this blur, in pixels. Highlights are smooth. If new poses follow highlights, the detail
+# of surfaces agrees less than before. If it does so by more than CHANCE standard errors, the new poses are dropped
 DETAIL, CHANCE = 2.0, 2.0
-# Prior error of a pose, radians and canonical units, and the weight of this prior
+# Prior standard error of a pose, rotation in radians and shift in canonical units; and the weight of this prior
 PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
-# Poses are moved only if this removes a share of the disagreement: LEAST_GAIN of some view at every size, and at the
-# largest size VIEW_GAIN of some view or MEAN_GAIN of all views. Wrong depth moves right views, too. At the largest size
-# it removes up to 0.14 of one view and 0.06 of all; the track of a depth camera removes 0.28 and 0.18. If all views are
-# half a degree off, they gain at least 0.22 of all; a single wrong view gains 0.32 of itself (14 captures). Views with
-# gains in between are not moved, because other photos of the scene have poses in the given frame
+# A gain is the share of the disagreement between photos that new poses remove. Poses are moved only if the gain of some
+# view is LEAST_GAIN at every size, and if at the largest size it is VIEW_GAIN, or MEAN_GAIN for all views together.
+# Wrong depth moves views with right poses, too. Its gains at the largest size are up to 0.14 for one view and 0.06 for
+# all, and up to 0.28 and 0.18 with the track of a depth camera. If all views are half a degree off, the gain for all is
+# at least 0.22; if a single view is wrong, its gain is 0.32 (14 captures). Views with gains in between are not moved,
+# because other photos of the scene have poses in the frame of the input
 LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class _Level:
+class _PhotoLevel:
     """Photos at one size, with the sampled pixels of each view."""
 
     pictures: np.ndarray  # [v,h,w,3] float32, grey, and its slope to the right and down
     Ks: np.ndarray  # [v,3,3]
-    scale: float  # Pixels of the views per pixel
+    scale: float  # Pixels of a view per pixel of these photos, along each axis
     points: np.ndarray  # [n,3] float64, sampled points of all views, in their cameras' frames
     greys: np.ndarray  # [p,m] float32, greys that the second view of a pair should show at the points of the first
-    starts: np.ndarray  # [v+1] first point of each view
+    starts: np.ndarray  # [v+1] index of the first point of each view
     depths: np.ndarray  # [v,h,w] depths of the Gaussians at the pixels' middles, canonical units; NaN without one
-    start: np.ndarray  # [v,4,4] poses as they were given
+    first_viewmats: np.ndarray  # [v,4,4] poses of the input
     pairs: np.ndarray  # [p,2] a view, and the view in which it is looked up
 
 
@@ -80,15 +83,15 @@ class _Evidence:
     curvatures: np.ndarray  # [p,6,6]
     slopes: np.ndarray  # [p,6]
     costs: np.ndarray  # [p] mean disagreement of the pixels
-    flows: np.ndarray  # [p] median shift of the pixels relative to the given poses, in pixels of the views
+    flows: np.ndarray  # [p] median shift of the pixels since the poses of the input, in pixels of the views
 
 
 def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = False) -> PicturedScene | None:
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
     The photos of ``views`` show the scene; other views are not moved. With ``always`` even small errors are corrected.
-    The median motion of the views is subtracted. Returns None if no pose is wrong, if the photos cannot decide, or if
-    their detail disagrees after the move.
+    The median motion of the views is subtracted from all. Returns None if no pose is wrong, if the photos say too
+    little, or if their detail agrees less after the move.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
@@ -101,12 +104,12 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     for side in sides:
         check = side == sides[0] != sides[-1] and not always
         level = _make_level(scene, pairs, largest / side, FIRST_PIXELS if check else POSE_PIXELS)
-        viewmats, final = _descend(level, viewmats, check=check)
-        before = _compare(level, start)
+        viewmats, final = _improve_poses(level, viewmats, check=check)
+        before = _gather_evidence(level, start)
         if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, final, end=side == sides[-1])):
             return None
     detail = _make_level(scene, pairs, largest / sides[-1], POSE_PIXELS, detail=True)
-    worse = _compare(detail, viewmats).costs - _compare(detail, start).costs
+    worse = _gather_evidence(detail, viewmats).costs - _gather_evidence(detail, start).costs
     if not always and worse.sum() > CHANCE * np.sqrt((worse * worse).sum()):
         return None
     moved = np.unique(pairs)  # all other views keep their poses
@@ -136,12 +139,14 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     return np.array(sorted(pairs), np.int64)
 
 
-def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: int, *, detail: bool = False) -> _Level:
-    """Shrink the photos by ``level``, and sample the pixels of each photo with the largest gradients.
+def _make_level(
+    scene: PicturedScene, pairs: np.ndarray, factor: float, samples: int, *, detail: bool = False
+) -> _PhotoLevel:
+    """Shrink the photos by ``factor``, and sample the pixels of each photo with the largest gradients.
 
-    With ``detail`` photos are their differences from a blurred copy.
+    With ``detail`` each photo is replaced by its difference from a blurred copy.
     """
-    photos = photos_of(scene.images, scene.cameras, level)
+    photos = photos_of(scene.images, scene.cameras, factor)
     shape = photos.height, photos.width
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)
     nearest = np.ix_((rows * scene.cameras.height).astype(int), (columns * scene.cameras.width).astype(int))
@@ -150,6 +155,7 @@ def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: 
     spread[:BORDER] = spread[-BORDER:] = spread[:, :BORDER] = spread[:, -BORDER:] = 0
 
     def sample_view(view: int) -> tuple[np.ndarray, ...]:
+        """Return the picture of a view, the points, greys and Gaussians of its sampled pixels, and all its depths."""
         grey = photos.images[view].mean(-1, dtype=np.float32)
         grey = blur(grey, POSE_BLUR) - (blur(grey, DETAIL) if detail else np.float32(0))
         down, right = np.gradient(grey)
@@ -165,7 +171,7 @@ def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: 
         return np.stack([grey, right, down], -1), points, grey.ravel()[ids], rows.ravel()[ids], depth
 
     pictures, points, greys, ids, depths = zip(*parallel_map(sample_view, range(len(scene))), strict=True)
-    return _Level(
+    return _PhotoLevel(
         np.stack(pictures), photos.Ks.astype(np.float64), scene.cameras.width / photos.width,
         np.concatenate(points), _expect_greys(scene, pairs, greys, ids), np.cumsum([0, *map(len, greys)]),
         np.stack(depths), scene.cameras.viewmats.astype(np.float64), pairs,
@@ -175,33 +181,34 @@ def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: 
 def _expect_greys(
     scene: PicturedScene, pairs: np.ndarray, greys: Sequence[np.ndarray], rows: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Return the greys that the second view of each pair should show: those of the first, changed by harmonics.
+    """Return the greys ``[p,m]`` that the second view of each pair should show at the sampled points of the first.
 
-    A highlight moves over its surface with the camera, as if the pose were wrong.
+    They are the ``greys`` of the first view, changed as the harmonics of the Gaussians ``rows`` change between the two
+    views. Otherwise a highlight, which moves over its surface with the camera, would look like a wrong pose.
     """
     g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
     expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)
     for pair, (view, other) in zip(expected, pairs, strict=True):
-        look = [np.ascontiguousarray(values[rows[view]], np.float32) for values in (g.means, g.sh0, g.shN)]
+        columns = [np.ascontiguousarray(values[rows[view]], np.float32) for values in (g.means, g.sh0, g.shN)]
         ids = np.arange(len(rows[view]), dtype=np.int32)
         here, there = np.empty((2, len(ids), 3), np.float32)
-        view_colors(*look, ids, eyes[view], 0, len(ids), here)
-        view_colors(*look, ids, eyes[other], 0, len(ids), there)
+        view_colors(*columns, ids, eyes[view], 0, len(ids), here)
+        view_colors(*columns, ids, eyes[other], 0, len(ids), there)
         pair[: len(ids)] = greys[view] + (there.clip(max=1) - here.clip(max=1)).mean(1)  # photos show nothing brighter
     return expected
 
 
-def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, _Evidence]:
-    """Improve poses by Gauss-Newton steps at one size; return the poses, and the evidence for them.
+def _improve_poses(level: _PhotoLevel, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, _Evidence]:
+    """Improve poses by Gauss-Newton steps at one size; return the poses, and the evidence at these poses.
 
-    ``check``: take few steps, and only one step if it moves no view far.
+    With ``check`` there are few steps, and only one if it moves no view far.
     """
     max_steps = FIRST_STEPS if check else POSE_STEPS
     early_px = 1.0  # poses are considered right if the first step moves all views by less than this, in pixels
     min_step = 1e-4  # a smaller step, in radians and canonical units, is the last
     for step in range(max_steps + 1):
-        evidence = _compare(level, viewmats)
-        if step == max_steps or (check and step == 1 and _flows(level, evidence).max() < early_px):
+        evidence = _gather_evidence(level, viewmats)
+        if step == max_steps or (check and step == 1 and _view_flows(level, evidence).max() < early_px):
             break
         change = _solve_step(level, viewmats, evidence)
         viewmats = matmul(viewmats, motion_matrices(change))
@@ -210,10 +217,10 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
     return viewmats, evidence
 
 
-def _solve_step(level: _Level, viewmats: np.ndarray, evidence: _Evidence) -> np.ndarray:
-    """Solve the normal equations of all pairs and of the prior; return the motion ``[v,6]`` of each view."""
+def _solve_step(level: _PhotoLevel, viewmats: np.ndarray, evidence: _Evidence) -> np.ndarray:
+    """Solve the normal equations of all pairs and of the prior for the next motion ``[v,6]`` of each view."""
     prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
-    curvature, slope = np.diag(prior), prior * motion_vectors(level.start, viewmats).ravel()
+    curvature, slope = np.diag(prior), prior * motion_vectors(level.first_viewmats, viewmats).ravel()
     pairs = zip(level.pairs.tolist(), evidence.curvatures, evidence.slopes, strict=True)
     for (a, b), pair_curvature, pair_slope in pairs:
         rows, columns = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
@@ -226,7 +233,7 @@ def _solve_step(level: _Level, viewmats: np.ndarray, evidence: _Evidence) -> np.
     return -solve(curvature, slope).reshape(-1, 6)
 
 
-def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
+def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:
     """Compare the pixels of the first view of each pair with the photo of the second view, for the given poses."""
     count, max_points = level.greys.shape
     evidence = _Evidence(np.empty((count, 6, 6)), np.empty((count, 6)), np.empty(count), np.empty(count))
@@ -234,8 +241,8 @@ def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
     def compare_pairs(begin: int) -> None:
         # fills the rows of the evidence; the two arrays before it are scratch
         compare_views(
-            level.points, level.greys, level.starts, level.pairs, viewmats, level.start, level.Ks, level.pictures,
-            level.depths, NEAR_PLANE, BORDER, level.scale, begin, min(begin + TOGETHER, count),
+            level.points, level.greys, level.starts, level.pairs, viewmats, level.first_viewmats, level.Ks,
+            level.pictures, level.depths, NEAR_PLANE, BORDER, level.scale, begin, min(begin + TOGETHER, count),
             np.empty((SCRATCH_COLUMNS, max_points)), np.empty(max_points, np.int64), *vars(evidence).values(),
         )  # fmt: skip
 
@@ -243,16 +250,19 @@ def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
     return evidence
 
 
-def _flows(level: _Level, evidence: _Evidence) -> np.ndarray:
-    """Return the median motion ``[v]``, in pixels, of the pixels of each view over its pairs."""
-    flows = [evidence.flows[(level.pairs == view).any(1)] for view in range(len(level.start))]
+def _view_flows(level: _PhotoLevel, evidence: _Evidence) -> np.ndarray:
+    """Return the shift ``[v]``, in pixels, of the pixels of each view since the input: the median over its pairs."""
+    flows = [evidence.flows[(level.pairs == view).any(1)] for view in range(len(level.first_viewmats))]
     return np.array([median(view_flows) if len(view_flows) else 0.0 for view_flows in flows])
 
 
-def _any_wrong(level: _Level, before: _Evidence, after: _Evidence, *, end: bool) -> bool:
-    """Return whether a view moved far and now agrees better with the other views; at the ``end``, much better."""
+def _any_wrong(level: _PhotoLevel, before: _Evidence, after: _Evidence, *, end: bool) -> bool:
+    """Return whether some view moved far and now agrees better with other views; at the ``end``, whether much better.
+
+    At the ``end`` it is also enough that some view moved far, and that all views together agree better.
+    """
     limit_px = 1.5  # a pose counts as wrong if it moves by more than this, in pixels of the views
-    is_far = _flows(level, after) > limit_px
+    is_far = _view_flows(level, after) > limit_px
     costs_before, costs = (
         np.bincount(level.pairs.ravel(), evidence.costs.repeat(2), len(is_far)) for evidence in (before, after)
     )

@@ -1,11 +1,11 @@
 """Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel; sizes of at least a pixel's low-pass.
 
-Pixels are found by projection of centres.
-Each view is divided into cells that are wider than the distances between neighbouring Gaussians. Gaussians behind the
-front of a cell are hidden. A pixel without a centre in it shows the front of its cell.
+Pixels are found by projection of centres. Each view is divided into cells that are wider than the distances between
+neighbouring Gaussians. Gaussians behind the front of a cell are hidden. A pixel without a centre in it shows the front
+of its cell.
 
 A view draws every Gaussian with the low-pass of its pixels added. So Gaussians far smaller than a pixel, such as points
-that all got one tiny size, look sound, but what uses their sizes without drawing them would find an empty scene.
+that all got one tiny size, look sound. Steps that use their sizes without drawing them would find an empty scene.
 """
 
 from __future__ import annotations
@@ -26,51 +26,51 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT
 
-# Only cells whose neighbours all have a centre are examined. Cells are wide enough if this share of them has a centre.
-# Of captures in voxels, six with a share of .97 or more give the same result as drawing; two with .93 and .95 lose 1.5
-# and 5 dB
+# Only cells whose neighbours all have a centre are examined. Cells are wide enough if at least this share of them has a
+# centre. Six captures in voxels with a share of .97 or more give the same result as drawing. Two with .93 and .95 lose
+# 1.5 and 5 dB
 COVERED_CELLS = 0.96
 SHOWN_WIDTH = 4.0  # width of a Gaussian that shows nearly all of it, in standard deviations
 ESTIMATE_GAUSSIANS = 10_000  # medians and shares are estimated from at least this many Gaussians, if there are as many
 SAME_DEPTH = 1.05  # a centre is on the surface of its cell up to this multiple of the depth of the cell's front
 LOW_PASS = math.sqrt(EPS2D)  # standard deviation of the low-pass, pixels
-# The low-pass hides a Gaussian if all its scales are below the share HIDDEN_SIZE of it. If less than the share
-# FEWEST_HIDDEN of the Gaussians is hidden, nothing changes: a fit repairs so few, and scenes without cameras have up to
-# .05 in placed views
+# The low-pass hides a Gaussian whose scales are all below the share HIDDEN_SIZE of the low-pass. If less than the share
+# FEWEST_HIDDEN of the Gaussians is hidden, nothing changes. A fit repairs so few, and in placed views of scenes without
+# cameras up to .05 are hidden
 HIDDEN_SIZE, FEWEST_HIDDEN = 0.5, 0.1
 
 
 def with_pixels(scene: SceneT) -> SceneT:
-    """Return a canonical scene with its pixels; unknown pixels are found by projection."""
+    """Return a canonical scene with pixels; if it has none, they are found by projection."""
     return scene if scene.pixels is not None else replace(scene, pixels=find_pixels(scene))
 
 
 def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
-    """Raise the scales of Gaussians that the low-pass hides, in a canonical scene, to the low-pass, with a note.
+    """Return a canonical scene in which Gaussians that the low-pass hides have the size of the low-pass, with a note.
 
-    Where Gaussians share a pixel, each needs less than all of it, so views with few pixels change no sound scene. If
-    the cameras were ``placed``, the distance to the nearest Gaussian takes the place of a pixel.
+    Gaussians that share a pixel may be smaller, since each shows a part of it. So views with few pixels change no sound
+    scene. If the cameras were ``placed``, the distance to the nearest Gaussian takes the place of a pixel.
     """
-    g, cameras, placed = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
+    g, cameras, by_distance = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
     step = max(1, len(g) // ESTIMATE_GAUSSIANS)
     units = pixel_sizes(g.means[::step], homes[::step], cameras)
-    if placed:  # a part of the Gaussians of a surface lies farther apart
+    if by_distance:  # a sample of the Gaussians of a surface lies farther apart
         units = np.minimum(units, find_nearest(g.means[::step], 1)[1][:, 0] / math.sqrt(step))
     if (g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units).mean() < FEWEST_HIDDEN:
         return scene
-    units = find_nearest(g.means, 1)[1][:, 0] if placed else pixel_sizes(g.means, homes, cameras)
-    sizes, seen = g.scales.max(1), (homes >= 0) | placed
-    num_sharing = 1 if placed else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
-    # A unit of 1 is that of the scene's median depth
+    units = find_nearest(g.means, 1)[1][:, 0] if by_distance else pixel_sizes(g.means, homes, cameras)
+    sizes, seen = g.scales.max(1), (homes >= 0) | by_distance
+    num_sharing = 1 if by_distance else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
+    # a size of 1 is the scene's median depth
     hidden = (sizes * np.sqrt(num_sharing) < HIDDEN_SIZE * LOW_PASS * units) & (units < 1)
     if np.count_nonzero(hidden & seen) <= FEWEST_HIDDEN * np.count_nonzero(seen):
         return scene
     share, usual = 100 * hidden.mean(), np.median(sizes[hidden] / units[hidden])
     note(
         f"{share:.0f} % of the Gaussians are far smaller than"
-        f" {'the distance to the next one' if placed else 'a pixel of the views'}, about {usual:.1g} of it; they count"
-        " as half of it, about as large as they look"
+        f" {'the distance to the next one' if by_distance else 'a pixel of the views'}, about {usual:.1g} of it;"
+        " they count as half of it, about as large as they look"
     )
     scales = np.where(hidden[:, None], LOW_PASS * units[:, None], g.scales).astype(np.float32)
     return replace(scene, gaussians=replace(g, scales=scales))
@@ -79,10 +79,10 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
 def find_pixels(scene: Scene) -> Pixels:
     """Find the pixel of each Gaussian of a canonical scene, and the front of each pixel.
 
-    In each view, a Gaussian has a weight of opacity x transmittance x area in pixels. The pixel of a Gaussian contains
-    its centre in the view with the largest weight, or in the first of these views. It is -1 if no view sees the
-    Gaussian. The front of a pixel is the Gaussian with the largest opacity x transmittance and a centre in the pixel.
-    If no centre is in the pixel, the front comes from its cell; it is -1 if the cell is empty.
+    In each view, the weight of a Gaussian is opacity x transmittance x area in pixels. The pixel of a Gaussian is the
+    one with its centre in the view of its largest weight, or in the first such view. It is -1 if no view sees the
+    Gaussian. The front of a pixel is the Gaussian with the largest opacity x transmittance among those with a centre in
+    the pixel. If there are none, the pixel has the front of its cell, or -1 if the cell is empty.
     """
     g, cameras, count = scene.gaussians, scene.cameras, len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
@@ -104,9 +104,9 @@ def find_pixels(scene: Scene) -> Pixels:
 def _weigh_view(
     means: np.ndarray, scales: np.ndarray, opacities: np.ndarray, viewmat: np.ndarray, K: np.ndarray, fronts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weigh the Gaussians of one view in its cells, and write the fronts of its pixels ``[h,w]``.
+    """Weigh the Gaussians of one view in its cells, and fill ``fronts [h,w]`` with the front of each pixel.
 
-    Returns rows ``[m]``, their pixels ``[m]``, and their weights ``[m]`` in pixels.
+    Returns the rows ``[m]`` that the view sees, their pixels ``[m]``, and their weights ``[m]`` in pixels.
     """
     height, width = fronts.shape
     ids, pixels, depths, areas = project_centres(means, scales, viewmat, K, width, height, NEAR_PLANE)
@@ -133,9 +133,9 @@ def _weigh_view(
 def choose_level(shown: np.ndarray, widest: float) -> int:
     """Choose the level of cells, which are 2**level pixels wide, from the mask ``shown [h,w]`` of pixels with a centre.
 
-    Cells are wide enough if nearly all of them have a centre; only cells whose neighbours all have a centre are
+    Cells are wide enough if nearly all of them have a centre. Only cells whose neighbours all have a centre are
     examined. The result is one level above the smallest cells that are wide enough, so that hidden surfaces do not show
-    through at a missing centre. It is 1 if no cells of up to ``widest`` pixels are wide enough.
+    through where a centre is missing. It is 1 if no cells of up to ``widest`` pixels are wide enough.
     """
     fine, level = shown, 0
     while 2**level <= max(widest, 1.0):
@@ -149,7 +149,7 @@ def choose_level(shown: np.ndarray, widest: float) -> int:
 
 
 def _coarser(mask: np.ndarray) -> np.ndarray:
-    """Return a mask of the squares of 2 x 2 pixels of a mask ``[h,w]`` that are not empty."""
+    """Return a mask of half the size: True for each square of 2 x 2 pixels with a True pixel of ``mask [h,w]``."""
     height, width = mask.shape
     even = np.pad(mask, ((0, height % 2), (0, width % 2)))
     lines = even[::2] | even[1::2]

@@ -1,4 +1,4 @@
-"""Place cameras: for a scene without cameras, or between and around its views; render pictures in place of photos."""
+"""Place cameras in a scene that has none, or between and around its views; render pictures in place of photos."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.facts.viewer import GOLDEN, find_viewer, sphere
+from gsmerge.facts.viewer import GOLDEN, find_viewer, spread_directions
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices, motion_vectors, nearest_views, normalize
 from gsmerge.kernels.elementary import cos, power, sin
@@ -21,22 +21,23 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 NUM_VIEWS = 24  # most cameras that are placed
-HELD_OUT = 8  # of so many placed cameras, one is held out from the fit, for scores
-FITTED = 16  # cameras of each kind for a scene without cameras, and half as many on a walk
+HELD_OUT = 8  # one in so many placed cameras is held out from the fit, for scores
+FITTED = 16  # cameras of each kind to which a scene without cameras is fitted; on a walk half as many
 CANDIDATE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
 AROUND_CAMERAS = 40  # candidate cameras around the scene
 FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
-INSIDE_DIRECTIONS = 8  # directions of a camera inside
-FIELD = 1.0  # width of the image over the focal length
-# Field of cameras that look from inside (80 degrees), and their pixel in standard deviations
+INSIDE_DIRECTIONS = 8  # directions in which cameras look from each position inside
+FIELD = 1.0  # width of the image, divided by the focal length
+# Field of cameras at the place of a viewer (80 degrees), and size of their pixels in standard deviations of Gaussians
 INSIDE_FIELD, INSIDE_PIXEL = 5 / 3, 1.5
 PROBE = 96  # pixels per side of the pictures for choosing candidates
 SMALLEST_PIXELS, LARGEST_PIXELS = 96, 640  # pixels per side
 NEAR_PLANE_SHARE = 0.02  # near plane, as a share of the scene's radius
-PAIRS, MIDDLE = 2, 0.5  # nearest views to which each view has a camera between, and its share of the way
+# Number of nearest views of each view between which cameras are placed, and the share of the way at which they stand
+PAIRS, MIDDLE = 2, 0.5
 WIDEST = np.pi / 4  # the space between two views is unknown if the angle between them is larger
-# With at most this many views, a fit to renders also gets views between them; more views it does not memorise
+# With at most this many views, a fit to renders also gets views between them. A fit does not memorise more views
 FEW_RENDERED_VIEWS = 24
 OUTSIDE_SHARE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share of all views, and its maximum
 # Bounds of the views from outside: step back as a share of the depth, rotation to the sides, and rotation up or down,
@@ -44,7 +45,7 @@ OUTSIDE_SHARE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share
 OUTSIDE_LOW, OUTSIDE_HIGH = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
 
-STANDING = (
+VIEWER_VIEWS = (
     "no cameras: the scene was made around a viewer, from whose place it is fitted and scored; --cameras names others"
 )
 PLACED_VIEWS = "no cameras: views are placed around and inside the scene"
@@ -55,16 +56,16 @@ NO_VIEWS = (
 
 
 def add_views(scene: Scene, *, shown: bool = False) -> Scene:
-    """Keep the finite Gaussians, at least one, and place cameras if there are none, with a note.
+    """Keep the finite Gaussians, of which there must be one, and place cameras if there are none; notes say so.
 
-    ``shown``: the views are for people to look at, as of :func:`place_viewpoints`.
+    ``shown``: place cameras for people to look from, as :func:`place_viewpoints` does.
     """
     scene = keep_finite(scene)
     if len(scene) == 0:
         inside = place_inside(scene.gaussians)
-        note(NO_VIEWS if inside is None else STANDING)
-        cameras = inside or (_place_shown if shown else place_around)(scene.gaussians)
-        order = sorted(range(len(cameras)), key=lambda view: (view + 1) % HELD_OUT != 0)  # those held out first
+        note(NO_VIEWS if inside is None else VIEWER_VIEWS)
+        cameras = inside or (_place_around_and_inside if shown else place_around)(scene.gaussians)
+        order = sorted(range(len(cameras)), key=lambda view: (view + 1) % HELD_OUT != 0)  # first those for scores
         scene = _with_cameras(scene.gaussians, cameras if shown else cameras[order])
     return scene
 
@@ -75,36 +76,38 @@ def _with_cameras(gaussians: Gaussians, cameras: Cameras) -> Scene:
 
 
 def place_inside(gaussians: Gaussians) -> Cameras | None:
-    """Place cameras to all sides where the viewer of a scene stands; None if it was not made around a viewer."""
+    """Place cameras where a scene's viewer stands, looking to all sides; None if it was not made around a viewer."""
     viewer = find_viewer(gaussians[:: -(-len(gaussians) // CANDIDATE_GAUSSIANS)])
     if viewer is None:
         return None
     size = int(np.clip(round(INSIDE_FIELD / (INSIDE_PIXEL * viewer.angle)), SMALLEST_PIXELS, LARGEST_PIXELS))
-    radii = viewer.free * power(np.arange(NUM_VIEWS) * GOLDEN / np.pi % 1, 1 / 3)  # even in the free ball
-    eyes = viewer.place + radii[:, None] * sphere(NUM_VIEWS)[::-1]
-    viewmats = np.stack([_look(eye, direction) for eye, direction in zip(eyes, sphere(NUM_VIEWS), strict=True)])
-    return Cameras(viewmats, np.repeat(_lens(size, INSIDE_FIELD)[None], NUM_VIEWS, 0), size, size)
+    radii = viewer.free * power(np.arange(NUM_VIEWS) * GOLDEN / np.pi % 1, 1 / 3)  # spread evenly in the free ball
+    eyes = viewer.place + radii[:, None] * spread_directions(NUM_VIEWS)[::-1]
+    viewmats = np.stack(
+        [_look_along(eye, direction) for eye, direction in zip(eyes, spread_directions(NUM_VIEWS), strict=True)]
+    )
+    return Cameras(viewmats, np.repeat(_square_intrinsics(size, INSIDE_FIELD)[None], NUM_VIEWS, 0), size, size)
 
 
 def place_viewpoints(gaussians: Gaussians) -> Cameras:
-    """Place cameras for people to look from: where a viewer stands; or else first around the scene, then inside."""
-    return place_inside(gaussians) or _place_shown(gaussians)
+    """Place cameras for people to look from, where a viewer stands, or else first around the scene and then inside."""
+    return place_inside(gaussians) or _place_around_and_inside(gaussians)
 
 
-def _place_shown(gaussians: Gaussians) -> Cameras:
-    """Place cameras for people to look from, first around a scene that was not made around a viewer, then inside."""
+def _place_around_and_inside(gaussians: Gaussians) -> Cameras:
+    """Place cameras for people to look from, first around a scene and then inside it."""
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
-    centre, half = _extent(thin_out(gaussians, CANDIDATE_GAUSSIANS).means.astype(np.float64))
+    centre, half = _robust_box(thin_out(gaussians, CANDIDATE_GAUSSIANS).means.astype(np.float64))
     angles = 2 * np.pi * np.arange(len(inside)) / len(inside)
     ring_height = -0.25  # height of the ring of viewpoints, in its radii; y points down
     # the first camera sees the front of most models
     ring = np.stack([sin(angles), np.full(len(angles), ring_height), -cos(angles)], 1)
-    around = replace(inside, viewmats=_around(centre, half, FAR_RADII, normalize(ring)))
+    around = replace(inside, viewmats=_viewmats_around(centre, half, FAR_RADII, normalize(ring)))
     return concat_cameras(around, inside)
 
 
 def keep_finite(scene: Scene) -> Scene:
-    """Keep the finite Gaussians, with a note; ValueError if there is none."""
+    """Return a scene of the finite Gaussians, with a note if others are left out; ValueError if there is none."""
     g = scene.gaussians
     finite = np.ones(len(g), bool)
     for array in vars(g).values():
@@ -127,9 +130,9 @@ def place_around(gaussians: Gaussians, count: int = FITTED) -> Cameras:
     and half as many on a walk.
     """
     means = thin_out(gaussians, CANDIDATE_GAUSSIANS).means.astype(np.float64)
-    centre, half = _extent(means)
-    outside = [_around(centre, half, radii, sphere(count)) for radii in (FAR_RADII, NEAR_RADII)]
-    chosen, walk = place_cameras(gaussians, count), _walk(np.median(means, axis=0), half, count // 2)
+    centre, half = _robust_box(means)
+    outside = [_viewmats_around(centre, half, radii, spread_directions(count)) for radii in (FAR_RADII, NEAR_RADII)]
+    chosen, walk = place_cameras(gaussians, count), _viewmats_on_walk(np.median(means, axis=0), half, count // 2)
     viewmats = np.concatenate([*outside, chosen.viewmats, walk])
     return replace(chosen, viewmats=viewmats, Ks=np.repeat(chosen.Ks[:1], len(viewmats), 0))
 
@@ -141,16 +144,16 @@ def blank_pictures(scene: Scene) -> PicturedScene:
 
 
 def draw_pictures(scene: Scene) -> PicturedScene:
-    """Render a canonical scene into its views and use the renders as its pictures, with what they leave empty."""
+    """Return a canonical scene with renders as the pictures of its views; ``empty`` is what the renders leave empty."""
     drawn = render(scene.gaussians, scene.cameras)
     pictured = PicturedScene.with_pictures(scene, np.clip(drawn.images, 0, 1, out=drawn.images), None)
     return replace(pictured, empty=1 - drawn.alphas[..., 0])
 
 
 def draw_around(scene: PicturedScene) -> PicturedScene:
-    """Add renders of a scene of several views from outside its views and, if these are few, from between them.
+    """Add renders of a scene from outside its views and, if these are few, from between them.
 
-    The renders come last.
+    The renders come last. A scene with a single view is returned as it is.
     """
     means, views = scene.gaussians.means, len(scene)
     if views == 1:
@@ -172,9 +175,9 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
 def between_cameras(cameras: Cameras, *further: float) -> Cameras:
     """Place cameras half way from each of two or more views to the nearest other views.
 
-    For each of the shares ``further``, each view gets one more camera at this share of the way to its nearest view. A
-    camera moves along the screw from one pose to the other, so it keeps looking at the point that both look at. Pairs
-    of views with an angle above ``WIDEST`` get no camera.
+    For each of the shares ``further``, each view gets one more camera at this share of the way to its nearest view.
+    Cameras lie on the screw motion from one pose to the other, so they look at the point at which both views look.
+    Pairs of views with an angle above ``WIDEST`` get no camera.
     """
     viewmats = cameras.viewmats.astype(np.float64)
     nearest = [nearest_views(cameras.centres, view)[:PAIRS] for view in range(len(cameras))]
@@ -190,7 +193,7 @@ def between_cameras(cameras: Cameras, *further: float) -> Cameras:
 def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     """Place cameras that see as much of the scene as possible.
 
-    Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it, looking in all
+    Candidates stand on a sphere around the box of most Gaussians, looking in, and on a grid inside it, looking in all
     directions. They are chosen one by one, at most ``num_views``. The next camera is always the candidate that shows
     the most opacity not shown yet, in pictures of a sample of the Gaussians. Images are square and grow with the number
     of Gaussians up to ``LARGEST_PIXELS`` pixels per side. Raises ValueError if there is no Gaussian.
@@ -198,22 +201,25 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
     sample = thin_out(gaussians, CANDIDATE_GAUSSIANS)
-    centre, half = _extent(sample.means.astype(np.float64))
-    viewmats = _candidates(centre, half)
-    candidates = Cameras(viewmats, np.repeat(_lens(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
+    centre, half = _robust_box(sample.means.astype(np.float64))
+    viewmats = _candidate_viewmats(centre, half)
+    candidates = Cameras(viewmats, np.repeat(_square_intrinsics(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
     shares = _shares_seen(sample, candidates, NEAR_PLANE_SHARE * float(np.sqrt((half * half).sum())))
     least_gain = 1e-3  # a camera is added if it raises the opacity shown so far by more than this share
     best = _choose_candidates(shares, num_views, least_gain)
     size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST_PIXELS, LARGEST_PIXELS))
-    return Cameras(viewmats[best], np.repeat(_lens(size)[None], len(best), 0), size, size)
+    return Cameras(viewmats[best], np.repeat(_square_intrinsics(size)[None], len(best), 0), size, size)
 
 
-def _lens(size: int, field: float = FIELD) -> np.ndarray:
-    """Return the intrinsics ``[3,3]`` of a placed camera with images of ``size`` pixels per side."""
+def _square_intrinsics(size: int, field: float = FIELD) -> np.ndarray:
+    """Return the intrinsics ``[3,3]`` of a camera with images of ``size`` pixels per side.
+
+    ``field`` is the width of the image divided by the focal length.
+    """
     return np.array([[size / field, 0, size / 2], [0, size / field, size / 2], [0, 0, 1]])
 
 
-def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _robust_box(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centre ``[3]`` and half sides ``[3]`` of the box that contains most of the means ``[n,3]``."""
     # Quantiles of the positions along each axis between which the scene is assumed to lie
     extent_quantiles = (0.05, 0.95)
@@ -223,33 +229,40 @@ def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (low + high) / 2, np.maximum(half, 1e-3 * widest)
 
 
-def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
+def _candidate_viewmats(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return the world-to-camera matrices ``[c,4,4]`` of all candidates around and inside a box."""
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
     inside = [
-        _look(centre + position * half, direction) for position in grid for direction in sphere(INSIDE_DIRECTIONS)
+        _look_along(centre + position * half, direction)
+        for position in grid
+        for direction in spread_directions(INSIDE_DIRECTIONS)
     ]
-    return np.concatenate([_around(centre, half, FAR_RADII, sphere(AROUND_CAMERAS)), inside])
+    return np.concatenate([_viewmats_around(centre, half, FAR_RADII, spread_directions(AROUND_CAMERAS)), inside])
 
 
-def _around(centre: np.ndarray, half: np.ndarray, radii: float, directions: np.ndarray) -> np.ndarray:
-    """Return world-to-camera matrices ``[c,4,4]`` of cameras in ``directions [c,3]`` that look at a scene's centre."""
+def _viewmats_around(centre: np.ndarray, half: np.ndarray, radii: float, directions: np.ndarray) -> np.ndarray:
+    """Return world-to-camera matrices ``[c,4,4]`` of cameras in ``directions [c,3]`` that look at a box's centre.
+
+    ``half [3]`` are half the sides of the box. The cameras' distance is ``radii`` times half its diagonal.
+    """
     distance = radii * float(np.sqrt((half * half).sum()))
-    return np.stack([_look(centre + distance * direction, -direction) for direction in directions])
+    return np.stack([_look_along(centre + distance * direction, -direction) for direction in directions])
 
 
-def _walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
-    """Return the world-to-camera matrices ``[count,4,4]`` of cameras on the longest axis that look to all sides."""
+def _viewmats_on_walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
+    """Return the world-to-camera matrices ``[count,4,4]`` of cameras along the longest axis that look to all sides."""
     _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
     steps = 2 * (np.arange(count) + 0.5) / count - 1
     angles = GOLDEN * np.arange(count)
     directions = cos(angles)[:, None] * along + sin(angles)[:, None] * side
     pairs = zip(steps, directions, strict=True)
-    walk_share = 0.6  # length of a walk to each side of the median, as a share of the longest half axis
-    return np.stack([_look(middle + step * walk_share * half.max() * along, direction) for step, direction in pairs])
+    walk_share = 0.6  # largest distance from the middle, as a share of the longest half axis
+    return np.stack(
+        [_look_along(middle + step * walk_share * half.max() * along, direction) for step, direction in pairs]
+    )
 
 
-def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def _look_along(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrix ``[4,4]``, OpenCV axes, of a camera at ``eye`` that looks along ``direction``.
 
     ``direction`` has length 1.
@@ -277,6 +290,7 @@ def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndar
     splats, photos = make_splats(sample), blank_photos(candidates)
 
     def view_shares(view: int) -> np.ndarray:
+        """Return the part of each Gaussian's opacity that one candidate shows, ``[n]``."""
         sums, _ = contributions(tile_view(splats, **photos.camera(view), near=near))
         seen_weight = 1.0  # blending weight, summed over pixels, at which a Gaussian counts as seen
         return np.minimum(sums / np.float32(seen_weight), 1) * splats.opacities
@@ -285,7 +299,11 @@ def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndar
 
 
 def _choose_candidates(shares: np.ndarray, num_views: int, least_added: float) -> list[int]:
-    """Choose candidates greedily, at least one: the next always adds most to the opacity shown so far."""
+    """Choose at most ``num_views`` candidates, at least one; the next one always adds most to the opacity shown so far.
+
+    ``shares [c,n]`` are those of :func:`_shares_seen`. A candidate that adds less than the share ``least_added`` ends
+    the choice.
+    """
     seen = np.zeros(shares.shape[1], np.float32)
     candidates: list[int] = []
     for _ in range(num_views):

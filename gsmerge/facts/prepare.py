@@ -1,4 +1,4 @@
-"""Scene -> prepared scene: facts about it, and the scene in the frame of all arithmetic."""
+"""Scene -> prepared scene: the scene in its canonical frame, and facts about it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsmerge.facts.pixels import raise_sizes, with_pixels
 from gsmerge.facts.place_cameras import (
     HELD_OUT,
     NO_VIEWS,
-    STANDING,
+    VIEWER_VIEWS,
     add_views,
     blank_pictures,
     draw_around,
@@ -42,13 +42,14 @@ class Reference:
 
     name: str  # "photos", or the name of the pictures that replace them
     score_views: tuple[int, ...]  # Views whose pictures results are scored on
-    placed: bool = False  # The scene has no views of its own; those for scores were placed, and no fit sees them
+    # True if the scene has no views of its own. The views for scores were placed then, and no fit sees them
+    placed: bool = False
     # [v,h,w,3] unchanged photos of the input scene, if the run changed some of them
     photo_files: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def of_views(self) -> bool:
-        """Whether the scene's own views have pictures for fits and scores that are not renders of the scene."""
+        """Whether the pictures show the scene's own views and are more than renders of the scene."""
         return self.name != RENDERS
 
 
@@ -62,7 +63,7 @@ class Prepared:
     frame: Frame  # The canonical frame
     reference: Reference  # Use of the pictures
     repeated: tuple[int, ...]  # Index in the canonical scene of every view of the input scene
-    moved: bool  # Views were moved to poses at which their photos agree, before a fit or by it
+    moved: bool  # True if views were moved to poses at which their photos agree, before a fit or by it
     agreement: Agreement | None = None  # Shares of depth that views confirm; None if views cannot be compared
 
     @property
@@ -87,7 +88,7 @@ class Prepared:
 
     @cached_property
     def scene_around(self) -> PicturedScene:
-        """The canonical scene with additional renders from around its views, which a fit to renders needs."""
+        """The canonical scene with further renders, from around its views, which a fit to renders needs."""
         return draw_around(self.scene)
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
@@ -120,10 +121,10 @@ def prepare(
 ) -> Prepared:
     """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
-    ``frame``: canonical frame; None: the scene's own. ``fill``: add Gaussians at pixels that only pictures show.
-    ``outside``: draw pictures of a part that no view sees; not if other views, of which these are a part, see it.
-    ``pixels``: find the pixels of placed views, which superpixels need.
-    Raises ValueError if there is no finite Gaussian, or if there are images without cameras.
+    ``frame`` is the canonical frame; None: the scene's own. ``fill``: add Gaussians at pixels that only pictures show.
+    ``outside``: draw pictures of what no view sees; False if these views are a part of others that see it. ``pixels``:
+    find the pixels of placed views, which superpixels need. Raises ValueError if there is no finite Gaussian, or if
+    there are images without cameras.
     """
     options = options or PrepareOptions()
     input_scene, (scene, repeated, notes) = scene, without_repeats(scene)
@@ -132,7 +133,7 @@ def prepare(
     scene, frame = canonicalise(add_views(scene), frame)
     placed = len(input_scene) == 0
     scene = raise_sizes(with_pixels(scene) if pixels or not placed else scene, placed=placed)
-    prepared = _with_references(input_scene, scene, frame, tuple(repeated), options)
+    prepared = _prepare_pictures(input_scene, scene, frame, tuple(repeated), options)
     files = _photos_before(input_scene, prepared)
     prepared = replace(prepared, reference=replace(prepared.reference, photo_files=files))
     agreement = confirm_depths(prepared.scene)
@@ -166,7 +167,10 @@ def _photos_before(input_scene: Scene, prepared: Prepared) -> np.ndarray | None:
 
 
 def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
-    """Return a copy with Gaussians added at pixels that photos show and no Gaussian covers, except in large parts."""
+    """Return a copy with Gaussians added at pixels that pictures show and no Gaussian covers; see :func:`fill_holes`.
+
+    Views whose pictures no longer count anywhere are not scored.
+    """
     scene, views = prepared.scene, prepared.reference.score_views  # the views whose photos show the scene
     shown = np.zeros(scene.images.shape[:3], bool)
     by_rows = prepared.reference.name == ROW_COLORS  # gaps in these pictures have the colours beside them
@@ -179,13 +183,14 @@ def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
     return replace(prepared, scene=filled, reference=reference)
 
 
-def _with_references(
+def _prepare_pictures(
     input_scene: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
 ) -> Prepared:
-    """Prepare a scene with pixels: choose the pictures to which results are fitted.
+    """Choose the pictures to which results are fitted, and return the prepared scene.
 
     The first choice are photos that show the scene. Without such photos, the colours of the views' own Gaussians are
-    used. If views have no Gaussians of their own, renders of the scene are used.
+    used. If views have no Gaussians of their own, renders of the scene are used. Views with Gaussians of their own and
+    photos also get one exposure, and poses at which the photos agree.
     """
     own = canonical.has_own_pixels
     stand_in = partial(add_row_colors, has_photos=canonical.images is not None) if own else blank_pictures
@@ -199,10 +204,10 @@ def _with_references(
         placed, lacks_photos = len(input_scene) == 0, input_scene.images is None
         reason = "no photos, and the rows are not the pixels of the views" if lacks_photos else "photos do not count"
         remedy = "; name photos with --images" if lacks_photos else ""
-        if not placed:  # a note says so
+        if not placed:  # of placed views another note says so
             note(f"{reason}: renders of the scene itself are used instead{remedy}")
         scene, scored = draw_pictures(scene), every[: len(every) // HELD_OUT] if placed else every
-        shown = tuple(view for view in scored if scene.images[view].any())  # any result equals an empty view
+        shown = tuple(view for view in scored if scene.images[view].any())  # in an empty view any result is right
         return Prepared(input_scene, scene, frame, Reference(RENDERS, shown or scored, placed), repeated, False)
     input_scene, moved = _with_photos(input_scene, scene, repeated), None
     if own:  # each view's Gaussians have the exposure and the pose of the view
@@ -227,7 +232,7 @@ def _with_pictures(
 
 
 def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:
-    """Return a scene with each of its views once, the index in it of every view, and notes on repeated views."""
+    """Return a scene without repeated views, the index in it of every input view, and notes on repeated views."""
     views, repeated = distinct_views(scene)
     count = len(scene) - len(views)
     if not count:
@@ -240,16 +245,16 @@ def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:
 def views_notes(scene: Scene) -> list[str]:
     """Return the notes of a run about repeated views and about missing views or photos, without comparing colours."""
     if len(scene) == 0:
-        return [NO_VIEWS if place_inside(scene.gaussians) is None else STANDING]
+        return [NO_VIEWS if place_inside(scene.gaussians) is None else VIEWER_VIEWS]
     shows_rows = scene.images is None and scene.is_shown and len(scene) > 0  # the rows' own colours replace photos
     return [*without_repeats(scene)[2], *([NO_PHOTOS] if shows_rows else [])]
 
 
 def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
-    """Return a scene with its pictures for scores, and whether :func:`prepare` changes its photos.
+    """Return a scene with its pictures for scores, and True if :func:`prepare` changes its photos.
 
-    As in :func:`prepare`, the rows' own colours are the pictures of a scene with pixels if photos are missing, have
-    another look, or do not show the scene.
+    The pictures are those of :func:`prepare`. If photos are missing, have another look, or do not show the scene, the
+    pictures of a scene with pixels have the colours of its own rows.
     """
     has_colors = scene.has_own_pixels and len(scene) > 0
     if len(scene) == 0 or len(scene.gaussians) == 0 or not (has_colors or scene.images is not None):

@@ -11,9 +11,9 @@ from gsmerge.geometry.transforms import median, quantiles
 from gsmerge.photos.views import camera_kinds
 from gsmerge.types import Gaussians, Scene
 
-# Bounds for the Gaussians of captures. The median largest scale is at most LARGE_SCALE times the diagonal of the box
-# that holds most Gaussians. The median coefficient of the base colours is at most BRIGHT_COLOR. Fewer than
-# FEWEST_TESTED Gaussians are not tested
+# Bounds that the Gaussians of all captures keep. The median of their largest scales is at most LARGE_SCALE times the
+# diagonal of the box that holds most Gaussians. The median coefficient of the base colours is at most BRIGHT_COLOR. The
+# bounds are not tested on fewer than FEWEST_TESTED Gaussians
 LARGE_SCALE, BRIGHT_COLOR, FEWEST_TESTED = 0.25, 10.0, 100
 FLAT_RANGE, FAINT_MEDIAN = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
 
@@ -26,8 +26,9 @@ class SceneSize:
     num_views: int
     height: int  # Pixels
     width: int
-    has_own_pixels: bool  # Each view has Gaussians of its own
-    rendered: bool  # Renders of the input stand for the pictures of its views, which have neither photos nor pixels
+    has_own_pixels: bool  # True if each view has Gaussians of its own
+    # True if views have neither photos nor Gaussians of their own, so that renders of the input stand in for pictures
+    rendered: bool
     num_cameras: int = 2  # Number of different cameras; 1: all views have the same camera
     sh_degree: int = 0
 
@@ -38,7 +39,10 @@ class SceneSize:
 
 
 def measure_size(scene: Scene, rendered: bool | None = None) -> SceneSize:
-    """Return the sizes of a scene; ``rendered`` None: views with photos have pictures, whatever these show."""
+    """Return the sizes of a scene.
+
+    ``rendered`` is as in :class:`SceneSize`. None: views with photos count as pictured, whatever the photos show.
+    """
     rendered = not scene.is_shown if rendered is None else rendered
     cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
     return SceneSize(

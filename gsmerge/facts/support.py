@@ -17,22 +17,22 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, make_scene
 
-# A view shows a Gaussian from this blending weight in a pixel on, as in a fit
+# A view shows a Gaussian if its blending weight in some pixel is at least this; a fit has the same threshold
 SHOWN_WEIGHT = FitOptions().min_contribution
 
 
 def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Count the views that show each of n canonical Gaussians, ``[n]`` int32.
 
-    A view shows a Gaussian if its blending weight is at least 1/255 in some pixel, which is the least weight that a fit
-    keeps.
+    A view shows a Gaussian if its blending weight is at least 1/255 in some pixel. A fit keeps no Gaussian with less.
     """
     splats = make_splats(gaussians)
     min_level = 2  # pictures are smaller by at least this factor, as in a fit's survey
-    max_side = 480  # of pictures, pixels
+    max_side = 480  # longer side of the pictures, pixels
     pictures = blank_photos(cameras, max(min_level, max(cameras.width, cameras.height) / max_side))
 
     def list_shown(view: int) -> np.ndarray:
+        """Return the rows of the Gaussians that a view shows."""
         tiled = tile_view(splats, **pictures.camera(view))
         return tiled.ids[list_contributions(tiled)[1] >= SHOWN_WEIGHT]
 

@@ -1,7 +1,7 @@
-"""Gaussians -> the place of the viewer around whom a scene was made, if it was.
+"""Gaussians -> the place of the viewer around whom a scene was made, if it was made around one.
 
-Pixels of a panorama, or of cameras that stand close together, become Gaussians whose sizes are proportional to the
-distance from there. So sizes tell the place, whatever lies in the distance.
+Pixels of a panorama, or of cameras that stand close together, become Gaussians whose sizes are proportional to their
+distance from the viewer. So the sizes determine the viewer's place, whatever the scene shows.
 """
 
 from __future__ import annotations
@@ -17,56 +17,63 @@ from gsmerge.kernels.matrices import matmul, solve_symmetric
 from gsmerge.types import Gaussians
 
 GOLDEN = np.pi * (1 + math.sqrt(5))  # angle between successive directions that spreads them evenly
-ALIKE = 0.5  # angles have to vary less than half as much as sizes, as logarithms
-# Of places that explain sizes equally well, up to chance, the one that sees most is the viewer's: a plane is seen alike
-# from both sides
+ALIKE = 0.5  # logarithms of the Gaussians' angles have to vary less than this share of those of their sizes
+# A place is likely if its error is at most this multiple of the least error. From the other side of a plane, sizes are
+# explained equally well. Of the likely places, the viewer's is the one around which most directions show Gaussians
 LIKELY = 1.1
-CELLS = 100  # directions, half of which the scene has to cover
-# Free radius around a viewer, as a share of the distance that so few Gaussians fall short of
+CELLS = 100  # cells of directions, half of which the scene has to cover
+# The radius around a viewer in which nothing is, as a share of a distance; and the share of Gaussians that are nearer
+# than this distance
 FREE, NEAR_SHARE = 0.25, 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Viewer:
-    """The viewer of a scene."""
+    """The viewer around whom a scene was made."""
 
     place: np.ndarray  # ``[3]``
-    free: float  # radius around it in which nothing is
-    angle: float  # median angle of a Gaussian's standard deviation
+    free: float  # radius around the place in which nothing is
+    angle: float  # median angle at which the viewer sees a Gaussian's standard deviation, radians
 
 
 def find_viewer(gaussians: Gaussians) -> Viewer | None:
-    """Find the viewer around whom finite Gaussians were made; None if sizes or missing directions deny one."""
+    """Find the viewer around whom finite Gaussians were made.
+
+    Returns None if sizes do not grow with the distance from any place, or if too many directions show nothing.
+    """
     means, sizes = gaussians.means.astype(np.float64), np.sort(gaussians.scales, 1)[:, 1].astype(np.float64)
-    if not sizes.all() or _spread(sizes) == 0:
+    if not sizes.all() or _spread_of_logs(sizes) == 0:
         return None
     order = np.argsort(sizes, kind="stable")
-    # Gaussians of the nearer half are smaller
+    # the search begins in the middle of the smaller half of the Gaussians, which are nearer, and at a direct solution
     starts = np.median(means[order[: (len(means) + 1) // 2]], 0), _solve_squares(means, sizes)
-    solutions = [_solve(means, sizes, start) for start in starts]
+    solutions = [_solve_place(means, sizes, start) for start in starts]
     least = min(error for _, error in solutions)
-    views = [_look_around(means, place) for place, error in solutions if error <= LIKELY * least]
-    place, distances, num_cells = max(views, key=lambda view: view[2])
+    likely = [_look_around(means, place) for place, error in solutions if error <= LIKELY * least]
+    place, distances, num_cells = max(likely, key=lambda result: result[2])
     angles = sizes / distances
-    if 2 * num_cells < CELLS or _spread(angles) >= ALIKE * _spread(sizes):
+    if 2 * num_cells < CELLS or _spread_of_logs(angles) >= ALIKE * _spread_of_logs(sizes):
         return None
     return Viewer(place, FREE * float(np.quantile(distances, NEAR_SHARE)), median(angles))
 
 
 def _look_around(means: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return a place, the distances ``[n]`` of Gaussians from it, and in how many cells of directions some lie."""
+    """Return the place, the distances ``[n]`` of Gaussians from it, and the number of cells of directions with some."""
     offsets = means - place
     distances = np.sqrt((offsets**2).sum(1)) + np.finfo(np.float32).tiny
-    return place, distances, len(np.unique(matmul(offsets / distances[:, None], sphere(CELLS).T).argmax(1)))
+    return place, distances, len(np.unique(matmul(offsets / distances[:, None], spread_directions(CELLS).T).argmax(1)))
 
 
-def _solve(means: np.ndarray, sizes: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, float]:
-    """Move a place until sizes are most nearly proportional to distances; return it and the median error."""
+def _solve_place(means: np.ndarray, sizes: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, float]:
+    """Move a place by Gauss-Newton steps until sizes are nearly proportional to distances; return it and its error.
+
+    The error is the median difference of the logarithms of sizes and distances.
+    """
     error = math.inf
-    rounds = 8  # steps of the solution
-    doubt_factor = 2.0  # errors of sizes, as logarithms, count half from twice their median on
-    least_error = 1e-3  # added to that, so that weights are finite where half of the errors are 0
-    for _ in range(rounds):  # Gauss and Newton's steps
+    rounds = 8  # number of steps
+    doubt_factor = 2.0  # an error counts half if it is this multiple of the median error
+    least_error = 1e-3  # added to this multiple, so that weights are finite if half of the errors are 0
+    for _ in range(rounds):
         offsets = means - place
         distances = np.sqrt((offsets**2).sum(1)) + np.finfo(np.float32).tiny
         angles = sizes / distances
@@ -79,7 +86,10 @@ def _solve(means: np.ndarray, sizes: np.ndarray, place: np.ndarray) -> tuple[np.
 
 
 def _solve_squares(means: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Solve size^2 = a |x|^2 + b x + c with equal relative errors; the place ``[3]`` is -b / 2a."""
+    """Return the place ``[3]`` at which a quadratic function of the means, fitted to squared sizes, is least.
+
+    The function is size^2 = a |x|^2 + b x + c, fitted with equal relative errors. It is least at -b / 2a.
+    """
     rows = np.concatenate([(means**2).sum(1, keepdims=True), means, np.ones((len(means), 1))], 1) / sizes[:, None] ** 2
     units = np.sqrt((rows**2).mean(0))
     units[units == 0] = 1
@@ -88,14 +98,14 @@ def _solve_squares(means: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     return -solution[1:4] / (2 * solution[0] or 1)
 
 
-def _spread(values: np.ndarray) -> float:
-    """Return the logarithm of the factor between the tenths of positive values."""
+def _spread_of_logs(values: np.ndarray) -> float:
+    """Return the logarithm of the factor between the quantiles 0.1 and 0.9 of positive values."""
     low, high = np.quantile(values, (0.1, 0.9))
     return float(log(high / low))
 
 
-def sphere(count: int) -> np.ndarray:
-    """Return directions ``[count,3]`` spread evenly over the sphere (golden spiral)."""
+def spread_directions(count: int) -> np.ndarray:
+    """Return directions ``[count,3]`` spread evenly over the spread_directions (golden spiral)."""
     i = np.arange(count) + 0.5
     height, angle = 1 - 2 * i / count, GOLDEN * i
     radius = np.sqrt(1 - height**2)

@@ -40,20 +40,22 @@ class Members:
     fronts: np.ndarray  # [v,h,w] int32, the member that each pixel shows, -1 for none
 
 
-def _array(values: np.ndarray) -> np.ndarray:
+def _as_float32(values: np.ndarray) -> np.ndarray:
+    """Return values as a contiguous float32 array."""
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
 def scene_members(scene: Scene) -> Members:
     """Return the Gaussians of a canonical scene with pixels as members; footprints are their :func:`pixel_sizes`."""
     g, pixels = scene.gaussians, scene.get_pixels()
-    return _make_members(g, pixel_sizes(_array(g.means), pixels.homes, scene.cameras), pixels)
+    return _make_members(g, pixel_sizes(_as_float32(g.means), pixels.homes, scene.cameras), pixels)
 
 
 def pixel_sizes(means: np.ndarray, homes: np.ndarray, cameras: Cameras) -> np.ndarray:
-    """Return the size ``[n]`` of a pixel at means ``[n,3]``, world units, in the view of the pixels ``homes [n]``.
+    """Return the size ``[n]`` of a pixel at the depth of each of ``means [n,3]``, in units of the world.
 
-    Without a pixel (-1), it is the smallest size over all views.
+    The pixel is that of the view to which ``homes [n]`` belongs. For a mean without a pixel (-1) it is the smallest
+    size over all views.
     """
     footprints, viewmats, Ks = np.empty(len(means), np.float32), cameras.viewmats.astype(np.float32), cameras.Ks
     focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in Ks])
@@ -65,23 +67,24 @@ def pixel_sizes(means: np.ndarray, homes: np.ndarray, cameras: Cameras) -> np.nd
         footprints[rows] = np.maximum(depths, np.float32(1e-6)) / focals.astype(np.float32)[views]
 
     parallel_map(measure_footprints, range(0, len(means), FOOTPRINT_ROWS))
-    homeless = np.flatnonzero(homes < 0)
-    if len(homeless):
-        smallest = np.full(len(homeless), np.inf)
+    without_pixel = np.flatnonzero(homes < 0)
+    if len(without_pixel):
+        smallest = np.full(len(without_pixel), np.inf)
         for centre, focal in zip(cameras.centres.astype(np.float64), focals, strict=True):
-            np.minimum(smallest, np.linalg.norm(means[homeless] - centre, axis=1) / focal, out=smallest)
-        footprints[homeless] = np.maximum(smallest, 1e-6)
+            np.minimum(smallest, np.linalg.norm(means[without_pixel] - centre, axis=1) / focal, out=smallest)
+        footprints[without_pixel] = np.maximum(smallest, 1e-6)
     return footprints
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray) -> Members:
     """Return Gaussians without pixels as members, with the given footprints ``[n]``."""
-    nowhere = np.full(len(g), -1, np.int32), np.zeros((0, 1, 1), np.int32)
-    return _make_members(g, footprints, Pixels(*nowhere, own=False))
+    no_pixels = np.full(len(g), -1, np.int32), np.zeros((0, 1, 1), np.int32)
+    return _make_members(g, footprints, Pixels(*no_pixels, own=False))
 
 
 def _make_members(g: Gaussians, footprints: np.ndarray, pixels: Pixels) -> Members:
-    columns = {name: _array(column) for name, column in vars(g).items()}
+    """Return Gaussians as members with the given footprints ``[n]`` and pixels."""
+    columns = {name: _as_float32(column) for name, column in vars(g).items()}
     return Members(**columns, footprints=footprints, pixels=pixels.homes, fronts=pixels.fronts)
 
 
@@ -145,7 +148,10 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:
-    """Convert moments to Gaussians; the opacity follows from the optical depth spread over the Gaussian's disc."""
+    """Convert the moments of g groups to Gaussians; ``sh [g,k,3]`` are all harmonics.
+
+    The opacity follows from the optical depth ``extinctions [g]``, spread over the Gaussian's disc.
+    """
     scales, quats = principal_axes(covars)
     opacities = 1 - exp(-extinctions / (scales[:, 1] * scales[:, 2]))
     return Gaussians(

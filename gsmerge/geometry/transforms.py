@@ -22,8 +22,8 @@ from gsmerge.values.arrays import Array
 
 DescentState = TypeVar("DescentState")  # state that a descent changes
 SH_DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
-# More values than the first number are narrowed down before the median is taken: to those between two shares of a
-# sample of about the second number, which are so far from a half that the median is practically always between them
+# The median of more than FEW_VALUES values is taken only of values near it. These lie between the two quantiles
+# AROUND_MEDIAN of a sample of about SAMPLE_VALUES values. The median is practically always between these quantiles
 FEW_VALUES, SAMPLE_VALUES, AROUND_MEDIAN = 1 << 17, 1 << 14, (0.47, 0.53)
 NORMAL_SPREAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
 NEAREST_ROWS = 1 << 14  # points per task of a search for the nearest ones
@@ -79,7 +79,7 @@ def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Return ``R diag(scales)^2 R^T [...,3,3]`` of quaternions wxyz and standard deviations (paper section 3)."""
+    """Return covariances ``R diag(scales)^2 R^T [...,3,3]`` from quaternions wxyz and scales (paper section 3)."""
     half = quat_to_rotmat(quats) * scales[..., None, :]
     return matmul(half, half.swapaxes(-1, -2))
 
@@ -95,7 +95,7 @@ def project(means: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray
 
 
 def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project points ``[...,n,3]`` as :func:`project` does, for any leading shape and in their own precision.
+    """Project points ``[...,n,3]`` as :func:`project` does, but for any leading shape and in their own precision.
 
     ``viewmats [...,4,4]`` are world to camera, ``Ks [...,3,3]`` in pixels. Returns positions ``[...,n,2]`` and depths
     ``[...,n]``.
@@ -125,7 +125,7 @@ def camera_depths(points: np.ndarray, viewmats: np.ndarray, ids: np.ndarray | No
 def motion_matrices(vectors: np.ndarray) -> np.ndarray:
     """Return rigid motions ``[v,4,4]`` float64 from ``[v,6]``: rotation vectors about the origin (radians), and shifts.
 
-    A motion rotates first.
+    A motion rotates first, and then shifts.
     """
     vectors = vectors.astype(np.float64)
     angles = vector_lengths(vectors[:, :3])
@@ -143,7 +143,7 @@ def euler_to_rotmat(degrees: np.ndarray) -> np.ndarray:
 
 
 def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the rigid motions ``[v,6]`` between viewmats: ``end = start @ motion_matrices(...)``."""
+    """Return the rigid motions ``[v,6]`` between viewmats ``[v,4,4]``: ``end = start @ motion_matrices(motions)``."""
     motions = matmul(invert(start), end)
     quats = rotmat_to_quat(motions[:, :3, :3])
     quats *= np.where(quats[:, :1] < 0, -1, 1)  # the angle is at most half a turn
@@ -153,9 +153,9 @@ def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[..., np.ndarray]) -> np.ndarray:
-    """Return the viewmats ``end [v,4,4]`` without the common part of all motions since ``start``.
+    """Return the viewmats ``end [v,4,4]`` without the part that all motions from ``start`` have in common.
 
-    ``middle`` computes the common part: a mean or a median.
+    ``middle`` computes the common part: ``np.mean`` or ``np.median``.
     """
     common = middle(motion_vectors(start, end), axis=0)
     return matmul(end, invert(motion_matrices(common[None])))
@@ -171,6 +171,7 @@ def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
     rotations, means, quats = rotmat_to_quat(motions[:, :3, :3]), g.means.copy(), g.quats.copy()
 
     def move(view: int) -> None:
+        """Move the Gaussians of a view, in ``means`` and ``quats``."""
         rows = view_rows[view]
         means[rows] = matmul(g.means[rows], motions[view, :3, :3].T) + motions[view, :3, 3]
         quats[rows] = multiply_quats(rotations[view], g.quats[rows])
@@ -218,6 +219,7 @@ def step_outside(
 
 def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Measure how far cameras moved between viewmats ``[v,4,4]``: angles ``[v]`` in degrees, and distances ``[v]``."""
+    # sines of half the angles
     chords = (np.linalg.norm(end[:, :3, :3] - start[:, :3, :3], axis=(1, 2)) / np.sqrt(8)).clip(0, 1)
     distances = vector_lengths(camera_centres(end) - camera_centres(start))[:, 0]
     return np.degrees(2 * arctan2(chords, np.sqrt((1 - chords) * (1 + chords)))), distances
@@ -230,9 +232,9 @@ def vector_lengths(vectors: np.ndarray) -> np.ndarray:
 
 
 def find_nearest(points: np.ndarray, count: int, rows: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and distances ``[m,count]`` of the nearest other points, nearest first, to each of ``rows [m]``.
+    """Find the ``count`` nearest other points of each of ``rows [m]``; return their rows and distances ``[m,count]``.
 
-    There are more than ``count`` finite points ``[n,3]``. ``rows`` None: all.
+    The nearest point comes first. There must be more than ``count`` points ``[n,3]``, all finite. ``rows`` None: all.
     """
     rows = np.arange(len(points)) if rows is None else rows
     others = np.ones(len(points), bool)
@@ -254,13 +256,13 @@ def find_nearest(points: np.ndarray, count: int, rows: np.ndarray | None = None)
 
 
 def nearest_views(centres: np.ndarray, view: int) -> np.ndarray:
-    """Order the other views by the distance of their cameras' ``centres [v,3]`` from that of ``view``."""
+    """Return the other views ``[v-1]`` of cameras with ``centres [v,3]``; those nearest to ``view`` come first."""
     order = np.argsort(((centres - centres[view]) ** 2).sum(1), kind="stable")
     return order[order != view]
 
 
 def camera_distances(cameras: Cameras) -> np.ndarray:
-    """Compute distances ``[v,v]`` between cameras: of their centres, canonical units, plus of their directions."""
+    """Return distances ``[v,v]`` of cameras: of their centres, in canonical units, plus of their directions."""
     viewmats = cameras.viewmats.astype(np.float64)
     centres_and_directions = (camera_centres(viewmats), viewmats[:, 2, :3])
     differences = [vectors[:, None] - vectors[None] for vectors in centres_and_directions]
@@ -350,11 +352,11 @@ def rotate_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def harmonics_rotation(num: int, rotation: np.ndarray) -> np.ndarray:
     """Return the matrix ``[num,num]`` that rotates ``num`` harmonics; see :func:`apply_harmonics_rotation`.
 
-    Each degree is fitted to the same colours in rotated directions, which is exact.
+    The matrix is fitted to colours in directions before and after the rotation. The fit is exact.
     """
     directions = normalize(np.random.default_rng(0).normal(size=(SH_DIRECTIONS, 3)))
-    before = harmonics_in(matmul(directions, rotation), num)
-    after = harmonics_in(directions, num)
+    before = evaluate_harmonics(matmul(directions, rotation), num)
+    after = evaluate_harmonics(directions, num)
     return solve(matmul(after.T, after), matmul(after.T, before))
 
 
@@ -364,7 +366,7 @@ def apply_harmonics_rotation(shN: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows.reshape(-1, 3, len(matrix)).swapaxes(1, 2), shN.dtype)
 
 
-def harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
+def evaluate_harmonics(directions: np.ndarray, num: int) -> np.ndarray:
     """Evaluate the higher harmonics in directions ``[d,3]``; return ``[d,num]`` float64."""
     means = directions.astype(np.float32)
     count = len(means)
@@ -445,7 +447,7 @@ def descend(
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """A map ``x_gaussians = scale * rotation @ x_cameras + shift`` between frames."""
+    """A map from the frame of cameras to that of Gaussians: ``x_gaussians = scale * rotation @ x_cameras + shift``."""
 
     rotation: np.ndarray  # [3,3]
     scale: float  # Positive
@@ -474,7 +476,7 @@ class Similarity:
         out[:, :3, 3] = self.scale * viewmats[:, :3, 3] - matmul(out[:, :3, :3], self.shift)
         return out
 
-    def move(self, cameras: Cameras) -> Cameras:
+    def move_cameras(self, cameras: Cameras) -> Cameras:
         """Move cameras into the frame of the Gaussians."""
         return replace(cameras, viewmats=self.move_viewmats(cameras.viewmats))
 
@@ -483,7 +485,7 @@ IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
 
 
 def move_region(region: Region, origin: np.ndarray, unit: float) -> Region:
-    """Move a region into a frame with another origin and unit, in which positions are float32."""
+    """Return a region in a frame with another origin and unit, where positions are float32 and so are rounded more."""
     middle, half = (region.middle - origin) / unit, region.half / unit
     rounding = float(np.finfo(np.float32).eps) * float(np.abs(middle).max() + half.max())  # of float32
     return replace(region, middle=middle, half=half, rounding=region.rounding / unit + rounding)
@@ -510,22 +512,22 @@ def clamp_inside(region: Region, points: np.ndarray) -> np.ndarray:
     return np.asarray(region.middle + matmul(local, region.axes))
 
 
-def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
-    """Fit the similarity that maps cameras ``theirs [c,4,4]`` (world to camera) to ``ours``, by least squares.
+def fit_similarity(start: np.ndarray, end: np.ndarray, scale: float = 1.0) -> Similarity:
+    """Fit the similarity that maps cameras ``start [c,4,4]`` (world to camera) to ``end``, by least squares.
 
     If all cameras stand in one place, they do not determine the scale, and ``scale`` is used.
     """
-    rotation = closest_rotation(matmul(ours[:, :3, :3].swapaxes(1, 2), theirs[:, :3, :3]).sum(0))
-    a, b = matmul(camera_centres(theirs), rotation.T), camera_centres(ours)
-    a0, b0 = a - a.mean(0), b - b.mean(0)
-    spread = float((a0**2).sum())
-    if spread > 1e-12 * max(float((a**2).sum()), 1e-300) and len(ours) > 1:
-        scale = float((a0 * b0).sum()) / spread
+    rotation = closest_rotation(matmul(end[:, :3, :3].swapaxes(1, 2), start[:, :3, :3]).sum(0))
+    a, b = matmul(camera_centres(start), rotation.T), camera_centres(end)
+    a_offsets, b_offsets = a - a.mean(0), b - b.mean(0)
+    spread = float((a_offsets**2).sum())
+    if spread > 1e-12 * max(float((a**2).sum()), 1e-300) and len(end) > 1:
+        scale = float((a_offsets * b_offsets).sum()) / spread
     return Similarity(rotation, scale, b.mean(0) - scale * a.mean(0))
 
 
 def mean_pose_frame(viewmats: np.ndarray) -> Similarity:
-    """Compute the map into the mean pose of cameras ``[c,4,4]`` in which all centres lie within +-1, as in Long-LRM."""
+    """Return the similarity into the mean pose of cameras ``[c,4,4]``, with all centres within +-1, as in Long-LRM."""
     rotation, centres = np.empty((3, 3)), camera_centres(viewmats)
     rotation[2], down = normalize(viewmats[:, 2, :3].mean(0)), viewmats[:, 1, :3].mean(0)
     rotation[1] = normalize(down - (down * rotation[2]).sum() * rotation[2])

@@ -501,9 +501,9 @@ def _make_load(
     number = f"{len(empty)} of {len(scene)} views {'has' if len(empty) == 1 else 'have'}"
     doubts = [Doubt(f"{number} no Gaussians: {list_some(empty)}")] if empty else []
     scene = read_rotations(scene, hints.quats)
-    if recovery is not None and result.given is not None:
-        scene = move_views(scene, result.given)
-        result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
+    if recovery is not None and result.confirmed_viewmats is not None:
+        scene = move_views(scene, result.confirmed_viewmats)
+        result = replace(result, cameras=replace(result.cameras, viewmats=result.confirmed_viewmats))
     alignment = None if recovery is None else check_pixels(scene)
     if alignment is not None and alignment.share_near < 1 - MAX_STRAY:
         share = f"{100 * (1 - alignment.share_near):.0f} % of the Gaussians lie far from their own pixels"

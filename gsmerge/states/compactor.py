@@ -24,12 +24,12 @@ from gsmerge.values.arguments import check_arguments
 def extend_state(
     state: State | None, scene: Scene, settings: Mapping[str, Any], *, progress: Progress | None = None
 ) -> tuple[State, BatchReport]:
-    """Add a batch of views to a copy of a state; None: begin a state.
+    """Add a batch of views to a copy of a state, or begin a state (None); return the new state and the report.
 
-    ``settings``: by default those of a draft, without a fit if each Gaussian has a pixel. With ``recipe="paper"`` the
-    first batch begins a state of Feature Gaussians, and later batches use its networks. Raises ValueError if a setting
-    is unknown, out of range, or impossible for the state or the scene; SceneError if the scene seems to have another
-    frame of coordinates than the state.
+    ``settings`` change those of a draft, which are the default; if each Gaussian has a pixel, the default has no fit.
+    With ``recipe="paper"`` the first batch begins a state of Feature Gaussians, and later batches use its networks.
+    Raises ValueError if a setting is unknown, out of range, or impossible for the state or the scene, and SceneError if
+    the scene seems to have another frame of coordinates than the state.
     """
     about = {} if state is None else dict(state.about)
     scene_before, features = (None, None) if state is None else (state.scene, state.features)

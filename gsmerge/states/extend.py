@@ -1,4 +1,4 @@
-"""State and new views -> state: compact a batch, and add its Gaussians, cameras and pictures."""
+"""State and new views -> state: compact a batch of views, and add its Gaussians, cameras and pictures to a state."""
 
 from __future__ import annotations
 
@@ -25,12 +25,13 @@ from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
-# A "world" is a frame of coordinates. It is another one above this ratio: the difference between the colours of the
-# foremost Gaussians and the pictures, divided by their difference from random pixels; 1 is chance. Over batches of 15
-# captures the ratio is at most .87 in the same world and .92 to 1.08 in another one. The side has to be certain.
+# A "world" is a frame of coordinates. The colours of the foremost Gaussians differ from new pictures of them. This
+# difference, divided by that from random pixels, is about 1 if the pictures are of another world. Above this ratio the
+# worlds differ. Over batches of 15 captures the ratio is at most .87 in the same world and .92 to 1.08 in another one.
+# Nothing is decided if chance might have put a ratio on the other side.
 WORLD_RATIO = 0.9
-SAME_WORLD, ANOTHER_WORLD, UNKNOWN_WORLD = "the same", "another", "not known"  # worlds
-BATCH = "batch"  # place in messages until the file is known
+SAME_WORLD, ANOTHER_WORLD, UNKNOWN_WORLD = "the same", "another", "not known"  # results of comparing two worlds
+BATCH = "batch"  # place of an error in messages until the file is known
 NOT_COMPARED = (
     "the pictures of this batch show too little of the earlier Gaussians to say whether both are in the same world"
 )
@@ -46,10 +47,10 @@ class BatchReport:
     num_gaussians: int  # Gaussians, or Feature Gaussians, of the state afterwards
     num_kept: int  # views whose pictures the state keeps afterwards
     pictures: str  # pictures that the batch is fitted to: "photos", or what stands in for them
-    views: Mapping[str, str]  # views whose pictures the state keeps: name in the state -> name in the batch
+    views: Mapping[str, str]  # names in the batch, by names in the state, of its views whose pictures the state keeps
     sh_degree: int  # of the batch's Gaussians
     seconds: Mapping[str, float]  # wall time of each stage
-    choices: Mapping[str, Any]  # decisions of the stages; `world`: that of the batch compared with earlier batches
+    choices: Mapping[str, Any]  # decisions of the stages; `world` says whether the batch is in that of earlier batches
     notes: tuple[str, ...]  # warnings, one sentence each
     options: Mapping[str, Any]  # all settings, by their names in reports
 
@@ -68,11 +69,12 @@ def extend(
     *,
     progress: Progress | None = None,
 ) -> tuple[Scene, BatchReport]:
-    """Add a batch of views, in the same world, to the results of earlier batches; None before the first.
+    """Compact a batch of views, and add it to the results of earlier batches, which have to be in the same world.
 
-    Poses and exposures of the batch are not changed. Returns an unaligned scene of all results, and the report. The
-    scene has the kept views at the size of the first batch's views; each has its mended photo, or what stands in for
-    it. ValueError if a setting is impossible for the scene; SceneError if the scene seems to be in another world.
+    ``before`` are the earlier results; None for the first batch. Poses and exposures of the batch are not changed.
+    Returns a scene of all results, whose rows are no pixels, and the report. The scene has the views that are kept, at
+    the size of the first batch's views. Each has its corrected photo, or what stands in for it. Raises ValueError if a
+    setting is impossible for the scene, and SceneError if the scene seems to be in another world.
     """
     options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress):
@@ -92,7 +94,7 @@ def extend(
     if before is not None:
         views = _join_views(before, views)
     new_names = views.names[len(views) - len(names) :]
-    joined = replace(subset(views, choose_far(views.cameras, extend_options.max_views)), gaussians=gaussians)
+    joined = replace(subset(views, choose_distant_views(views.cameras, extend_options.max_views)), gaussians=gaussians)
     report = BatchReport(
         num_views=len(scene),
         num_input=scene.num_gaussians,
@@ -111,10 +113,11 @@ def extend(
 
 
 def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
-    """Compare the world of new views with that of earlier Gaussians; return one of the three names of worlds.
+    """Compare the world of new views with that of the Gaussians ``before``.
 
-    In the same world the pictures show the earlier Gaussians, except where the batch's Gaussians, at ``means``, hide
-    them. In another world the colours differ from the pictures as much as from random pixels.
+    Returns SAME_WORLD, ANOTHER_WORLD or UNKNOWN_WORLD. In the same world the pictures show the earlier Gaussians,
+    except where the batch's Gaussians, at ``means [n,3]``, hide them. In another world the colours differ from the
+    pictures as much as from random pixels.
     """
     if not len(views):
         return UNKNOWN_WORLD
@@ -136,7 +139,7 @@ def refuse_other_world(world: str, options: ExtendOptions) -> None:
 
 
 def _keep_pictures(prepared: Prepared) -> Scene:
-    """Return the input's views, each once, with their pictures and without Gaussians."""
+    """Return a scene of the input's views, each once, with their pictures and without Gaussians."""
     input_scene, no_gaussians = prepared.input_scene, prepared.input_scene.gaussians[:0]
     if prepared.reference.placed:  # placed views do not belong to the scene
         return Scene(no_gaussians, input_scene.cameras, None, None, input_scene.names)
@@ -148,7 +151,7 @@ def _keep_pictures(prepared: Prepared) -> Scene:
 
 
 def _join_views(before: Scene, batch: Scene) -> Scene:
-    """Append a batch's views at the size of the views before; a name that is already in use gets a number in front."""
+    """Append a batch's views to those ``before``, at the size of these; see :func:`append_names` for their names."""
     if len(batch) == 0 or len(before) == 0:
         return before if len(batch) == 0 else batch
     size = before.cameras.width, before.cameras.height
@@ -162,12 +165,12 @@ def _join_views(before: Scene, batch: Scene) -> Scene:
         before,
         cameras=concat_cameras(before.cameras, cameras),
         images=np.concatenate([before.images, images]),
-        names=number_names(before.names, batch.names),
+        names=append_names(before.names, batch.names),
     )
 
 
-def number_names(before: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Append names of views to those ``before``; a name that is already in use gets a number in front."""
+def append_names(before: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return names of views appended to those ``before``; a name that is already in use gets a number in front."""
     all_names = list(before)
     for name in names:
         numbered = (f"{number}-{name}" for number in range(2, len(all_names) + 3))
@@ -175,9 +178,10 @@ def number_names(before: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, 
     return tuple(all_names)
 
 
-def choose_far(cameras: Cameras, count: int) -> list[int]:
-    """Choose at most ``count`` views, in rising order: the first view, then always the view farthest from all chosen.
+def choose_distant_views(cameras: Cameras, count: int) -> list[int]:
+    """Choose at most ``count`` views that are far apart, in rising order.
 
+    The first view is chosen, and then always the view that is farthest from all chosen views.
     The distance of two views is the distance of their centres, as a share of the widest extent of all centres, plus the
     distance of their directions.
     """

@@ -1,7 +1,7 @@
-"""Feature Gaussians across batches with ``recipe=paper`` (paper section 4.5, "Online reconstruction").
+"""Add batches of views to Feature Gaussians with ``recipe=paper`` (paper section 4.5, "Online reconstruction").
 
 New views are encoded, matched with the earlier Feature Gaussians, merged into them and refined. Decoder heads then make
-any K of Gaussians per group. For a single batch the result has the same bytes as that of ``compact``.
+K Gaussians per group, for any K. For a single batch the result has the same bytes as that of ``compact``.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from gsmerge.states.extend import (
     NOT_COMPARED,
     UNKNOWN_WORLD,
     BatchReport,
+    append_names,
     compare_worlds,
-    number_names,
     refuse_other_world,
 )
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
@@ -57,7 +57,7 @@ class ViewSamples:
 
     @staticmethod
     def concat(parts: list[ViewSamples]) -> ViewSamples:
-        """Concatenate the views of all parts."""
+        """Return the samples of the views of all ``parts``."""
         names = [f.name for f in fields(ViewSamples)]
         return ViewSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
@@ -66,15 +66,15 @@ class ViewSamples:
 class FeatureState:
     """Feature Gaussians of all views so far; the frame is that of the first batch."""
 
-    merged: FeatureGaussians  # g, canonical, after merging; later batches are matched with these
-    refined: FeatureGaussians  # g, canonical, after the refiner; the heads decode these
-    views: np.ndarray  # [g] int64, the view whose frame the group uses
+    merged: FeatureGaussians  # g groups after merging, in the canonical frame; later batches are matched with these
+    refined: FeatureGaussians  # the same g groups after the refiner; the heads decode these
+    views: np.ndarray  # [g] int64, the view in whose frame the networks see the group
     num_members: np.ndarray  # [g] int64, number of Gaussians that were pooled into the group
-    saliency: np.ndarray  # [g] float64, mean corner response of the group's pixels; a mixed K depends on it
+    saliency: np.ndarray  # [g] float64, mean corner response of the group's pixels, which decides a mixed K
     group: np.ndarray  # [g,n] float32, the networks' inputs about each group
     samples: ViewSamples  # of all views
     cameras: Cameras  # of all views, canonical, at the size of the first batch's views
-    frame: Frame  # from canonical to world
+    frame: Frame  # the canonical frame, in the world
     networks: NetworkWeights
     checkpoint: str = ""  # name of the networks, as the user gave it
     names: tuple[str, ...] = ()  # of the views
@@ -90,8 +90,8 @@ class FeatureState:
 class _JoinContext(NetworkContext):
     """The networks' inputs for groups of a batch and a state together; ``cameras`` are those of all views.
 
-    Members of earlier batches are not stored. In place of its members, each Feature Gaussian lists the rows of the
-    parts from which it was pooled; a part is a group of the state or of the batch.
+    Members of earlier batches are not stored. In place of its members, a Feature Gaussian lists the rows of the parts
+    from which it was pooled. A part is a group of the state or of the batch.
     """
 
     samples: ViewSamples  # of all views
@@ -101,7 +101,7 @@ class _JoinContext(NetworkContext):
 
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
         """Compute the networks' inputs for Feature Gaussians, from the samples of all views."""
-        views, num_members = self.trace(features)
+        views, num_members = self.summarise_parts(features)
         height, width = self.samples.opacities.shape[1:]
         unused = np.zeros((0, 0), np.float32)  # the statistics do not read these columns
         samples = Members(
@@ -113,7 +113,7 @@ class _JoinContext(NetworkContext):
         stats = cross_view_stats(features.means, features.sh0, views, samples, grid_cameras)
         return describe_features(features, views, num_members, stats, self.cameras)
 
-    def trace(self, features: FeatureGaussians) -> tuple[np.ndarray, np.ndarray]:
+    def summarise_parts(self, features: FeatureGaussians) -> tuple[np.ndarray, np.ndarray]:
         """Find the view ``[g]`` with most of the weight of each Feature Gaussian, and its number of members ``[g]``."""
         num_views, rows = len(self.cameras), features.members
         owners = np.repeat(np.arange(len(features)), np.diff(features.starts))  # the Feature Gaussian of each part
@@ -129,10 +129,10 @@ def extend_features(
     state: FeatureState | None, scene: Scene, options: CompactOptions, extend_options: ExtendOptions,
     *, progress: Progress | None = None,
 ) -> tuple[FeatureState, BatchReport]:  # fmt: skip
-    """Add a batch of views to a state, or begin a state; see :func:`gsmerge.states.extend.extend`.
+    """Add a batch of views to a state, or begin one (None); see :func:`gsmerge.states.extend.extend`.
 
-    Raises UsageError if the settings ask for a budget, a fit or networks other than those of the state, or if the
-    harmonics have another degree.
+    Returns the new state and the report. Raises UsageError if the settings ask for a budget, for a fit, or for other
+    networks than those of the state, or if the harmonics have another degree.
     """
     _check_options(options)
     options = options.with_settings(ONE_PIECE)
@@ -147,16 +147,16 @@ def extend_features(
             )
         features, members, _, context = encode_views(prepared, plan, None)
         assert isinstance(context, NetworkContext)
-        samples = sample_views(members, prepared_scene.cameras, state)
+        samples = sample_fronts(members, prepared_scene.cameras, state)
         corners = scene_saliency(prepared_scene.images)
         if state is None:
             merged = merge(features, match(features, plan.match), context)
             saliency = group_saliency(merged, members, corners)
-            extended = _refine(merged, context, saliency, samples, prepared.frame)
+            extended = _refine_groups(merged, context, saliency, samples, prepared.frame)
         else:
             _check_degree(state, scene)
             saliency = group_saliency(features, members, corners)
-            extended = _join(state, features, saliency, context, samples, plan.match)
+            extended = _join_batch(state, features, saliency, context, samples, plan.match)
     numbers = {"num_views": len(prepared_scene), "num_input": scene.num_gaussians, "num_new": len(features)}
     notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == UNKNOWN_WORLD else [])]
     report = BatchReport(
@@ -169,7 +169,7 @@ def extend_features(
 
 
 def _check_options(options: CompactOptions) -> None:
-    """Raise UsageError for settings that Feature Gaussians in batches cannot follow: a budget, a fit and others."""
+    """Raise UsageError for settings that do not apply to Feature Gaussians in batches: a budget, a fit and others."""
     for name in options.compact_only:
         raise UsageError(f"{name}: not possible for Feature Gaussians in batches; use compact on the whole scene")
     if options.budget.budget is not None:
@@ -192,11 +192,14 @@ def _view_names(state: FeatureState | None, prepared: Prepared) -> tuple[str, ..
     """Return the names of all views of a state and a batch."""
     input_names = prepared.input_scene.names
     batch_names = tuple(input_names[prepared.repeated.index(view)] for view in range(len(prepared.scene)))
-    return batch_names if state is None else number_names(state.names, batch_names)
+    return batch_names if state is None else append_names(state.names, batch_names)
 
 
 def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
-    """Compare the world of a canonical scene with that of a state; SceneError for another one, unless allowed."""
+    """Return how the world of a canonical scene compares with that of a state; see :func:`compare_worlds`.
+
+    Raises SceneError if it is another one, unless the options allow it.
+    """
     if state is None:
         return UNKNOWN_WORLD
     world = compare_worlds(feature_to_gaussians(state.refined), scene, scene.gaussians.means)
@@ -215,8 +218,11 @@ def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
     return Checkpoint(state.networks, Path(stored), __version__, {})
 
 
-def sample_views(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
-    """Sample the foremost Gaussian at the centre of each cell of a grid; with a state, use its grid."""
+def sample_fronts(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
+    """Sample the foremost Gaussian at the centre of each cell of a grid in every view; the grid is that of a state.
+
+    Without a state, the cells of the grid are squares of a fixed size.
+    """
     sample_step = 8  # pixels between samples of a view along each axis
     new_shape = -(-cameras.height // sample_step), -(-cameras.width // sample_step)
     height, width = new_shape if state is None else state.samples.opacities.shape[1:]
@@ -235,14 +241,14 @@ def sample_views(members: Members, cameras: Cameras, state: FeatureState | None)
     )
 
 
-def _refine(
+def _refine_groups(
     merged: FeatureGaussians, context: NetworkContext, saliency: np.ndarray, samples: ViewSamples, frame: Frame
 ) -> FeatureState:  # fmt: skip
-    """Refine merged Feature Gaussians, and describe the groups for the heads."""
+    """Refine merged Feature Gaussians, and return the state that has them and the inputs of the heads about them."""
     refined = context.refine(merged)
     with stage("decode"):
         described = context.describe(refined)
-    num_members = context.trace(refined)[1] if isinstance(context, _JoinContext) else np.diff(refined.starts)
+    num_members = context.summarise_parts(refined)[1] if isinstance(context, _JoinContext) else np.diff(refined.starts)
     return FeatureState(
         merged=_without_members(merged),
         refined=_without_members(refined),
@@ -257,11 +263,14 @@ def _refine(
     )
 
 
-def _join(
+def _join_batch(
     state: FeatureState, features: FeatureGaussians, saliency: np.ndarray, context: NetworkContext,
     samples: ViewSamples, options: MatchOptions,
 ) -> FeatureState:  # fmt: skip
-    """Match, merge and refine the Feature Gaussians of a state and a batch; those of the state come first."""
+    """Match, merge and refine the Feature Gaussians of a state and of a batch; return the new state.
+
+    ``features``, ``saliency``, ``context`` and ``samples`` are those of the batch. Views of the state come first.
+    """
     size, members = (state.cameras.width, state.cameras.height), context.members
     cameras = concat_cameras(state.cameras, resize_cameras(context.cameras, *size))
     views = features.views + len(state.cameras)
@@ -278,11 +287,11 @@ def _join(
     merged = merge(parts, _match_parts(parts, len(state), options), join_context)
     part_saliency = np.concatenate([state.saliency, saliency])
     merged_saliency = _mean_of_parts(merged, part_saliency, num_members.astype(np.float64))
-    return _refine(merged, join_context, merged_saliency, samples, state.frame)
+    return _refine_groups(merged, join_context, merged_saliency, samples, state.frame)
 
 
 def _mean_of_parts(merged: FeatureGaussians, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the weighted mean ``[g]`` of the parts of each Feature Gaussian; values and weights are ``[p]``."""
+    """Return the mean ``[g]`` of ``values [p]`` over the parts of each Feature Gaussian, with ``weights [p]``."""
     owners = np.repeat(np.arange(len(merged)), np.diff(merged.starts))
     weights, values = weights[merged.members], values[merged.members]
     return np.bincount(owners, weights * values, len(merged)) / np.bincount(owners, weights, len(merged))
@@ -291,8 +300,9 @@ def _mean_of_parts(merged: FeatureGaussians, values: np.ndarray, weights: np.nda
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -> Matches:
     """Match the Feature Gaussians of a batch with each other, as in a scene, and with those of the state.
 
-    Clusters of the two matchings are joined if they share a part. In the matching with the state, the state counts as
-    one view and the batch as another, so that each part is compared with its nearest neighbours on the other side.
+    The first ``num_old`` of the ``parts`` are those of the state. Clusters of the two matchings are joined if they
+    share a part. In the matching with the state, the state counts as one view and the batch as another, so that each
+    part is compared with its nearest neighbours on the other side.
     """
     rows = np.arange(len(parts))
     across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options).clusters
@@ -304,7 +314,7 @@ def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -
 
 
 def _first_members(clusters: np.ndarray) -> np.ndarray:
-    """Return for each part the first part ``[p]`` with the same cluster in ``clusters [p]``."""
+    """Return the first part ``[p]`` that is in the same cluster as each part; ``clusters [p]`` are their numbers."""
     _, first_rows, cluster_ids = np.unique(clusters, return_index=True, return_inverse=True)
     return first_rows[cluster_ids]
 
@@ -315,7 +325,7 @@ def _without_members(features: FeatureGaussians) -> FeatureGaussians:
 
 
 def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
-    """Decode a state into ``k`` Gaussians per group, or into a number that depends on saliency, in the world frame.
+    """Decode a state into ``k`` Gaussians per group, or by saliency with a mixed K; return them in the world frame.
 
     Raises UsageError if the networks' heads make fewer Gaussians, or if ``k_rule`` needs the members of the groups.
     """

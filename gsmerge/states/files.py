@@ -49,11 +49,21 @@ def extend_file(
 ) -> tuple[dict[str, Any], State]:
     """Add a batch of views to the state in a file, or to a new file; return report (plain JSON types) and new state.
 
-    The file is replaced at the end, but not if anything fails; another process that extends it waits. A batch is left
-    out, with a note, if the state already has it. ``settings``: see :class:`gsmerge.Compactor`. ``seconds_before``:
-    wall time by name of the caller's earlier steps. ``dry_run``: write nothing. ``tried``: the state of an earlier dry
-    run, used in place of the file's. Raises SceneError if a file cannot be read or written, or if the batch seems to be
-    in another world; UsageError if a setting is unknown, out of range, or impossible for the state or the scene.
+    The file is replaced at the end, but not if anything fails. Another process that extends it waits. If the state
+    already has the batch, it is left out, with a note. Raises SceneError if a file cannot be read or written, or if the
+    batch seems to be in another world. Raises UsageError if a setting is unknown, out of range, or impossible for the
+    state or the scene.
+
+    Args:
+        path: The file of the state.
+        files: The files of the batch.
+        settings: See :class:`gsmerge.Compactor`.
+        opacity: How opacities are stored in the batch's file.
+        hints: Facts about the batch's file that it does not have itself.
+        progress: Called as the batch is compacted.
+        seconds_before: Wall times of the caller's earlier steps, by name.
+        dry_run: Write nothing.
+        tried: The state of an earlier dry run, used in place of the file's.
     """
     try:
         batch_settings(settings)
@@ -69,7 +79,7 @@ def extend_file(
         if state is not None and content in contents:
             number = contents.index(content) + 1
             note = f"{files.ply}: left out, since the same files are batch {number} of {path.name} already"
-            return document | {"repeated": True, "state": _describe_file(path, state), **note_entries([note])}, state
+            return document | {"repeated": True, "state": _state_facts(path, state), **note_entries([note])}, state
         load_end = perf_counter()
         load = read_input(files, opacity=opacity, hints=hints, hashed=True)
         read_end = perf_counter()
@@ -77,7 +87,7 @@ def extend_file(
             state, report = extend_state(state, load.scene, settings, progress=progress)
         except SceneError as error:
             raise (SceneError(files.ply, error.problem, error.remedy) if error.path == BATCH else error) from error
-        state = _note_source(state, content, load.comments)
+        state = _record_source(state, content, load.comments)
         extend_end = perf_counter()
         if not dry_run:
             save_state(path, state, overwrite=True, mode=mode)
@@ -88,7 +98,7 @@ def extend_file(
         document |= {
             **facts,
             "repeated": False,
-            "state": _describe_file(path, state),
+            "state": _state_facts(path, state),
             "options": dict(report.options),
             **seconds_document(seconds | {"write": perf_counter() - extend_end}),
             "peak_memory_bytes": peak_memory(),
@@ -98,29 +108,29 @@ def extend_file(
 
 
 def lock_state(path: Path) -> AbstractContextManager[bool]:
-    """Let one process at a time into the block for a state."""
+    """Return a context in which only one process at a time works with the file of a state."""
     path = Path(os.path.realpath(path))
     if not path.parent.is_dir():  # a new state in a new folder, which is made with the file
         return nullcontext(True)
     return lock_file(path.with_name(f".gsmerge-{digest({'name': path.name})[:16]}.lock"))
 
 
-def _note_source(state: State, content: str, comments: Sequence[str]) -> State:
-    """Return a state that records the hash of its last batch's files, and the comments that results copy."""
+def _record_source(state: State, content: str, comments: Sequence[str]) -> State:
+    """Return a state that records the hash ``content`` of its last batch's files, and comments for its results."""
     *earlier, last = state.about["batches"]
     last = last | {"content": content}
     all_comments = list(dict.fromkeys([*state.about.get("comments", []), *comments]))
     return replace(state, about={**state.about, "batches": [*earlier, last], "comments": all_comments})
 
 
-def _describe_file(path: Path, state: State) -> dict[str, Any]:
-    """Describe the file of a state; after a dry run it may not exist."""
+def _state_facts(path: Path, state: State) -> dict[str, Any]:
+    """Return the part of a report about the file of a state; after a dry run the file may not exist."""
     num_bytes = path.stat().st_size if path.exists() else 0
     return {"path": str(path), "bytes": num_bytes, "num_batches": len(state.about["batches"])}
 
 
 def batch_line(document: Mapping[str, Any]) -> str:
-    """Describe the report of a batch in one line."""
+    """Summarise the report of :func:`extend_file` in one line."""
     state, would = document["state"], "would be " * document["dry_run"]
     if document["repeated"]:
         return f"{state['path']}: {would}unchanged, {count_words(state['num_batches'], 'batch')}"
@@ -145,8 +155,8 @@ def decode_file(
 ) -> dict[str, Any]:
     """Decode the Feature Gaussians in a ``.gsm`` into an output, with cameras in or beside it; return the report.
 
-    ``dry_run``: write nothing. Raises SceneError if a file cannot be read or written, UsageError for a K that the
-    networks do not make.
+    With ``dry_run`` nothing is written. Raises SceneError if a file cannot be read or written, and UsageError for a K
+    that the networks do not make.
     """
     start, state = perf_counter(), load_state(path)
     features, batches = state.features, state.about["batches"]
@@ -178,7 +188,7 @@ def decode_file(
 
 
 def decoding_line(document: Mapping[str, Any]) -> str:
-    """Describe the report of :func:`decode_file` in one line."""
+    """Summarise the report of :func:`decode_file` in one line."""
     before, after = document["input"], document["output"]
     if "dry_run" in document:
         return f"would write  {after['path']}: at most {after['num_gaussians_at_most']:,} Gaussians"

@@ -1,4 +1,4 @@
-"""Write and read the file of a state: results with views, or Feature Gaussians of ``recipe=paper``."""
+"""Write and read the file of a state, which has results with views, or Feature Gaussians of ``recipe=paper``."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
 from gsmerge.values.words import count_words
 
 FEATURE_COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
-_MAX_MEMBERS = (1 << 40) - 1  # of a group; larger numbers are damaged
+_MAX_MEMBERS = (1 << 40) - 1  # most Gaussians of a group; a larger number is damaged
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Views of several batches, compacted: results in a scene, or Feature Gaussians."""
+    """What is kept of several batches of views: results in a scene with views, or Feature Gaussians."""
 
-    about: Mapping[str, Any]  # plain JSON types; `batches` has the report of each batch
+    about: Mapping[str, Any]  # facts in plain JSON types; `batches` has the figures of each batch
     scene: Scene | None = None  # None in a state of Feature Gaussians
     features: FeatureState | None = None  # None in a state of results
 
@@ -53,7 +53,7 @@ class State:
 def save_state(path: StrPath, state: State, *, overwrite: bool = False, mode: int = 0o666) -> None:
     """Write a state to a file, completely or not at all; SceneError if the file exists or cannot be written.
 
-    ``mode``: the most rights of a new file, see :func:`gsmerge.io.atomic.common_mode`.
+    ``mode`` has the most rights that a new file gets, see :func:`gsmerge.io.atomic.common_mode`.
     """
     if state.scene is not None:
         write_scene(path, state.scene, state.about, overwrite=overwrite, mode=mode)
@@ -95,7 +95,7 @@ def load_state(path: StrPath) -> State:
 
 
 def holds_features(path: Path) -> bool:
-    """Return whether a ``.gsm`` holds Feature Gaussians instead of results; SceneError if it cannot be read."""
+    """Return whether a ``.gsm`` holds a state of Feature Gaussians, not results; SceneError if it cannot be read."""
     return bool(read_header(path)["kind"] != SCENE)
 
 
@@ -113,22 +113,22 @@ def _read_features(file: GsmFile) -> FeatureState:
     shapes: dict[str, tuple[int, ...]] = {
         "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (num_higher, 3), "latents": (weights.options.latent,),
     }  # fmt: skip
-    columns = {name: _numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in FEATURE_COLUMNS}
+    columns = {name: _read_numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in FEATURE_COLUMNS}
     merged = FeatureGaussians(
         **columns,
-        views=_whole_numbers(file, "merged.views", g, -1, num_views),
+        views=_read_whole_numbers(file, "merged.views", g, -1, num_views),
         starts=np.zeros(g + 1, np.int64),
         members=np.zeros(0, np.int32),
     )
-    corrected = {name: _numbers(file, f"refined.{name}", g, *shapes.get(name, ())) for name in CORRECTED}
+    corrected = {name: _read_numbers(file, f"refined.{name}", g, *shapes.get(name, ())) for name in CORRECTED}
     return FeatureState(
         merged=merged,
         refined=replace(merged, **corrected),
         samples=_read_samples(file, num_views),
-        views=_whole_numbers(file, "views", g, 0, num_views),
-        num_members=_whole_numbers(file, "num_members", g, 1, _MAX_MEMBERS + 1),
+        views=_read_whole_numbers(file, "views", g, 0, num_views),
+        num_members=_read_whole_numbers(file, "num_members", g, 1, _MAX_MEMBERS + 1),
         saliency=file.finite("saliency", np.float64, g),
-        group=_numbers(file, "group", g, GROUP_COLUMNS),
+        group=_read_numbers(file, "group", g, GROUP_COLUMNS),
         cameras=cameras,
         frame=Frame(file.finite("origin", np.float64, 3), unit),
         networks=weights,
@@ -162,20 +162,20 @@ def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
         raise file.error("samples.opacities: expected pixels of every view, found none")
     shapes = {"means": (3,), "opacities": (), "sh0": (3,)}
     grid = num_views, height, width
-    return ViewSamples(*(_numbers(file, f"samples.{name}", *grid, *shape) for name, shape in shapes.items()))
+    return ViewSamples(*(_read_numbers(file, f"samples.{name}", *grid, *shape) for name, shape in shapes.items()))
 
 
-def _numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
-    """Return a float32 array; SceneError if it has numbers that would overflow later."""
+def _read_numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
+    """Return a float32 array of a file; SceneError if it has numbers that would overflow later."""
     array = file.array(name, np.float32, *shape)
-    largest = 1e37  # absolute value of any number; float32 ends at 3e38
+    largest = 1e37  # largest absolute value; float32 ends at 3e38
     if not (np.abs(array).max(initial=0) <= largest):  # NaN fails too
         raise file.error(f"{name}: expected finite numbers up to {largest:g}, found others")
     return array
 
 
-def _whole_numbers(file: GsmFile, name: str, count: int, start: int, end: int) -> np.ndarray:
-    """Return an array ``[count]`` of whole numbers from ``start`` to below ``end``; SceneError for other numbers."""
+def _read_whole_numbers(file: GsmFile, name: str, count: int, start: int, end: int) -> np.ndarray:
+    """Return an array ``[count]`` of a file, whole numbers from ``start`` to below ``end``; SceneError for others."""
     array = file.array(name, np.int64, count)
     if count and not start <= int(array.min()) <= int(array.max()) < end:
         raise file.error(f"{name}: expected numbers from {start} to {end - 1}, found others")

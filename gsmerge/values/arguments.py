@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Name in an annotation -> its words in messages, and the test of a value; CLASSES are the other names
+# Names in annotations, each with its words in messages and its test of a value. CLASSES are all other known names
 ARGUMENT_KINDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "None": ("", lambda value: value is None),
     "StrPath": ("a path", lambda value: isinstance(value, str | os.PathLike)),
@@ -30,6 +30,7 @@ CLASSES = (
     "Pixels", "LargePhotos", "Region", "Scene", "Gaussians", "Cameras", "Views", "CameraFile", "CompactOptions",
     "EvaluateOptions",
 )  # fmt: skip
+# How annotations of containers begin, and the types that such values may have
 CONTAINERS = {"Mapping[str, ": Mapping, "Sequence[": list | tuple, "tuple[": list | tuple}
 REMEDIES = {
     "Scene": "gsmerge.read_scene(path) reads one; tensors go to gsmerge.compact_tensors",
@@ -38,7 +39,7 @@ REMEDIES = {
 
 
 def check_arguments(function: Function) -> Function:
-    """Decorate a public function so that arguments of undeclared types raise TypeError, with one line.
+    """Decorate a public function so that arguments of other types than it declares raise TypeError, with one line.
 
     Only parameters are checked whose annotations consist of names from :data:`ARGUMENT_KINDS` and :data:`CLASSES`, and
     of lists and mappings of these.
@@ -48,26 +49,26 @@ def check_arguments(function: Function) -> Function:
 
     @wraps(function)
     def call(*args: Any, **named: Any) -> Any:
-        given = signature.bind(*args, **named).arguments
-        for name in filter(checked.get, given):
-            is_several = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
-            for value in given[name] if is_several else [given[name]]:
-                _check(name, checked[name], value)
+        arguments = signature.bind(*args, **named).arguments
+        for name in filter(checked.get, arguments):
+            is_variadic = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
+            for value in arguments[name] if is_variadic else [arguments[name]]:
+                _check_value(name, checked[name], value)
         return function(*args, **named)
 
     return cast("Function", call)
 
 
 def check_fields(value: Any) -> None:
-    """Raise TypeError, with one line, if a field of a dataclass has an undeclared type; see :func:`check_arguments`."""
+    """Raise TypeError, with one line, if a field of a dataclass has another type than declared."""
     for field in fields(value):
         if _is_known(str(field.type)):
-            _check(field.name, str(field.type), getattr(value, field.name))
+            _check_value(field.name, str(field.type), getattr(value, field.name))
 
 
 @cache
-def _split(annotation: str) -> list[tuple[str, str]]:
-    """Split an annotation at each |; return the container of each part, "" without one, and the name in it."""
+def _split_annotation(annotation: str) -> list[tuple[str, str]]:
+    """Split an annotation at each |; return the container of each part ("" if it has none) and the name in the part."""
     matches = [re.fullmatch(r"(Mapping\[str, |Sequence\[|tuple\[)?(.*?)(?:, \.\.\.)?\]?", part.strip())
                for part in re.split(r"\|(?![^\[]*\])", annotation)]  # fmt: skip
     return [(match[1] or "", match[2]) for match in matches if match]
@@ -75,16 +76,16 @@ def _split(annotation: str) -> list[tuple[str, str]]:
 
 @cache
 def _is_known(annotation: str) -> bool:
-    """Return whether an annotation consists of known names only."""
+    """Return whether an annotation consists only of names from ``ARGUMENT_KINDS`` and ``CLASSES``."""
     return all(
         (container in CONTAINERS and _is_known(name)) if container else name in ARGUMENT_KINDS or name in CLASSES
-        for container, name in _split(annotation)
+        for container, name in _split_annotation(annotation)
     )
 
 
-def _check(name: str, annotation: str, value: Any) -> None:
-    """Raise TypeError, with the expected types, if a value has none of the types of an annotation."""
-    if _fits(annotation, value):
+def _check_value(name: str, annotation: str, value: Any) -> None:
+    """Raise TypeError, with the expected types, if the value of an argument has none of the types of its annotation."""
+    if _has_type(annotation, value):
         return
     words = re.sub(
         r"[\w.]+", lambda match: ARGUMENT_KINDS[match[0]][0] if match[0] in ARGUMENT_KINDS else match[0], annotation
@@ -94,12 +95,12 @@ def _check(name: str, annotation: str, value: Any) -> None:
     raise TypeError(f"{name}: expected {words}, got {type(value).__name__}{next(remedies, '')}")
 
 
-def _fits(annotation: str, value: Any) -> bool:
+def _has_type(annotation: str, value: Any) -> bool:
     """Return whether a value has one of the types that an annotation names."""
-    for container, name in _split(annotation):
+    for container, name in _split_annotation(annotation):
         if container:
             values = value.values() if isinstance(value, Mapping) else value
-            fits = isinstance(value, CONTAINERS[container]) and all(_fits(name, each) for each in values)
+            fits = isinstance(value, CONTAINERS[container]) and all(_has_type(name, each) for each in values)
         elif name in ARGUMENT_KINDS:
             fits = ARGUMENT_KINDS[name][1](value)
         else:

@@ -18,7 +18,7 @@ Array = NDArray[Any]  # or a torch tensor if a docstring allows one; type checke
 
 
 class ArrayFields:
-    """Base of dataclasses of arrays: compares values, where ``==`` of the arrays themselves gives an array."""
+    """Base of dataclasses of arrays: ``==`` compares all values and gives one boolean, where arrays give an array."""
 
     def __eq__(self, other: object) -> bool:
         if other.__class__ is not self.__class__:
@@ -52,9 +52,9 @@ def check_numbers(name: str, values: Any) -> None:
 
 
 def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> int:
-    """Return the length of an array; TypeError unless it is an array or tensor, ValueError unless it has a shape.
+    """Return the length of an array; TypeError for anything but an array or tensor, ValueError for another shape.
 
-    An axis given by a name may have any length.
+    An axis whose expected length is a name may have any length. ``name`` is the array's name in messages.
     """
     if not hasattr(array, "ndim"):
         raise TypeError(f"{name}: expected an array or a tensor, got {type(array).__name__}")
@@ -67,7 +67,10 @@ def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> int:
 
 
 def as_index(rows: str, index: Any) -> Any:
-    """Return an index that selects ``rows``: a slice, a mask or integers, a tuple as a list; TypeError for another."""
+    """Return an index of several rows: a slice, a mask or integers, a tuple as a list; TypeError for any other index.
+
+    ``rows`` is the name of the rows in messages.
+    """
     if isinstance(index, slice | list | range) or getattr(index, "ndim", 0) == 1:
         return index
     if isinstance(index, tuple):
@@ -80,7 +83,7 @@ def as_index(rows: str, index: Any) -> Any:
 def as_array(values: Any) -> np.ndarray:
     """Return an array, or a tensor on any device, as a NumPy array without gradient; copy it only if needed.
 
-    Floats of less than 32 bits, of which NumPy lacks some, become float32 if they are a tensor's.
+    A tensor's floats of less than 32 bits become float32, because NumPy lacks some of their types.
     """
     if hasattr(values, "detach"):
         check_numbers("tensor", values)
@@ -146,7 +149,7 @@ def concat_columns(parts: Sequence[Array]) -> Array:
 
 
 def is_equal(one: Any, other: Any) -> bool:
-    """Return whether two values are equal; arrays or tensors are if their shapes and numbers are, NaN equals NaN."""
+    """Return whether two values are equal; of arrays or tensors, shapes and numbers count, and NaN equals NaN."""
     if one is other:
         return True
     if getattr(one, "ndim", 0) or getattr(other, "ndim", 0):
@@ -156,5 +159,5 @@ def is_equal(one: Any, other: Any) -> bool:
 
 
 def shorten(value: Any) -> str:
-    """Describe a value; of an array or tensor only the shape."""
+    """Describe a value in one line: an array or a tensor by its shape alone."""
     return f"{type(value).__name__}{list(value.shape)}" if getattr(value, "ndim", 0) else repr(value)

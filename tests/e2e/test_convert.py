@@ -115,7 +115,7 @@ def test_up_is_where_the_cameras_look_up_or_minus_y(result: Path) -> None:
         expected["xyz".index(axis[-1])] = -1 if axis[0] == "-" else 1
         frame = find_placement(PlacementOptions(up=axis), None)
         np.testing.assert_allclose(frame.rotation @ [0, -1, 0], expected, atol=1e-12)
-        moved = find_placement(PlacementOptions(up=axis), cameras).move(cameras)
+        moved = find_placement(PlacementOptions(up=axis), cameras).move_cameras(cameras)
         upward = -moved.viewmats[:, 1, :3].sum(0)
         np.testing.assert_allclose(upward / np.linalg.norm(upward), expected, atol=1e-9)
     np.testing.assert_array_equal(find_placement(PlacementOptions(up="y"), None).rotation, np.diag([1, -1, -1]))

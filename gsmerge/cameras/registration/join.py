@@ -1,4 +1,4 @@
-"""Join scenes of one place into one scene: each is moved into the frame of the first one."""
+"""Join scenes of one place into one scene, in the frame of the first scene that is joined."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class JoinedScene:
     """Several scenes joined into one, in the frame of the first scene used."""
 
     scene: Scene
-    used: tuple[int, ...]  # numbers of the given scenes that are joined
-    names: tuple[str, ...]  # of the given scenes, for messages
-    notes: tuple[str, ...]
-    # for each given scene: its path and whether it was joined; if so, the number of keypoints by which it was
-    # registered, the angle of its rotation in degrees, its scale and the shift of its origin
+    used: tuple[int, ...]  # numbers of the input scenes that are joined
+    names: tuple[str, ...]  # of all input scenes, for messages
+    notes: tuple[str, ...]  # for the user, one sentence each
+    # For each input scene: its path, and whether it was joined. For joined scenes also the number of keypoints by which
+    # they were registered, the angle of their rotation in degrees, their scale, and the shift of their origin
     facts: tuple[dict[str, Any], ...]
 
 
@@ -37,7 +37,7 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     ``paths`` are their files, for messages. Raises SceneError if a scene has no pixels, if views or harmonics differ in
     size, or if no two scenes show the same surfaces.
     """
-    _check(scenes, paths)
+    _check_joinable(scenes, paths)
     registration = register(scenes)
     with_folder = len({path.name for path in paths}) < len(paths)
     names = [os.path.join(path.parent.name, path.name) if with_folder else path.name for path in paths]
@@ -55,12 +55,14 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     notes += [Doubt(f"{name} {left_out}") for i, name in enumerate(names) if i not in used]
     if len({scene.images is None for scene in moved}) > 1:
         notes.append(Doubt("some files have no photos, so none are used; name the folder of all with --images"))
-    facts = [_facts(*entry) for entry in zip(paths, registration.similarities, registration.matches, strict=True)]
+    facts = [
+        _describe_scene(*entry) for entry in zip(paths, registration.similarities, registration.matches, strict=True)
+    ]
     return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 
 
-def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
-    """Raise SceneError if scenes cannot be joined."""
+def _check_joinable(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
+    """Raise SceneError if a scene has no pixels, or differs from the first scene in size or degree of harmonics."""
     first = scenes[0]
     size = first.cameras.width, first.cameras.height
     degree = first.gaussians.sh_degree
@@ -68,10 +70,10 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
         scene_size = scene.cameras.width, scene.cameras.height
         sh_degree = scene.gaussians.sh_degree
         if not scene.has_own_pixels:
-            found = "no cameras"
+            actual = "no cameras"
             if len(scene):
-                found = count_words(len(scene), "camera", "and Gaussians that are no pixels")
-            problem = f"expected cameras and one Gaussian for each of their pixels, as scenes to join, found {found}"
+                actual = count_words(len(scene), "camera", "and Gaussians that are no pixels")
+            problem = f"expected cameras and one Gaussian for each of their pixels, as scenes to join, found {actual}"
             raise SceneError(path, problem, "compact it by itself")
         if scene_size != size:
             problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}"
@@ -82,29 +84,30 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
             raise SceneError(path, problem, "export all with one degree")
 
 
-def _facts(path: Path, similarity: Similarity | None, matches: int) -> dict[str, Any]:
+def _describe_scene(path: Path, similarity: Similarity | None, matches: int) -> dict[str, Any]:
     """Return the facts of a scene in the report, see :class:`JoinedScene`."""
     facts: dict[str, Any] = {"path": str(path), "joined": similarity is not None}
     if similarity is None:
         return facts
-    half = np.abs(rotmat_to_quat(similarity.rotation[None])[0, :1]).clip(0, 1)
-    degrees = round(float(np.degrees(2 * arccos(half))[0]), 4)
+    half_cosine = np.abs(rotmat_to_quat(similarity.rotation[None])[0, :1]).clip(0, 1)
+    degrees = round(float(np.degrees(2 * arccos(half_cosine))[0]), 4)
     facts |= {"matches": matches, "degrees": degrees}
     return facts | {"scale": similarity.scale, "shift": similarity.shift.tolist()}
 
 
 def move_scene(scene: Scene, similarity: Similarity) -> Scene:
-    """Move a scene's Gaussians and cameras by a similarity; photos do not change."""
+    """Return a scene with its Gaussians and cameras moved by a similarity, and with the same photos."""
     if similarity.scale == 1 and np.array_equal(similarity.rotation, np.eye(3)) and not similarity.shift.any():
         return scene
-    gaussians, cameras = similarity.move_gaussians(scene.gaussians), similarity.move(scene.cameras)
+    gaussians, cameras = similarity.move_gaussians(scene.gaussians), similarity.move_cameras(scene.cameras)
     return replace(scene, gaussians=gaussians, cameras=cameras)
 
 
 def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> Scene:
     """Concatenate the views of scenes of one size and frame; the result has pixels if all scenes do.
 
-    ``photos`` are the photos of all views, if they are in one array already.
+    ``photos [v,h,w,3]`` are the photos of all views, if they are in one array already. Otherwise the result has photos
+    if all scenes do.
     """
     cameras = Cameras(
         np.concatenate([scene.cameras.viewmats for scene in scenes]),
@@ -131,14 +134,14 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
 
 def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
     """Concatenate the pixels of scenes; None if the views of any scene have no Gaussians of their own."""
-    homes, fronts, rows, views = list[np.ndarray](), list[np.ndarray](), 0, 0
+    homes, fronts, num_rows, num_views = list[np.ndarray](), list[np.ndarray](), 0, 0
     for scene in scenes:
         if not scene.has_own_pixels:
             return None
         pixels = scene.get_pixels()
-        homes.append(np.where(pixels.homes >= 0, pixels.homes + views * scene.pixels_per_view, -1))
-        fronts.append(np.where(pixels.shown, pixels.fronts + np.int32(rows), np.int32(-1)))
-        rows, views = rows + len(scene.gaussians), views + len(scene)
+        homes.append(np.where(pixels.homes >= 0, pixels.homes + num_views * scene.pixels_per_view, -1))
+        fronts.append(np.where(pixels.shown, pixels.fronts + np.int32(num_rows), np.int32(-1)))
+        num_rows, num_views = num_rows + len(scene.gaussians), num_views + len(scene)
     return Pixels(np.concatenate(homes), np.concatenate(fronts), own=True)
 
 
@@ -164,13 +167,14 @@ def _concat_values(
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
-    """Concatenate large photos; None if a scene has none, or if their sizes differ."""
+    """Concatenate the large photos of scenes; None if a scene has none, or if their sizes differ."""
     sources = [source for source in photos if source is not None]
     if len(sources) < len(photos) or len({(source.width, source.height) for source in sources}) > 1:
         return None
     source_views = [(source, source_view) for source in sources for source_view in source.ids]
 
     def read(view: int) -> np.ndarray:
+        """Read the photo of a view from the source of its scene."""
         source, source_view = source_views[view]
         return source.read(source_view)
 

@@ -15,74 +15,74 @@ from gsmerge.raster.photos import row_pictures
 from gsmerge.types import Scene
 
 KEYPOINT_PIXELS = 1600  # longest side of a photo in which keypoints are searched, pixels
-GREY_WEIGHTS = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
+GREY_WEIGHTS = np.array([77, 150, 29], np.int32)  # of red, green and blue in a grey value; they sum to 256
 MATCH_RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
+class PhotoKeypoints:
     """Keypoints of one photo, and their points in the scene."""
 
-    pixels: np.ndarray  # [n,2] of the scene's grid
+    pixels: np.ndarray  # [n,2] positions in the scene's grid
     points: np.ndarray  # [n,3] float64, in the scene's frame
     descriptors: np.ndarray  # [n,128] float32, whole numbers up to 255
-    viewmat: np.ndarray  # [4,4] float64, of its camera in the scene's frame
-    K: np.ndarray  # [3,3]
+    viewmat: np.ndarray  # [4,4] float64, of the photo's camera in the scene's frame
+    K: np.ndarray  # [3,3] of this camera
 
 
 @dataclass(frozen=True, eq=False)
-class End:
+class MatchSide:
     """One scene's half of m keypoint matches: pixels, points and cameras."""
 
     points: np.ndarray  # [m,3] in the scene's frame
-    pixels: np.ndarray  # [m,2] of the scene's grid
-    viewmats: np.ndarray  # [m,4,4] cameras that see them
-    Ks: np.ndarray  # [m,3,3]
+    pixels: np.ndarray  # [m,2] positions in the scene's grid
+    viewmats: np.ndarray  # [m,4,4] of the camera that shows each keypoint
+    Ks: np.ndarray  # [m,3,3] of this camera
 
-    def select(self, mask: np.ndarray) -> End:
+    def select(self, mask: np.ndarray) -> MatchSide:
         """Select matches by a mask."""
-        return End(*(getattr(self, field.name)[mask] for field in fields(self)))
+        return MatchSide(*(getattr(self, field.name)[mask] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class KeypointMatches:
     """Matches between the keypoints of two scenes, row by row."""
 
-    scenes: tuple[int, int]
-    ends: tuple[End, End]
+    scenes: tuple[int, int]  # numbers of the two scenes
+    sides: tuple[MatchSide, MatchSide]
     spread: float  # standard deviation of a keypoint, pixels
 
     def __len__(self) -> int:
-        return len(self.ends[0].points)
+        return len(self.sides[0].points)
 
     def select(self, mask: np.ndarray) -> KeypointMatches:
         """Select matches by a mask."""
-        first, second = self.ends
-        return replace(self, ends=(first.select(mask), second.select(mask)))
+        first, second = self.sides
+        return replace(self, sides=(first.select(mask), second.select(mask)))
 
 
-def find_keypoints(scene: Scene) -> list[Photo]:
-    """Find the keypoints in the photo of every view of a scene of pixels; leave out those at edges of surfaces."""
+def find_keypoints(scene: Scene) -> list[PhotoKeypoints]:
+    """Find the keypoints in the photo of every view of a scene with pixels, except keypoints at edges of surfaces."""
     cameras, photos = scene.cameras.numpy(), []
     for view in range(len(scene)):
         K = cameras.Ks[view].astype(np.float64)
         viewmat = cameras.viewmats[view].astype(np.float64)
-        picture, shown = _picture(scene, view, K)
-        places, descriptors = _describe(picture, shown[1, 1] / shown[0, 0])
-        zoom = K[0, 0] / shown[0, 0], K[1, 1] / shown[1, 1]
-        pixels = (places - shown[:2, 2]) * zoom + K[:2, 2]
-        z, ok = _depths_at(_surface(scene, view, viewmat), pixels)
+        picture, picture_K = _read_picture(scene, view, K)
+        places, descriptors = _detect_keypoints(picture, picture_K[1, 1] / picture_K[0, 0])
+        zoom = K[0, 0] / picture_K[0, 0], K[1, 1] / picture_K[1, 1]
+        pixels = (places - picture_K[:2, 2]) * zoom + K[:2, 2]
+        z, is_surface = _depths_at(_surface_depths(scene, view, viewmat), pixels)
         rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
-        points = matmul(rays[ok] * z[ok, None] - viewmat[:3, 3], viewmat[:3, :3])
-        photos.append(Photo(pixels[ok], points, descriptors[ok], viewmat, K))
+        points = matmul(rays[is_surface] * z[is_surface, None] - viewmat[:3, 3], viewmat[:3, :3])
+        photos.append(PhotoKeypoints(pixels[is_surface], points, descriptors[is_surface], viewmat, K))
     return photos
 
 
-def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a picture ``[h,w,3]`` uint8 of a view, and its intrinsics.
+def _read_picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a picture ``[h,w,3]`` uint8 of a view, and the picture's intrinsics.
 
-    The picture is the largest photo, reduced to KEYPOINT_PIXELS pixels. Without photos it has the base colours of the
-    Gaussians.
+    The picture is the photo at its own size, but its longer side has at most KEYPOINT_PIXELS pixels. Without photos the
+    picture has the base colours of the Gaussians. ``K`` are the intrinsics of the view.
     """
     if scene.large_photos is not None:
         large = scene.large_photos
@@ -96,10 +96,11 @@ def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.nda
     return (colors.clip(0, 1) * 255).round().astype(np.uint8), K
 
 
-def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find keypoints of a picture ``[h,w,3]`` uint8; return their places ``[n,2]`` and descriptors ``[n,128]``.
+def _detect_keypoints(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find keypoints of a picture ``[h,w,3]`` uint8; return their pixels ``[n,2]`` and descriptors ``[n,128]``.
 
-    ``stretch`` is the width of a pixel's footprint over its height. The picture is resized to square pixels.
+    ``stretch`` is the width of a pixel's footprint divided by its height. The search resizes the picture to square
+    pixels.
     """
     height, width = picture.shape[:2]
     min_side = 8  # least side of a photo in which keypoints are searched, pixels
@@ -109,7 +110,7 @@ def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarr
     max_keypoints = 4000  # most keypoints of a photo
     contrast = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
     finder = cv2.SIFT.create(max_keypoints, contrastThreshold=contrast)
-    with _any_processor():
+    with _equal_on_any_processor():
         square = cv2.resize(grey, (wide, high), interpolation=cv2.INTER_LINEAR)
         keypoints, descriptors = finder.detectAndCompute(square, None)
     if descriptors is None:
@@ -119,8 +120,8 @@ def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarr
 
 
 @contextmanager
-def _any_processor() -> Iterator[None]:
-    """Restrict OpenCV in the block to instructions of all processors, so that keypoints are equal on all of them."""
+def _equal_on_any_processor() -> Iterator[None]:
+    """Let OpenCV use only instructions that all processors have in the block, so that keypoints are equal on all."""
     before = cv2.useOptimized()
     cv2.setUseOptimized(False)
     try:
@@ -129,15 +130,18 @@ def _any_processor() -> Iterator[None]:
         cv2.setUseOptimized(before)
 
 
-def _surface(scene: Scene, view: int, viewmat: np.ndarray) -> np.ndarray:
-    """Return the depth ``[h,w]`` of the Gaussian in front of each pixel of a view; infinite without any."""
+def _surface_depths(scene: Scene, view: int, viewmat: np.ndarray) -> np.ndarray:
+    """Return the depth ``[h,w]`` of the front Gaussian of each pixel of a view; infinite if a pixel has none."""
     rows = scene.get_pixels().fronts[view]
     depths = camera_depths(scene.gaussians.means[rows].astype(np.float64), viewmat)
     return np.asarray(np.where((rows >= 0) & (depths > 0), depths, np.inf))
 
 
 def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median depth of 3 x 3 pixels around each of ``pixels [n,2]``, and whether these show one surface."""
+    """Return the median depth ``[n]`` of the 3 x 3 pixels around ``pixels [n,2]``, and a mask ``[n]``.
+
+    The mask is True if the 3 x 3 pixels show one surface.
+    """
     padded = np.pad(depths, 1, mode="edge")
     height, width = depths.shape
     x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)
@@ -149,23 +153,26 @@ def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def match_photos(
-    scenes: tuple[int, int], photos: Sequence[Photo], other_photos: Sequence[Photo], size: tuple[int, int]
+    scenes: tuple[int, int],
+    photos: Sequence[PhotoKeypoints],
+    other_photos: Sequence[PhotoKeypoints],
+    size: tuple[int, int],
 ) -> KeypointMatches:
     """Match the keypoints of all photos of two scenes; ``size`` is width and height of their grids, pixels."""
     pairs = [(a, b) for a in photos for b in other_photos]
-    rows = [_match(a.descriptors, b.descriptors) for a, b in pairs]
-    first = _make_end([a for a, _ in pairs], [ids for ids, _ in rows])
-    second = _make_end([b for _, b in pairs], [ids for _, ids in rows])
+    rows = [_match_descriptors(a.descriptors, b.descriptors) for a, b in pairs]
+    first = _make_side([a for a, _ in pairs], [ids for ids, _ in rows])
+    second = _make_side([b for _, b in pairs], [ids for _, ids in rows])
     diagonal = float(np.sqrt(size[0] ** 2 + size[1] ** 2))
     pixel_spread = 0.003  # standard deviation of a keypoint, divided by the diagonal of the picture
     return KeypointMatches(scenes, (first, second), pixel_spread * diagonal)
 
 
-def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
-    """Collect the keypoints at the given rows of each photo."""
+def _make_side(photos: Sequence[PhotoKeypoints], rows: Sequence[np.ndarray]) -> MatchSide:
+    """Collect the keypoints of photos; each photo has the numbers of its keypoints in ``rows``."""
     photo_rows = list(zip(photos, rows, strict=True))
     counts = [len(ids) for ids in rows]
-    return End(
+    return MatchSide(
         points=np.concatenate([photo.points[ids] for photo, ids in photo_rows]),
         pixels=np.concatenate([photo.pixels[ids] for photo, ids in photo_rows]),
         viewmats=np.repeat([photo.viewmat for photo in photos], counts, 0),
@@ -173,9 +180,12 @@ def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
     )
 
 
-def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of rows of ``a`` and ``b`` that are mutual best matches, clearly better than the second best."""
-    if min(len(a), len(b)) < 2:
+def _match_descriptors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Match descriptors ``a`` and ``b``; return the rows in each of those that match.
+
+    Two descriptors match if each is the best match of the other, clearly better than the second best.
+    """
+    if min(len(a), len(b)) < 2:  # there is no second best
         return np.empty(0, int), np.empty(0, int)
     # all sums are whole numbers below 2^24, so float32 is exact in any order of summation
     distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)

@@ -1,9 +1,10 @@
 """Register scenes of one place: find the similarities between their frames from photos and depths.
 
-Matched keypoints of two photos are points of both scenes, at the depths of their Gaussians. Three matches determine a
-similarity (Umeyama 1991). Similarities are fitted to random triples, and the similarity that agrees with most matches
-is chosen. Then all scenes are moved at once by Gauss-Newton steps, until points project to their keypoints in the other
-photos. Single depths may be wrong, so a point may move along its ray within the standard deviation of depths.
+Matched keypoints of two photos are points of both scenes, at the depths of the Gaussians in their pixels. Three matches
+determine a similarity (Umeyama 1991). Similarities are fitted to random triples, and the similarity that agrees with
+most matches is chosen. Then all scenes are moved at once by Gauss-Newton steps, until points project to their keypoints
+in the other photos. A single depth may be wrong. So residuals allow a point to move along its ray, within the standard
+deviation of depths.
 """
 
 from __future__ import annotations
@@ -14,7 +15,13 @@ from itertools import combinations
 
 import numpy as np
 
-from gsmerge.cameras.registration.keypoints import End, KeypointMatches, Photo, find_keypoints, match_photos
+from gsmerge.cameras.registration.keypoints import (
+    KeypointMatches,
+    MatchSide,
+    PhotoKeypoints,
+    find_keypoints,
+    match_photos,
+)
 from gsmerge.cameras.registration.similarities import compose, fit_similarities, invert_similarity, round_similarity
 from gsmerge.geometry.transforms import (
     IDENTITY,
@@ -34,13 +41,15 @@ from gsmerge.types import Scene
 DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
 NORMAL_2D = 1 / 1.1774  # standard deviation of two normal components, divided by the median length of their vector
 AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
-LOOSE = (100.0, 10.0, 2.0, 2.0)  # multiples of AGREE in each round; the first are large because chains of scenes drift
-MIN_MATCHES = 16  # agreeing matches of two connected scenes; unrelated photos have up to 5
-DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
+# Multiples of AGREE up to which matches are used in each round. The first are large because chains of scenes drift
+LOOSE = (100.0, 10.0, 2.0, 2.0)
+MIN_MATCHES = 16  # least number of agreeing matches of two connected scenes; unrelated photos have up to 5
+SIMILARITY_DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
 NUM_PARAMETERS = 7  # parameters of a step: rotation, shift, logarithm of the scale
 
 Similarities = Sequence[Similarity | None]
-_Fit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]  # similarities; their cost, its curvature and slope
+# Similarities, and the cost of their residuals with its curvature and slope; see _normal_equations
+_SimilarityFit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,26 +61,27 @@ class Registration:
 
 
 def register(scenes: Sequence[Scene]) -> Registration:
-    """Find the similarities that map aligned scenes, with grids of one size, into the frame of the first.
+    """Find the similarities that map aligned scenes, with grids of one size, into the frame of the first connected one.
 
-    If the scenes form several connected sets, the largest is used.
+    Scenes are connected if enough keypoints of their photos match. If they form several connected sets, the largest is
+    used.
     """
     count, cameras = len(scenes), scenes[0].cameras
     photos = [find_keypoints(scene) for scene in scenes]
     size = cameras.width, cameras.height
-    ids = combinations(range(count), 2)
-    pairs = [match_photos((a, b), photos[a], photos[b], size) for a, b in ids]
+    id_pairs = combinations(range(count), 2)
+    pairs = [match_photos((a, b), photos[a], photos[b], size) for a, b in id_pairs]
     links = [link for link in parallel_map(connect, pairs) if link is not None]
-    similarities = _chain(links, count)
+    similarities = _chain_largest_set(links, count)
     connected = [pair for _, pair in links if all(similarities[scene] is not None for scene in pair.scenes)]
     spread = DEPTH_SPREAD
     for loose in LOOSE if connected else ():
-        agreeing = [pair.select(_squares(similarities, pair, spread) < loose * AGREE) for pair in connected]
-        similarities = _refine(similarities, agreeing, spread)
+        agreeing = [pair.select(_squared_residuals(similarities, pair, spread) < loose * AGREE) for pair in connected]
+        similarities = _refine_similarities(similarities, agreeing, spread)
         connected, spread = _measure_spreads(similarities, connected)
-    agreeing = [pair.select(_squares(similarities, pair, spread) < AGREE) for pair in connected]
+    agreeing = [pair.select(_squared_residuals(similarities, pair, spread) < AGREE) for pair in connected]
     matches = [sum(len(pair) for pair in agreeing if i in pair.scenes) for i in range(count)]
-    unit = _unit(photos, similarities)
+    unit = _choose_shift_unit(photos, similarities)
     rounded = tuple(None if similarity is None else round_similarity(similarity, unit) for similarity in similarities)
     return Registration(rounded, tuple(matches))
 
@@ -82,22 +92,22 @@ def register(scenes: Sequence[Scene]) -> Registration:
 def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | None:
     """Find the similarity from the first scene to the second that agrees with the most matches.
 
-    Returns the similarity and the matches that agree; None if they are too few.
+    Returns the similarity and the matches that agree; None if too few agree.
     """
     if len(matches) < MIN_MATCHES:
         return None
     pair = replace(matches, scenes=(0, 1))
     trials = _sample_similarities(matches)
-    misses = [_squares((trial, IDENTITY), pair, DEPTH_SPREAD) for trial in trials]
+    misses = [_squared_residuals((trial, IDENTITY), pair, DEPTH_SPREAD) for trial in trials]
     scores = [(1 - squares / AGREE).clip(0).sum() for squares in misses]
     similarities: Similarities = (trials[int(np.argmax(scores))], IDENTITY)
     agree = misses[int(np.argmax(scores))] < AGREE
-    rounds = 3  # of selecting the agreeing matches of a pair and refining its similarity
+    rounds = 3  # in each, the similarity is refined and the agreeing matches are selected anew
     for _ in range(rounds):
         if agree.sum() < MIN_MATCHES // 2:
             return None
-        similarities = _refine(similarities, [pair.select(agree)], DEPTH_SPREAD, fixed=1)
-        agree = _squares(similarities, pair, DEPTH_SPREAD) < AGREE
+        similarities = _refine_similarities(similarities, [pair.select(agree)], DEPTH_SPREAD, fixed=1)
+        agree = _squared_residuals(similarities, pair, DEPTH_SPREAD) < AGREE
     similarity = similarities[0]
     min_share = 0.15  # least share of agreeing matches
     if similarity is None or agree.sum() < max(MIN_MATCHES, min_share * len(matches)):
@@ -106,11 +116,11 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
 
 
 def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
-    """Fit similarities to random triples of matches; return those that most matches agree with."""
+    """Fit similarities to random triples of matches; return those with which the points of most matches agree."""
     rng = np.random.default_rng(0)
-    p, q = (end.points for end in matches.ends)
-    first_depths, second_depths = (camera_depths(end.points, end.viewmats) for end in matches.ends)
-    num_triples = 2000  # random triples of matches
+    p, q = (side.points for side in matches.sides)
+    first_depths, second_depths = (camera_depths(side.points, side.viewmats) for side in matches.sides)
+    num_triples = 2000  # number of random triples
     rows = rng.integers(0, len(matches), (num_triples, 3))
     weights = (1 / (first_depths * second_depths))[rows]
     rotations, scales, shifts = fit_similarities(p[rows], q[rows], weights)
@@ -118,12 +128,12 @@ def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
     squares = ((moved - q) ** 2).sum(2) / np.minimum(second_depths, scales[:, None] * first_depths) ** 2
     max_distance = 0.25  # distance of matched points, divided by their depth, up to which a match supports a triple
     closeness = (1 - squares / max_distance**2).clip(0).sum(1)
-    num_trials = 60  # best similarities of triples that are tested in the photos
+    num_trials = 60  # similarities that are returned, the best first
     best = np.argsort(-closeness, kind="stable")[:num_trials]
     return [Similarity(rotations[i], float(scales[i]), shifts[i]) for i in best]
 
 
-def _between(similarities: Similarities, scenes: Sequence[int]) -> Similarity:
+def _similarity_between(similarities: Similarities, scenes: Sequence[int]) -> Similarity:
     """Return the similarity from the frame of the first of two placed scenes to the frame of the second."""
     first, second = (similarities[scene] for scene in scenes)
     assert first is not None
@@ -139,27 +149,29 @@ class _Residuals:
     """Errors of points of one scene in the photos of another, in standard deviations."""
 
     moved: np.ndarray  # [m,3] points in the frame of the other scene
-    values: np.ndarray  # [m,3] two errors of the place in the photo, and one of the depth
+    values: np.ndarray  # [m,3] two errors of the position in the photo, and one of the depth
     slopes: np.ndarray  # [m,3,3] derivatives of ``values`` by ``moved``
 
 
-def _residuals(similarity: Similarity, end: End, other: End, pixels: float, spread: float) -> _Residuals:
-    """Compute the errors between projected points of one end and the keypoints of the other, in standard deviations.
+def _one_way_residuals(
+    similarity: Similarity, side: MatchSide, other: MatchSide, pixels: float, spread: float
+) -> _Residuals:
+    """Compute the errors between projected points of one side and the keypoints of the other.
 
-    ``similarity`` maps from the frame of ``end`` to the frame of ``other``. ``pixels`` is the standard deviation of a
-    keypoint, and ``spread`` the standard deviation of the logarithm of a depth.
+    ``similarity`` maps from the frame of ``side`` to the frame of ``other``. The errors are in standard deviations:
+    ``pixels`` is that of a keypoint, and ``spread`` that of the logarithm of a depth.
     """
     rotmats = other.viewmats[:, :3, :3]
-    moved = similarity.move_points(end.points)
+    moved = similarity.move_points(side.points)
     camera = transform(rotmats, moved) + other.viewmats[:, :3, 3]
     z = np.maximum(camera[:, 2], 1e-9 * np.abs(camera).max(1) + 1e-30)
     projected = transform(other.Ks, camera)[:, :2] / z[:, None]
     by_camera = np.zeros((len(moved), 3, 3))
     by_camera[:, :2] = (other.Ks[:, :2] - projected[..., None] * np.eye(3)[2]) / z[:, None, None]
-    # movement of the place in the photo if a depth is wrong by one standard deviation
-    poses = end.viewmats[:, :3, :3]
-    eyes = -transform(poses.swapaxes(1, 2), end.viewmats[:, :3, 3])
-    along = similarity.scale * transform(rotmats, matmul(end.points - eyes, similarity.rotation.T))
+    # shift of the position in the photo if a depth is wrong by one standard deviation
+    poses = side.viewmats[:, :3, :3]
+    eyes = -transform(poses.swapaxes(1, 2), side.viewmats[:, :3, 3])
+    along = similarity.scale * transform(rotmats, matmul(side.points - eyes, similarity.rotation.T))
     streaks = spread * transform(by_camera[:, :2], along)
     lengths = np.maximum((streaks * streaks).sum(1), 1e-30)
     shrink = (1 - pixels / np.sqrt(pixels**2 + lengths)) / lengths
@@ -176,31 +188,30 @@ def _residuals(similarity: Similarity, end: End, other: End, pixels: float, spre
     return _Residuals(moved, values, matmul(by_camera, rotmats))
 
 
-def _squares(similarities: Similarities, matches: KeypointMatches, spread: float) -> np.ndarray:
+def _squared_residuals(similarities: Similarities, matches: KeypointMatches, spread: float) -> np.ndarray:
     """Return the squared residual ``[m]`` of each match, in the direction in which it is larger."""
-    both = [(residuals.values**2).sum(1) for residuals in _both_residuals(similarities, matches, spread)]
+    both = [(residuals.values**2).sum(1) for residuals in _two_way_residuals(similarities, matches, spread)]
     return np.asarray(np.maximum(*both))
 
 
-def _both_residuals(similarities: Similarities, matches: KeypointMatches, spread: float) -> list[_Residuals]:
+def _two_way_residuals(similarities: Similarities, matches: KeypointMatches, spread: float) -> list[_Residuals]:
     """Compute the residuals of matches in both directions: from the first scene to the second, and back."""
-    first, second = matches.ends
-    forward = _between(similarities, matches.scenes)
+    first, second = matches.sides
+    forward = _similarity_between(similarities, matches.scenes)
     return [
-        _residuals(forward, first, second, matches.spread, spread),
-        _residuals(invert_similarity(forward), second, first, matches.spread, spread),
+        _one_way_residuals(forward, first, second, matches.spread, spread),
+        _one_way_residuals(invert_similarity(forward), second, first, matches.spread, spread),
     ]
 
 
 def _measure_spreads(
     similarities: Similarities, matches: Sequence[KeypointMatches]
 ) -> tuple[list[KeypointMatches], float]:
-    """Measure standard deviations robustly.
+    """Measure the standard deviations of keypoints and of depths robustly.
 
-    Returns the matches with the measured standard deviation of keypoints, and the standard deviation of the logarithms
-    of depths.
+    Returns the matches with the measured standard deviation of keypoints, and that of the logarithms of depths.
     """
-    values = [_both_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
+    values = [_two_way_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
     lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
     ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
     spread = NORMAL_SPREAD * float(lower_median(ratios))
@@ -214,22 +225,25 @@ def _measure_spreads(
 # All scenes
 
 
-def _chain(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
-    """Place the scenes of the largest connected set along their strongest links, in the frame of its first scene."""
+def _chain_largest_set(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
+    """Return similarities of the largest connected set of scenes into the frame of its first scene; None for others.
+
+    Scenes are placed one after the other, along the links with most matches. ``count`` is the number of all scenes.
+    """
     strength = [0] * count
     for _, pair in links:
         for scene in pair.scenes:
             strength[scene] += len(pair)
     best: Similarities = []
     for start in sorted(range(count), key=lambda scene: -strength[scene]):
-        similarities = _chain_from(start, links, count)
-        if _num_connected(similarities) > _num_connected(best):
+        similarities = _chain_from_scene(start, links, count)
+        if _count_placed(similarities) > _count_placed(best):
             best = similarities
     first = next(similarity for similarity in best if similarity is not None)
     to_first = invert_similarity(first)
 
     def move(similarity: Similarity | None) -> Similarity | None:
-        """Change the frame of a similarity to the frame of the first scene."""
+        """Return a similarity into the frame of the first scene instead."""
         if similarity is None:
             return None
         return IDENTITY if similarity is first else compose(to_first, similarity)
@@ -237,13 +251,16 @@ def _chain(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> S
     return list(map(move, best))
 
 
-def _num_connected(similarities: Similarities) -> int:
+def _count_placed(similarities: Similarities) -> int:
     """Count the scenes that are placed."""
     return sum(similarity is not None for similarity in similarities)
 
 
-def _chain_from(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
-    """Place scenes in the frame of scene ``start``, each along its strongest link to a scene already placed."""
+def _chain_from_scene(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
+    """Place scenes in the frame of scene ``start``, each along the link with most matches to a scene already placed.
+
+    The result has None for scenes that are not connected with ``start``.
+    """
     similarities: list[Similarity | None] = [None] * count
     similarities[start] = IDENTITY
     while True:
@@ -260,17 +277,21 @@ def _chain_from(start: int, links: Sequence[tuple[Similarity, KeypointMatches]],
             similarities[b] = compose(first, invert_similarity(similarity))
 
 
-def _refine(
+def _refine_similarities(
     similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, fixed: int | None = None
 ) -> Similarities:
-    """Move all placed scenes but ``fixed`` (None: the first) by damped Gauss-Newton steps to minimise the residuals."""
+    """Return the similarities with the least residuals of the matches, by damped Gauss-Newton steps.
+
+    The scene ``fixed`` (None: the first that is placed) does not move.
+    """
     placed = [i for i, each in enumerate(similarities) if each is not None]
     free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
 
-    def fit(current: Similarities) -> _Fit:
+    def linearise(current: Similarities) -> _SimilarityFit:
         return current, _normal_equations(current, matches, spread, free)
 
-    def step(state: _Fit, damping: float) -> _Fit | None:
+    def step(state: _SimilarityFit, damping: float) -> _SimilarityFit | None:
+        """Return the fit after one damped Gauss-Newton step; None if the step is not finite."""
         current, (_, curvature, slope) = state
         scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
         steps = -solve(curvature + np.diag(scale), slope).reshape(-1, NUM_PARAMETERS)
@@ -278,13 +299,13 @@ def _refine(
             return None
         moved = list(current)
         for i, vector in zip(free, steps, strict=True):
-            moved[i] = compose(current[i] or IDENTITY, _make_step(vector))
-        return fit(moved)
+            moved[i] = compose(current[i] or IDENTITY, _make_similarity(vector))
+        return linearise(moved)
 
-    return descend(fit(similarities), lambda state: state[1][0], step, DAMPING)[0]
+    return descend(linearise(similarities), lambda state: state[1][0], step, SIMILARITY_DAMPING)[0]
 
 
-def _make_step(step: np.ndarray) -> Similarity:
+def _make_similarity(step: np.ndarray) -> Similarity:
     """Make the similarity of a step ``[7]``: rotation vector, shift and logarithm of the scale."""
     rotation = motion_matrices(np.concatenate([step[:3], np.zeros(3)])[None])[0, :3, :3]
     scale = float(exp(step[6:].clip(-1, 1))[0])
@@ -294,7 +315,10 @@ def _make_step(step: np.ndarray) -> Similarity:
 def _normal_equations(
     similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, free: Sequence[int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return Cauchy's cost of the residuals, its curvature and its slope with respect to steps of the free scenes."""
+    """Return Cauchy's cost of the residuals, and its curvature and slope for steps of the ``free`` scenes.
+
+    Each free scene has NUM_PARAMETERS rows, in the order of ``free``.
+    """
     size = len(free) * NUM_PARAMETERS
     curvature = np.zeros((size, size))
     slope = np.zeros(size)
@@ -302,14 +326,14 @@ def _normal_equations(
     columns = {scene: slice(i * NUM_PARAMETERS, (i + 1) * NUM_PARAMETERS) for i, scene in enumerate(free)}
     half_weight = 4.0  # squared residual at which the weight of a match halves
     for pair in matches:
-        forward = _between(similarities, pair.scenes)
-        both = _both_residuals(similarities, pair, spread)
+        forward = _similarity_between(similarities, pair.scenes)
+        both = _two_way_residuals(similarities, pair, spread)
         for source, similarity, residuals in zip((0, 1), (forward, invert_similarity(forward)), both, strict=True):
             squares = (residuals.values**2).sum(1)
             weights = 1 / (1 + squares / half_weight)
             cost += half_weight * float(log1p(squares / half_weight).sum())
-            source_jacobian = _by_step(residuals.slopes, pair.ends[source].points, similarity)
-            target_jacobian = -_by_step(residuals.slopes, residuals.moved, IDENTITY)
+            source_jacobian = _differentiate_by_step(residuals.slopes, pair.sides[source].points, similarity)
+            target_jacobian = -_differentiate_by_step(residuals.slopes, residuals.moved, IDENTITY)
             jacobians = {pair.scenes[source]: source_jacobian, pair.scenes[1 - source]: target_jacobian}
             jacobians = {scene: jacobian for scene, jacobian in jacobians.items() if scene in columns}
             for scene, jacobian in jacobians.items():
@@ -321,8 +345,11 @@ def _normal_equations(
     return cost, curvature, slope
 
 
-def _by_step(slopes: np.ndarray, points: np.ndarray, similarity: Similarity) -> np.ndarray:
-    """Differentiate residuals by a step of their points before ``similarity`` is applied: ``[m,3,7]``."""
+def _differentiate_by_step(slopes: np.ndarray, points: np.ndarray, similarity: Similarity) -> np.ndarray:
+    """Return the derivatives ``[m,3,7]`` of residuals by a step that moves their points before ``similarity`` does.
+
+    ``slopes [m,3,3]`` are the derivatives of the residuals by the moved points.
+    """
     by_point = similarity.scale * matmul(slopes, similarity.rotation)
     x, y, z = points.T
     zero = np.zeros_like(x)
@@ -331,8 +358,8 @@ def _by_step(slopes: np.ndarray, points: np.ndarray, similarity: Similarity) -> 
     return np.concatenate([matmul(by_point, by_rotation), by_point, by_scale], 2)
 
 
-def _unit(photos: Sequence[Sequence[Photo]], similarities: Similarities) -> float:
-    """Return the power of two nearest to the median depth of the points of the first placed scene."""
+def _choose_shift_unit(photos: Sequence[Sequence[PhotoKeypoints]], similarities: Similarities) -> float:
+    """Return the unit in which shifts are rounded: the power of two above the first placed scene's median depth."""
     first = next(scene_photos for scene_photos, each in zip(photos, similarities, strict=True) if each is not None)
     depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
     return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0

@@ -7,7 +7,7 @@ import numpy as np
 from gsmerge.geometry.transforms import Similarity, normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.kernels.matrices import eigh, matmul, transform
 
-DIGITS = 7  # decimals of a rounded similarity, whose last bits have no meaning
+DIGITS = 7  # decimals to which a similarity is rounded; further digits have no meaning
 
 
 def fit_similarities(p: np.ndarray, q: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -22,9 +22,10 @@ def fit_similarities(p: np.ndarray, q: np.ndarray, weights: np.ndarray) -> tuple
     a = p - middle_p[:, None]
     b = q - middle_q[:, None]
     scales = np.sqrt(_spread(b, share) / _spread(a, share))
-    m = matmul((share * b).swapaxes(1, 2), a)
+    m = matmul((share * b).swapaxes(1, 2), a)  # covariance of the two sets
     trace = np.trace(m, axis1=1, axis2=2)
     axis = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1)
+    # the quaternion is the eigenvector of the largest eigenvalue of this form
     form = np.empty((len(m), 4, 4))
     form[:, 0, 0] = trace
     form[:, 0, 1:] = axis
@@ -36,6 +37,7 @@ def fit_similarities(p: np.ndarray, q: np.ndarray, weights: np.ndarray) -> tuple
 
 
 def _spread(points: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return the weighted mean square ``[b]``, above 0, of b sets of centred points ``[b,n,3]``."""
     return np.asarray(np.maximum((share * points**2).sum((1, 2)), 1e-30))
 
 
@@ -47,15 +49,15 @@ def compose(second: Similarity, first: Similarity) -> Similarity:
 
 
 def invert_similarity(similarity: Similarity) -> Similarity:
-    """Invert a similarity."""
+    """Return the similarity that maps back."""
     shift = -matmul(similarity.rotation.T, similarity.shift) / similarity.scale
     return Similarity(similarity.rotation.T, 1 / similarity.scale, shift)
 
 
 def round_similarity(similarity: Similarity, unit: float) -> Similarity:
-    """Round a similarity so that rounding errors of keypoints do not change results.
+    """Return a rounded similarity, so that tiny differences between keypoints do not change results.
 
-    ``unit`` is the unit of the shift.
+    ``unit`` is the unit in which the shift is rounded.
     """
     quat = normalize(rotmat_to_quat(similarity.rotation[None]).round(DIGITS))
     shift = unit * (similarity.shift / unit).round(DIGITS)

@@ -15,7 +15,7 @@ from saved_cameras import write_transforms
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge.cameras.poses import move_cameras
-from gsmerge.cameras.score import max_pixels, sample_pixels
+from gsmerge.cameras.score import max_correctable_px, sample_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import pose_changes, project_points
 from gsmerge.io import write_gaussians
@@ -44,7 +44,7 @@ def test_a_known_motion_is_measured(large: Tiny) -> None:
     wrong = cameras_of(large, off(large, 0.7, 0.02))
     pairs = sample_pixels(large.gaussians, wrong, np.ones(len(large.gaussians), bool))
     moved = move_cameras(pairs, wrong, NAMES)
-    assert 1.5 < moved.worst_px < max_pixels(200, 140)
+    assert 1.5 < moved.worst_px < max_correctable_px(200, 140)
     degrees, distances = pose_changes(large.w2c, moved.cameras.viewmats)
     assert degrees.max() < 0.05
     assert distances.max() < 0.004
@@ -103,8 +103,8 @@ def test_a_file_with_other_intrinsics_is_refused_with_the_remedy(large: Tiny, tm
 def test_far_off_is_too_far(large: Tiny) -> None:
     wrong = cameras_of(large, off(large, 8.0, 0.02))
     assert move_cameras(sample_pixels(large.gaussians, wrong, np.ones(84000, bool)), wrong, NAMES) is None
-    assert max_pixels(480, 360) == 12
-    assert max_pixels(20, 14) == 1.5  # in small pictures twelve pixels are much
+    assert max_correctable_px(480, 360) == 12
+    assert max_correctable_px(20, 14) == 1.5  # in small pictures twelve pixels are much
 
 
 def save_with(tiny: Tiny, folder: Path, viewmats: np.ndarray) -> Path:

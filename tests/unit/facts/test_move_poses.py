@@ -15,7 +15,7 @@ from gsmerge.facts.move_poses import CHANCE, move_poses
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
 from gsmerge.geometry.transforms import (
-    harmonics_in,
+    evaluate_harmonics,
     motion_matrices,
     motion_vectors,
     normalize,
@@ -55,7 +55,7 @@ def with_highlight(scene: Scene) -> Scene:
     """The scene with harmonics of degree 3, brightest where a wall at right angles to z mirrors a lamp."""
     g, eyes = scene.gaussians, scene.cameras.centres.repeat(scene.pixels_per_view, 0)
     lamp = np.array([0.0, -0.2, 2 * np.median(g.means[:, 2]) - np.median(eyes[:, 2])])  # in the mirror
-    lobes, seen = (harmonics_in(normalize(away), 15) for away in (lamp - g.means, g.means - eyes))
+    lobes, seen = (evaluate_harmonics(normalize(away), 15) for away in (lamp - g.means, g.means - eyes))
     lobes *= GLOSS
     bright = (lobes * seen).sum(1).reshape(*scene.images.shape[:3], 1)
     shiny = replace(g, shN=lobes[:, :, None].repeat(3, 2).astype(np.float32))

@@ -18,7 +18,7 @@ from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.photos.row_colors import PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.scene.read import load_scene
-from gsmerge.states.extend import NOT_COMPARED, choose_far, compare_worlds
+from gsmerge.states.extend import NOT_COMPARED, choose_distant_views, compare_worlds
 
 FEW = {"superpixels": "10%", "checkpoint": "none"}
 SHAPES = {"room": scenes.room, "wall": scenes.wall, "planes": scenes.two_planes}
@@ -172,7 +172,7 @@ def test_kept_views_are_far_apart(places: list[float], count: int) -> None:
     """Each view is no farther from a kept one than those are from each other."""
     viewmats = np.tile(np.eye(4), (len(places), 1, 1))
     viewmats[:, 0, 3] = places
-    chosen = choose_far(Cameras(viewmats, np.tile(np.eye(3), (len(places), 1, 1)), 4, 4), count)
+    chosen = choose_distant_views(Cameras(viewmats, np.tile(np.eye(3), (len(places), 1, 1)), 4, 4), count)
     assert chosen == sorted(set(chosen))
     assert len(chosen) == min(count, len(places))
     x = np.array(places)
