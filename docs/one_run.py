@@ -214,8 +214,8 @@ def head(run: Run) -> str:
             "[Conventions](../reference/conventions.md) explain names and words.",
         ),
         text(
-            "Lists give arrays with shape and type, and the values of one row:",
-            f"that of pixel ({X}, {Y}) of view {VIEW}, or of what this pixel has become.",
+            "Lists give arrays with shape and type, and the values of one row.",
+            f"The row is that of pixel ({X}, {Y}) of view {VIEW}, or of what this pixel has become.",
         ),
         f"![One view: photo, superpixels, Feature Gaussians, merged, fitted, result](../images/{PICTURE.name})",
         text(
@@ -234,7 +234,7 @@ def align_section(run: Run) -> str:
         "## 1. align: which row is which pixel",
         text(
             "[`cameras/rows_first.py`](../../gsmerge/cameras/rows_first.py) gets the rows, the cameras and the",
-            "photos, and returns the pixel of every row.",
+            "photos, and returns the pixel of every row if the rows show it.",
         ),
         "\n".join([
             entry("ply.gaussians.means", ply.gaussians.means, ROW),
@@ -321,8 +321,8 @@ def plan_section(run: Run) -> str:
                 f" {plan.settings['superpixels']} of the",
                 limits.exact is None and not plan.keeps_fidelity and plan.target_psnr is None,
             ),
-            f"{pixels:,} pixels of a view become Gaussians: {limits.per_view} for each view,",
-            f"{limits.default:,} in all. The fit has {plan.fit.steps} steps. It starts with fewer Gaussians,",
+            f"{pixels:,} pixels of a view become Gaussians. These are {limits.per_view} for each view,",
+            f"and {limits.default:,} in all. The fit has {plan.fit.steps} steps. It starts with fewer Gaussians,",
             say(
                 f"{first} for each view, and adds the others where the photos show the largest errors.",
                 plan.fit.grows and not plan.merges_pairs,
@@ -400,7 +400,8 @@ def build_section(run: Run) -> str:
         ),
         text(
             f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians, which change no photo by more than",
-            f"rounding does, and puts {len(others)} others where cameras between photos see nothing.",
+            "rounding does, and adds Gaussians where cameras between the photos see nothing.",
+            say("Here there are no such places.", not others),
         ),
     ])  # fmt: skip
 
