@@ -20,7 +20,7 @@ _REPORTS = b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,"
 _DOWNLOAD = "download it again, in a browser if the page needs a click or a login"
 _UNPACK = "unpack it, and name the scene in it"
 _GLB = "export it as .glb, which is a single file"
-_AGAIN = "copy or download it again"
+_COPY_AGAIN = "copy or download it again"
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,10 @@ class OtherContent:
     wrong: tuple[str, ...] | None = None  # endings of files that may not have it; None: all endings except ``right``
 
 
-_TRAIN = "train Gaussians on it, or make Gaussians from the photos with a model"
-_WRITE = "write its Gaussians as .ply, with ns-export gaussian-splat (nerfstudio) or the option save_ply (gsplat)"
+_TRAIN_OR_MAKE = "train Gaussians on it, or make Gaussians from the photos with a model"
+_WRITE_GAUSSIANS = (
+    "write its Gaussians as .ply, with ns-export gaussian-splat (nerfstudio) or the option save_ply (gsplat)"
+)
 _EXPORT = "export the scene from that program as .ply"
 FILM = "a film"
 # A program that reads other formats; remedies may have the path of the file
@@ -48,10 +50,10 @@ _FILM = FILM, "save its frames as photos, and make a scene from them with a mode
 # Other files that are often beside scenes, by ending: their content, and the remedy
 FOREIGN: dict[str, tuple[str, str]] = {
     **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"), _FILM),
-    **dict.fromkeys((".pt", ".pth", ".ckpt", ".pkl"), ("a checkpoint", _WRITE)),
+    **dict.fromkeys((".pt", ".pth", ".ckpt", ".pkl"), ("a checkpoint", _WRITE_GAUSSIANS)),
     **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), _PACKED_BY_OTHERS),
-    **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".ptx"), ("a cloud of points", _TRAIN)),
-    **dict.fromkeys((".obj", ".fbx", ".stl", ".dae", ".off", ".blend", ".abc"), ("a mesh", _TRAIN)),
+    **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".ptx"), ("a cloud of points", _TRAIN_OR_MAKE)),
+    **dict.fromkeys((".obj", ".fbx", ".stl", ".dae", ".off", ".blend", ".abc"), ("a mesh", _TRAIN_OR_MAKE)),
     ".ssproj": ("a project of SuperSplat", _EXPORT),
     ".psht": ("a project of Postshot", _EXPORT),
     ".rad": ("levels of Spark", "name the .ply or .spz that they were made from"),
@@ -135,7 +137,7 @@ def check_first_bytes(path: Path, size: int) -> None:
     """
     ending = path.suffix.lower()
     if size == 0 and ending in NO_TEXT:
-        raise SceneError(path, "expected content, found an empty file", _AGAIN)
+        raise SceneError(path, "expected content, found an empty file", _COPY_AGAIN)
     if ending in FOREIGN:
         content, remedy = FOREIGN[ending]
         raise SceneError(path, f"expected a scene, found {content}", remedy.format(path=shlex.quote(str(path))))

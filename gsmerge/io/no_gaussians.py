@@ -30,7 +30,7 @@ class PointsOnly:
     remedy: str
 
 
-_TRAIN = "train Gaussians on it, or name the .ply of a model, and this file with --cameras"
+_TRAIN_OR_NAME = "train Gaussians on it, or name the .ply of a model, and this file with --cameras"
 _PHOTOS = "photos", "make Gaussians from the photos first, with a model such as Depth Anything 3 or AnySplat"
 # They are tried in this order
 POINTS_ONLY = (
@@ -41,19 +41,19 @@ POINTS_ONLY = (
     ),
     PointsOnly("gsplat's trainer", ("ckpts/ckpt_*.pt",), "run it with its option save_ply"),
     PointsOnly("nerfstudio", ("nerfstudio_models/*.ckpt",), "write Gaussians with ns-export gaussian-splat"),
-    PointsOnly("DA3-Streaming or VGGT-Long", ("camera_poses.txt",), _TRAIN),
-    PointsOnly("FLARE", ("pred.npz",), f"FLARE writes no Gaussians; {_TRAIN}"),
+    PointsOnly("DA3-Streaming or VGGT-Long", ("camera_poses.txt",), _TRAIN_OR_NAME),
+    PointsOnly("FLARE", ("pred.npz",), f"FLARE writes no Gaussians; {_TRAIN_OR_NAME}"),
     PointsOnly(
         "VGGT or MapAnything",
         ("sparse/points.ply", "dense_mesh.glb", "glbscene_*.glb", "predictions.npz", "points.ply"),
-        _TRAIN,
+        _TRAIN_OR_NAME,
     ),
     PointsOnly(
         "COLMAP",
         tuple(f"{folder}cameras.{kind}" for folder in ("sparse/0/", "sparse/", "0/", "") for kind in ("bin", "txt")),
-        _TRAIN,
+        _TRAIN_OR_NAME,
     ),
-    PointsOnly("a model of points", ("*.glb", "*.npz"), _TRAIN),
+    PointsOnly("a model of points", ("*.glb", "*.npz"), _TRAIN_OR_NAME),
 )
 
 

@@ -33,7 +33,7 @@ _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
 ASPECT_TOLERANCE = 0.02
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of a scan; a progressive JPEG has any number of scans
-_MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
+_PHOTO_MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
 _COPIES = 2, 3  # of all pixels in memory: with OpenCV, and at most with Pillow and the conversion of its image
 _PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # of a pixel by mode; 4 in all other modes
 _COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10  # of a pixel, while decoding
@@ -276,7 +276,7 @@ def decode_alpha(path: Path) -> np.ndarray | None:
 
 def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
     """Return the budget of a photo or mask that is decoded alone; the bytes of files ``beside`` it count as well."""
-    return ReadBudget(path, sum(map(check_file, (path, *beside))), _MEMORY_PER_BYTE, _SMALLER)
+    return ReadBudget(path, sum(map(check_file, (path, *beside))), _PHOTO_MEMORY_PER_BYTE, _SMALLER)
 
 
 def _check_channels(budget: ReadBudget, image: Image.Image) -> None:

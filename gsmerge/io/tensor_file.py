@@ -10,7 +10,7 @@ from safetensors import SafetensorError, deserialize
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import parse_json, read_budget
 
-_TYPES = {
+_NUMPY_TYPES = {  # names of types in the file -> NumPy's types
     "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
     "I8": np.int8, "U64": np.uint64, "U32": np.uint32, "U16": np.uint16, "U8": np.uint8, "BOOL": np.bool_,
 }  # fmt: skip
@@ -41,10 +41,10 @@ def read_tensors(
                 raise ValueError("metadata that is not text")
             del header
             tensors = {
-                name: np.frombuffer(tensor["data"], _TYPES[tensor["dtype"]]).reshape(tensor["shape"])
+                name: np.frombuffer(tensor["data"], _NUMPY_TYPES[tensor["dtype"]]).reshape(tensor["shape"])
                 for name, tensor in (deserialize(length_bytes + header_bytes + file.read()) if arrays else ())
             }
-    except (SafetensorError, OSError, ValueError, KeyError, MemoryError) as error:  # KeyError: of a type not in _TYPES
+    except (SafetensorError, OSError, ValueError, KeyError, MemoryError) as error:  # KeyError: an unknown type
         reason = f"numbers of type {error.args[0]}" if isinstance(error, KeyError) else str(error)
         reason = next(iter(reason.splitlines()), "out of memory")
         raise SceneError(path, f"expected {what}, found a file that cannot be read ({reason})", remedy) from error

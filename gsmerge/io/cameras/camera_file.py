@@ -27,12 +27,12 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) 
 # A principal point is in the middle if twice it differs by at most these pixels from the image's size
 CENTRED_PX = 1e-3
 PATCH_SIDE = 14  # sides of vision transformers' inputs are multiples of it
-_WHOLE = 1e-3  # pixels; tolerance of a side that is a whole number
+_WHOLE_PX = 1e-3  # a side counts as whole if it differs from a whole number by less than these pixels
 MAX_NORMALISED_FOCAL = 10.0  # a longer focal length is in pixels, and no image is that small
 
 # Orders of the Gaussians' rows that a camera file may name
 ORDERS: tuple[str, ...] = get_args(Order)
-# How a format stores poses: direction of the matrix, and axes of the camera
+# How a format stores poses: the direction of the matrix, and the axes of the camera
 Convention = tuple[str, str]
 W2C_OPENCV: Convention = ("world-to-camera", "OpenCV")
 C2W_OPENCV: Convention = ("camera-to-world", "OpenCV")
@@ -40,13 +40,13 @@ W2C_OPENGL: Convention = ("world-to-camera", "OpenGL")
 C2W_OPENGL: Convention = ("camera-to-world", "OpenGL")
 CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
-COEFFICIENTS = {  # names of a lens's coefficients, in order
+COEFFICIENTS = {  # names of the coefficients of each model of lens, in order
     "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 # Smallest share of an undistorted photo's pixels that lie within the photo. A lens with k1 = 1 / r^2, where r is half
-# of the image's diagonal, is stronger than any real lens and still has a third
-_MIN_SHARE = 0.25
+# of the image's diagonal, is stronger than any real lens, and a third of its undistorted photo still lies within
+_MIN_INSIDE = 0.25
 
 
 @dataclass(frozen=True)
@@ -316,7 +316,7 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     has_photo_shape = float(ratios.max()) < (1 + min_difference) * float(ratios.min())
     if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > min_difference).all():
         return camera_file
-    step = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH_SIDE
+    step = 1 if (np.abs(sides - sides.round()) < _WHOLE_PX).all() else PATCH_SIDE
     widths, heights = (np.full(len(camera_file), step * round(side / step)) for side in sides.tolist())
     return replace(camera_file, widths=widths, heights=heights)
 
@@ -377,7 +377,7 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
     Ks = to_cameras(pinholes, size).Ks
     for view, K, lens in zip(camera_file.names, Ks, camera_file.lenses, strict=True):
         share = 1.0 if lens is None else _share_inside(K, lens, size)
-        if lens is not None and share < _MIN_SHARE:
+        if lens is not None and share < _MIN_INSIDE:
             coefficients = zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False)
             nonzero = ", ".join(f"{key} = {coefficient:g}" for key, coefficient in coefficients if coefficient)
             problem = f"view {view}: expected {lens.name} coefficients of a lens, found {nonzero}, with which"

@@ -24,16 +24,16 @@ _NUM_PARAMS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
 }  # fmt: skip
-_NAMES = dict(enumerate(_NUM_PARAMS))
+_MODEL_NAMES = dict(enumerate(_NUM_PARAMS))  # id -> name
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
-_FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
-_PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
+_FISHEYE_MODELS = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_PERSPECTIVE_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 
 MAX_NAME = 1 << 16  # bytes of an image's name
 
-_MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # in a camera's line
-_MAX_DIGITS = 18  # in a whole number
-_WHOLE = re.compile(rf"[+-]?[0-9]{{1,{_MAX_DIGITS}}}([.]0*)?")
+_MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # words in the line of a camera
+_MAX_DIGITS = 18  # digits of a whole number that are read
+_WHOLE_NUMBER = re.compile(rf"[+-]?[0-9]{{1,{_MAX_DIGITS}}}([.]0*)?")
 
 _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
@@ -103,13 +103,13 @@ def _pose(numbers: list[float]) -> np.ndarray:
 
 
 def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> StoredView:
-    if model not in _PERSPECTIVE | _FISHEYE:
+    if model not in _PERSPECTIVE_MODELS | _FISHEYE_MODELS:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
         raise SceneError(path, problem, "undistort the images first")
     one_focal = model in _ONE_FOCAL
     K = make_pinhole(params[0], *params[:3]) if one_focal else make_pinhole(*params[:4])
     distortion = params[3 if one_focal else 4 : _NUM_PARAMS[model]]
-    lens = make_lens(model, "fisheye" if model in _FISHEYE else "perspective", distortion)
+    lens = make_lens(model, "fisheye" if model in _FISHEYE_MODELS else "perspective", distortion)
     return StoredView("", np.eye(4), K, size if lens else _size_of(K, size), lens)
 
 
@@ -134,7 +134,7 @@ def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
     cameras = {}
     for _ in range(count):
         camera_id, model_id, width, height = _numbers(file, "<iiQQ")
-        model = _NAMES.get(model_id, f"model {model_id}")
+        model = _MODEL_NAMES.get(model_id, f"model {model_id}")
         params = list(_numbers(file, f"<{_NUM_PARAMS.get(model, 0)}d"))
         cameras[camera_id] = _camera(path, camera_id, model, (width, height), params)
     return cameras
@@ -194,9 +194,9 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredV
 def _lists_points(line: str, cameras: Mapping[int, StoredView]) -> bool:
     """Return whether the line after an image lists its points, x y id each, and is not another image."""
     start = line.split(maxsplit=9)
-    if len(start) < 3 or not all(_WHOLE.fullmatch(number) for number in start[2:9:3]):
+    if len(start) < 3 or not all(_WHOLE_NUMBER.fullmatch(number) for number in start[2:9:3]):
         return False
-    if len(start) < 10 or not _WHOLE.fullmatch(start[0]) or int(float(start[8])) not in cameras:
+    if len(start) < 10 or not _WHOLE_NUMBER.fullmatch(start[0]) or int(float(start[8])) not in cameras:
         return True
     quat = np.array(start[1:5], np.float64)
     not_unit = 0.05  # four numbers are no quaternion if their length differs from 1 by more than this

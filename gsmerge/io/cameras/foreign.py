@@ -24,8 +24,10 @@ class Foreign(NamedTuple):
 
 INTRINSICS = "intrinsic.txt"  # of DA3-Streaming, beside its poses
 _DEPTH, _MAX_PATHS = 3, 10_000  # limits of the search for files of PROGRAMS: levels of folders, and paths
-_WRITE = "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
-_MODEL = f"name the COLMAP model that it was made from, or {_WRITE}"
+_WRITE_POSES = (
+    "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
+)
+_MODEL = f"name the COLMAP model that it was made from, or {_WRITE_POSES}"
 _NUMBER = r"[-+.\deE]+"
 _NERFSTUDIO = "`ns-process-data {}` of nerfstudio makes a transforms.json of it"
 _KAPTURE = "kapture_import_{}.py and kapture_export_colmap.py of kapture make a COLMAP model of it"
@@ -63,25 +65,25 @@ PROGRAMS = (
     Foreign("cameras*.npz", "IDR, NeuS or DTU", _MODEL, "(world|scale|camera)_mat"),
     Foreign("metadata.json *.r3d", "Record3D", _NERFSTUDIO.format("record3d"), '^PK|"(poses|perFrameIntrinsicCoeffs)"'),
     Foreign("*.vrs *_loop_trajectory.csv", "Project Aria", _NERFSTUDIO.format("aria")),
-    Foreign("*.sens", "ScanNet", _WRITE),
-    Foreign("pose/*.txt poses/*.txt", "ScanNet, NSVF or SRN", _WRITE, rf"\A({_NUMBER}\s+){{3,15}}{_NUMBER}\s*$"),
+    Foreign("*.sens", "ScanNet", _WRITE_POSES),
+    Foreign("pose/*.txt poses/*.txt", "ScanNet, NSVF or SRN", _WRITE_POSES, rf"\A({_NUMBER}\s+){{3,15}}{_NUMBER}\s*$"),
     Foreign("*.txt", "TUM, ORB-SLAM or MonST3R", "its timestamps may be those of no photo: keep the pose nearest in"
             " time to each photo, with associate.py of TUM, and turn these with `evo_traj tum` of evo and its option"
             " save_as_kitti into lines of 12 numbers, which are read with one photo for each",
             rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
-    Foreign("*.txt", "RealEstate10K", _WRITE, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
+    Foreign("*.txt", "RealEstate10K", _WRITE_POSES, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
     Foreign("*.torch", "a chunk of RealEstate10K", "write the cameras and photos of its scene into views.npz"
             " (docs/reference/formats.md)"),
-    Foreign("*.log", "Open3D or Tanks and Temples", _WRITE, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),
-    Foreign("*.traj", "ARKitScenes", _WRITE), Foreign("*.jgz", "CO3D", _WRITE),
-    Foreign("*.json", "Open3D", _WRITE, '"PinholeCamera'),
-    Foreign("*.json", "3D Scanner App", _WRITE, '"cameraPoseARFrame"'),
-    Foreign("camera/*.json", "Nerfies", _WRITE, '"(orientation|principal_point)"'),
-    Foreign("*_par.txt *.conf", "Middlebury or Matterport", _WRITE, r"^\s*\d+\s|^dataset"),
-    Foreign("*.out *.mve/meta.ini", "MVE", _WRITE, "drews|MVE view"),
-    Foreign("*.csv", "EuRoC's body", _WRITE, "#(timestamp|time)"),
-    Foreign("camera/*.npz poses.npz", "CUT3R or Spann3R", _WRITE, "pose"),
-    Foreign("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _WRITE),
+    Foreign("*.log", "Open3D or Tanks and Temples", _WRITE_POSES, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),
+    Foreign("*.traj", "ARKitScenes", _WRITE_POSES), Foreign("*.jgz", "CO3D", _WRITE_POSES),
+    Foreign("*.json", "Open3D", _WRITE_POSES, '"PinholeCamera'),
+    Foreign("*.json", "3D Scanner App", _WRITE_POSES, '"cameraPoseARFrame"'),
+    Foreign("camera/*.json", "Nerfies", _WRITE_POSES, '"(orientation|principal_point)"'),
+    Foreign("*_par.txt *.conf", "Middlebury or Matterport", _WRITE_POSES, r"^\s*\d+\s|^dataset"),
+    Foreign("*.out *.mve/meta.ini", "MVE", _WRITE_POSES, "drews|MVE view"),
+    Foreign("*.csv", "EuRoC's body", _WRITE_POSES, "#(timestamp|time)"),
+    Foreign("camera/*.npz poses.npz", "CUT3R or Spann3R", _WRITE_POSES, "pose"),
+    Foreign("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _WRITE_POSES),
     Foreign("*.json", "a path of nerfstudio's viewer, or ns-export", "name the transforms.json of the capture",
            r'"camera_path"\s*:|^\[\s*\{[^{}]*"transform"\s*:'),
     Foreign("*.psht", "Postshot", "name the cameras that were loaded into it"),

@@ -27,7 +27,7 @@ from gsmerge.kernels.elementary import cos, sin
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's "distortion_params"
 _COEFFICIENTS = (*_DISTORTION, "k5", "k6")
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
-_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
+_PINHOLE_OR_OPENCV = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
 _FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length follows
 
 
@@ -193,7 +193,7 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
         return make_lens("OPENCV_FISHEYE", "fisheye", [params[key] for key in ("k1", "k2", "k3", "k4")])
     ambiguous = next((key for key in ("k4", "k5", "k6") if params[key]), None)
-    if model not in _PERSPECTIVE or ambiguous is not None:
+    if model not in _PINHOLE_OR_OPENCV or ambiguous is not None:
         reason = f"lens distortion {ambiguous}, which formats understand differently"
         found = f"camera model {model}" if ambiguous is None else reason
         problem = f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {found}"

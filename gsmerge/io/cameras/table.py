@@ -72,7 +72,7 @@ _READ_COLMAP, _READ_DA3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3
 _LISTS_POSES = _lazy("pose_lines.lists_poses")
 _READ_STATE = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 
-_TRANSFORMS = ViewLayout(
+_TRANSFORMS_JSON = ViewLayout(
     views="frames",
     name=("file_path", "image_path", "name"),
     pose=Matrix("transform_matrix"),  # applied_transform is not applied: poses are in the Gaussians' world
@@ -154,9 +154,9 @@ CAMERA_FORMATS = (
                  lambda file: _LISTS_POSES(file.path)),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", _LONG_LRM, W2C_OPENCV, "pixels", is_long_lrm),
     CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
-                 ".json", _TRANSFORMS, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
+                 ".json", _TRANSFORMS_JSON, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
                  lambda file: "frames" in file.object),
-    CameraFormat("frame list", "list of frames with `transform_matrix`", ".json", replace(_TRANSFORMS, views=""),
+    CameraFormat("frame list", "list of frames with `transform_matrix`", ".json", replace(_TRANSFORMS_JSON, views=""),
                  C2W_OPENCV, "pixels or field of view; may be missing; lenses",
                  lambda file: "transform_matrix" in file.first),
     CameraFormat("INRIA cameras.json", "`cameras.json` of INRIA; InstantSplat's `pose/ours_N/pose_optimized.npy`",

@@ -45,6 +45,7 @@ REQUIRED_COLUMNS = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
 SHARE_ROUNDING = 0.01  # by which shares that were rounded to half floats may exceed [0, 1]
 MAX_STRAY = 0.01  # share of a column's values that may contradict the rest, because of roundings and damage
 _EXACT = 1e-5  # largest rounding error of a whole number in a matrix that rotates harmonics
+EXPORT_AGAIN = "copy or export it again"  # remedy for a damaged file
 GAUSSIAN_BYTES = 4 * len(REQUIRED_COLUMNS) + 1  # in memory, without higher harmonics, with its flag of validity
 
 

@@ -10,7 +10,7 @@ from gsmerge.io.formats import arrays
 from gsmerge.io.formats.scale_units import MIN_JUDGED
 
 RGB_NOTE = "f_dc_0 to f_dc_2 are read as {}, since {}; if they are harmonics, use --hint colors=sh"
-_ROUNDING = 1.5 / 255  # difference of two columns of one colour, of which one is a byte
+_SAME_COLOR = 1.5 / 255  # largest difference of a float and a byte of the same colour, in shares of white
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUni
     min_spread = 0.5
     for units in _UNITS if len(stored) >= MIN_JUDGED else ():
         rgb = units.rgb(stored)
-        if plain is not None and (np.abs(rgb - plain / np.float32(255)) <= _ROUNDING).mean() > 1 - arrays.MAX_STRAY:
+        if plain is not None and (np.abs(rgb - plain / np.float32(255)) <= _SAME_COLOR).mean() > 1 - arrays.MAX_STRAY:
             return units, "the columns red, green and blue are the same"
         if arrays.are_shares(rgb) and np.ptp(np.quantile(rgb, (arrays.MAX_STRAY, 1 - arrays.MAX_STRAY))) > min_spread:
             return units, f"all lie in [{units.black:g}, {units.white:g}]"

@@ -48,15 +48,18 @@ _OPACITY = f"{NAME}:OPACITY"
 COMPRESSED = f"{NAME}_compression_spz_2"  # of which Cesium's tiles consist
 COLOR_SPACE = "srgb_rec709_display"
 READ_EXTENSIONS = {NAME, COMPRESSED, "KHR_mesh_quantization", "KHR_materials_unlit"}
-_FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # constants of glTF
-_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_WIDTHS = {name: width for width, name in _TYPES.items()}
+# Constants of glTF: float32, uint8, a buffer of vertices, and a mesh of points
+_FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
+_TYPE_NAMES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # width of a value -> its type in glTF
+_WIDTHS = {name: width for width, name in _TYPE_NAMES.items()}
+# NumPy's types -> the numbers of glTF's types of components, and back
 _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
-HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # between the axes of a ``.ply`` and of glTF
+# The file: mark, version and length. A chunk: length and kind
+_FILE_HEADER, _CHUNK_HEADER = struct.Struct("<4sII"), struct.Struct("<I4s")
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # turns the axes of a ``.ply`` to those of glTF, and back
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
-_TRANSFORMS = {"matrix", "rotation", "scale", "translation"}  # keys of a node with a transform of its own
+_TRANSFORM_KEYS = {"matrix", "rotation", "scale", "translation"}  # keys of a node that moves its mesh and its children
 
 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
@@ -121,7 +124,7 @@ def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
     }
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
-    return _HEADER.pack(b"glTF", 2, _HEADER.size + len(chunks)) + chunks
+    return _FILE_HEADER.pack(b"glTF", 2, _FILE_HEADER.size + len(chunks)) + chunks
 
 
 def _join(blocks: Sequence[np.ndarray]) -> np.ndarray:
@@ -139,7 +142,7 @@ def _describe_arrays(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]]
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, **stride, "target": _VERTICES})
         number: dict[str, Any] = {"componentType": _COMPONENTS[array.dtype.str]}
         number |= {} if array.dtype.kind == "f" else {"normalized": True}
-        accessors.append({"bufferView": view_id, **number, "count": len(array), "type": _TYPES[width]})
+        accessors.append({"bufferView": view_id, **number, "count": len(array), "type": _TYPE_NAMES[width]})
         offset += size
     return views, accessors
 
@@ -164,7 +167,7 @@ def _attributes(columns: Columns) -> dict[str, np.ndarray]:
 
 def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:
     content += padding * (-len(content) % 4)
-    return _CHUNK.pack(len(content), kind) + content
+    return _CHUNK_HEADER.pack(len(content), kind) + content
 
 
 def holds_gaussians(path: Path) -> bool:
@@ -194,7 +197,7 @@ def read_rows(path: Path) -> StoredRows:
     return replace(
         to_stored(parts, ".glb", sizes),
         format="binary little-endian",
-        notes=note_surplus(budget.file_bytes - total, _HEADER.size),
+        notes=note_surplus(budget.file_bytes - total, _FILE_HEADER.size),
     )
 
 
@@ -274,10 +277,13 @@ class _Content:
 def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any], int]:
     """Read the JSON of a ``.glb`` and the length that its header states, and move to the start of its binary chunk."""
     size = budget.file_bytes
-    start = file.read(_HEADER.size + _CHUNK.size)
-    if len(start) < _HEADER.size + _CHUNK.size:
+    start = file.read(_FILE_HEADER.size + _CHUNK_HEADER.size)
+    if len(start) < _FILE_HEADER.size + _CHUNK_HEADER.size:
         raise _ForeignError("an early end of file")
-    (magic, version, total), (length, kind) = _HEADER.unpack_from(start), _CHUNK.unpack_from(start, _HEADER.size)
+    (magic, version, total), (length, kind) = (
+        _FILE_HEADER.unpack_from(start),
+        _CHUNK_HEADER.unpack_from(start, _FILE_HEADER.size),
+    )
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
         raise _ForeignError("a file that is no binary glTF 2.0")
     if total > size or length > total - len(start):
@@ -288,7 +294,7 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any],
     missing = set(document.get("extensionsRequired", ())) - READ_EXTENSIONS
     if missing and NAME in str(document.get("extensionsUsed")):
         raise _ForeignError(f"one that requires {', '.join(sorted(map(str, missing)))}, which is not supported")
-    file.read(_CHUNK.size)
+    file.read(_CHUNK_HEADER.size)
     return document, total
 
 
@@ -303,7 +309,9 @@ def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple
             raise _ForeignError(f"one with two parents of node {node_id}")
         visited.add(node_id)
         node = nodes[node_id]
-        transform = parent_transform if _TRANSFORMS.isdisjoint(node) else matmul(parent_transform, _node_matrix(node))
+        transform = (
+            parent_transform if _TRANSFORM_KEYS.isdisjoint(node) else matmul(parent_transform, _node_matrix(node))
+        )
         primitives = document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []
         yield from ((primitive, transform) for primitive in primitives if NAME in primitive.get("extensions", {}))
         stack += [(child, transform) for child in reversed(node.get("children", []))]

@@ -40,10 +40,9 @@ MAX_LOGIT = 16.0  # from 16.6 on, the sigmoid rounds to 1 in float32, whose logi
 BLOCK_BYTES = 1 << 19  # rows converted at a time; they stay in the processor's cache for all columns
 
 _PREFIXED = "the prefix {!r} of the columns' names, as CloudCompare writes it, is ignored"
-_AGAIN = "copy or export it again"
 MAX_HEADER_BYTES = 1 << 20
 MAX_LINE = 1 << 20  # characters of a row of text; its words take many times as much memory
-_TYPES = {  # PLY's names of types by NumPy's
+_PLY_TYPES = {  # PLY's names of types by NumPy's
     "i1": "char", "i2": "short", "i4": "int", "f4": "float", "u1": "uchar", "u2": "ushort", "u4": "uint", "f8": "double"
 }  # fmt: skip
 _SIZES = {
@@ -261,7 +260,7 @@ def open_ply(path: Path) -> tuple[PlyData, int]:
         raise _truncated(path, expected, row or 0, error.message) from error
     except (PlyParseError, ValueError, ArithmeticError) as error:
         problem = f"expected a readable PLY file, found a damaged one ({error})"
-        raise SceneError(path, problem, _AGAIN) from error
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN) from error
 
 
 def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
@@ -382,7 +381,7 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     end = start.find(last_line)
     if end < 0:
         found = f"no 'end_header' within {MAX_HEADER_BYTES >> 20} MiB" if size > len(start) else "an early end of file"
-        raise SceneError(path, f"expected a PLY header, found {found}", _AGAIN)
+        raise SceneError(path, f"expected a PLY header, found {found}", arrays.EXPORT_AGAIN)
     words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
     is_text = ["format", "ascii", "1.0"] in words
     elements = _parse_elements(words)
@@ -428,15 +427,19 @@ def _check_element(budget: ReadBudget, element: _Element) -> None:
     path, name, count, num_columns = Path(budget.path), element.name, element.count, len(element.properties)
     has_lists = any(words[0] == "list" for words in element.properties)
     if count < 0:
-        raise SceneError(path, f"expected a number of rows, found {count} rows of element '{name}'", _AGAIN)
+        raise SceneError(
+            path, f"expected a number of rows, found {count} rows of element '{name}'", arrays.EXPORT_AGAIN
+        )
     if count and not num_columns:
-        raise SceneError(path, f"expected columns, found element '{name}' of {count} rows without any", _AGAIN)
+        raise SceneError(
+            path, f"expected columns, found element '{name}' of {count} rows without any", arrays.EXPORT_AGAIN
+        )
     unknown = sorted({words[0] for words in element.properties if len(words) == 1} - _SIZES.keys())
     if unknown:
         problem = f"expected columns of float or another type of PLY, found {unknown[0]!r:.40} in element '{name}'"
         raise SceneError(path, problem, "export it again with columns of float")
     if has_lists and name == "vertex":
-        raise SceneError(path, "expected one number per column and vertex, found a list property", _AGAIN)
+        raise SceneError(path, "expected one number per column and vertex, found a list property", arrays.EXPORT_AGAIN)
     max_list_values = 1_000_000  # lists of an element; they are read one value at a time
     if has_lists and count * num_columns > max_list_values:
         problem = f"expected at most {max_list_values:,} lists, found element '{name}' with lists in {count:,} rows"
@@ -448,7 +451,9 @@ def _check_element(budget: ReadBudget, element: _Element) -> None:
 
 def _truncated(path: Path, expected: str, num_whole: int, reason: str) -> SceneError:
     """Make the SceneError for a file that ends early or is damaged after ``num_whole`` complete rows."""
-    return SceneError(path, f"truncated or damaged: expected {expected}, found {num_whole} complete ({reason})", _AGAIN)
+    return SceneError(
+        path, f"truncated or damaged: expected {expected}, found {num_whole} complete ({reason})", arrays.EXPORT_AGAIN
+    )
 
 
 def ply_blocks(
@@ -506,7 +511,7 @@ def _header(
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
     lines += [f"property float {name}" for name in names]
-    lines += [*(f"property {_TYPES[kind]} {name}" for name, kind in extra.items()), "end_header", ""]
+    lines += [*(f"property {_PLY_TYPES[kind]} {name}" for name, kind in extra.items()), "end_header", ""]
     return "\n".join(lines).encode("ascii"), len(names)
 
 

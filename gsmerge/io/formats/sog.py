@@ -157,7 +157,7 @@ def _damage(path: Path) -> Iterator[None]:
         raise SceneError(path, problem, "export it again") from error
     except zlib.error as error:
         problem = f"expected a readable .sog file, found a damaged one ({error})"
-        raise SceneError(path, problem, "copy or export it again") from error
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN) from error
 
 
 def _read_content(files: _Files, budget: ReadBudget) -> SogContent:

@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
-from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, column_blocks, to_bytes, to_stored
+from gsmerge.io.formats.arrays import EXPORT_AGAIN, Columns, Packed, StoredRows, column_blocks, to_bytes, to_stored
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 
@@ -37,7 +37,7 @@ def read_rows(path: Path) -> StoredRows:
     size = check_file(path)
     if size % ROW.itemsize:
         problem = f"expected a .splat of {ROW.itemsize} bytes per Gaussian, found {size} bytes"
-        raise SceneError(path, problem, "copy or export it again")
+        raise SceneError(path, problem, EXPORT_AGAIN)
     with read_errors(path):
         rows = np.fromfile(path, ROW)
     sizes = {"means": 12, "scales": 12, "sh0": 3, "opacities": 1, "quats": 4}

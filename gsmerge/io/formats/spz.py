@@ -56,7 +56,6 @@ _SHIFTS = (20, 10, 0)  # of the three smaller components of a rotation in its wo
 COLOR_SCALE = 0.15  # factor of sh0, so that colours slightly outside [0, 1] can be stored
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
-AGAIN = "copy or export it again"
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
     """Read the header; SceneError if it is invalid, or if the file is too small for its Gaussians."""
     path = budget.path
     if len(start) < HEADER.size:
-        raise SceneError(path, FOUND_EARLY_END, AGAIN)
+        raise SceneError(path, FOUND_EARLY_END, arrays.EXPORT_AGAIN)
     magic, *numbers = HEADER.unpack(start)
     header = Header(*numbers)
     max_read_degree = 4  # some programs write degree 4 in version 3
@@ -146,7 +145,9 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
         problem = f"expected .spz of version 1 to 4 and SH degree 0 to {max_read_degree}, found {found}"
         raise SceneError(path, problem, "export it again")
     if header.count == 0:
-        raise SceneError(path, f"expected at least one Gaussian in {len(packed)} bytes, found a count of 0", AGAIN)
+        raise SceneError(
+            path, f"expected at least one Gaussian in {len(packed)} bytes, found a count of 0", arrays.EXPORT_AGAIN
+        )
     arrays.check_gaussian_count(budget, header.count, header.num_higher, sum(header.widths))
     return header
 
@@ -161,11 +162,13 @@ def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndar
         # This also checks the checksum; at the end, what is left would count twice as unused
         extensions = stream.decompress(b"" if stream.eof else stream.unconsumed_tail, _MAX_EXTENSIONS)
     except zlib.error as error:
-        raise SceneError(path, "expected a gzip stream of .spz, found another or damaged file", AGAIN) from error
+        raise SceneError(
+            path, "expected a gzip stream of .spz, found another or damaged file", arrays.EXPORT_AGAIN
+        ) from error
     ends = np.cumsum([0, *header.widths]) * header.count
     if len(data) < ends[-1] or not stream.eof:
         problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(data)}"
-        raise SceneError(path, f"{problem}{'' if stream.eof else ' and no end of the stream'}", AGAIN)
+        raise SceneError(path, f"{problem}{'' if stream.eof else ' and no end of the stream'}", arrays.EXPORT_AGAIN)
     parts = [np.frombuffer(data, np.uint8, end - at, at).reshape(header.count, -1) for at, end in pairwise(ends)]
     return header, parts, extensions, len(stream.unused_data)
 
@@ -193,7 +196,7 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np
         raise SceneError(
             path,
             "truncated or damaged: expected whole Zstandard streams with the sizes of its table, found others",
-            AGAIN,
+            arrays.EXPORT_AGAIN,
         ) from error
     columns += [b""] * (len(header.widths) - len(columns))
     parts = [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
@@ -210,15 +213,15 @@ def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) 
         (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
         table = [TABLE_ROW.unpack_from(packed, table_start + i * TABLE_ROW.size) for i in range(header.num_streams)]
     except struct.error as error:
-        raise SceneError(path, FOUND_EARLY_END, AGAIN) from error
+        raise SceneError(path, FOUND_EARLY_END, arrays.EXPORT_AGAIN) from error
     if [unpacked_size for _, unpacked_size in table] != sizes:
         problem = f"damaged: expected columns of {sizes} bytes for {header.count} Gaussians, found others"
-        raise SceneError(path, problem, AGAIN)
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN)
     streams_start = table_start + len(table) * TABLE_ROW.size
     ends = streams_start + np.cumsum([0, *(packed_size for packed_size, _ in table)], dtype=object)
     if ends[-1] > len(packed):
         problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(packed)}"
-        raise SceneError(path, problem, AGAIN)
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN)
     return table_start, ends
 
 

@@ -65,8 +65,9 @@ class Format:
     # Encodes one file by the views and options of the content; None: ``encode`` does without them
     encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
     first_view: bool = False  # Viewers look from its first camera, so one is placed if there is none
-    beside: str = ""  # name of a file that is written beside it; "": none
-    settings: str = ""  # name of a file beside it that tells viewers where to look first; "": none
+    beside: str = ""  # name of a file that is written beside an output; "": none
+    # Name of a file beside an output that tells viewers where to look first, with the output's {stem}; "": none
+    settings: str = ""
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
     finish: Callable[[Path], object] = lambda _: None  # called with the path after all files were renamed
@@ -93,6 +94,11 @@ class Format:
         name = Path(path).name
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
+    def settings_path(self, output: Path) -> Path | None:
+        """Return the path of the settings for viewers beside an output; None if the format has none."""
+        stem = output.name.removesuffix(self.ending)
+        return output.with_name(self.settings.format(stem=stem)) if self.settings else None
+
 
 _page = lazy_functions("gsmerge.pages")
 # Bytes of a Gaussian, for harmonics of degree 0 to 3
@@ -113,7 +119,7 @@ LEVELS = Format(
 TILESET = Format(
     "tileset.json", "3D Tiles for Cesium: a .spz in a .glb beside it", _lazy("tileset.read_rows"), None, 3,
     holds=Path.is_file, write=_lazy("tileset.write_output"), levels="",
-    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), most=10_000_000, beside="{stem}.glb",
+    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), most=10_000_000, beside="tileset.glb",
     each=_SPZ, rest=_lazy("tileset.least_bytes"), measure=_lazy("tileset.measure"),
 )  # fmt: skip
 HTML = Format(

@@ -22,7 +22,7 @@ from gsmerge.io.formats import glb
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.glb import COLOR_SPACE, COMPRESSED, HALF_TURN, HARMONICS, NAME, pack_glb
 from gsmerge.io.formats.spz import MAX_DEGREE, encode_contents
-from gsmerge.io.formats.table import Contents
+from gsmerge.io.formats.table import TILESET, Contents
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.settings.files import parse_place
@@ -34,8 +34,8 @@ _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  #
 
 
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write the files of a tileset, as :data:`gsmerge.io.formats.table.WriteOutput`; the ``.glb`` has its stem."""
-    tile = path.with_suffix(".glb")
+    """Write the files of a tileset, as :data:`gsmerge.io.formats.table.WriteOutput`."""
+    tile = path.with_name(TILESET.beside)
     # Percentiles of the means that the bounds include; a few far Gaussians would make a scene small
     percentiles = 1, 99
     file, low, high = add(tile), *np.percentile(contents.levels[0].means.astype(np.float64), percentiles, axis=0)
