@@ -19,20 +19,21 @@ _NUMPY_TYPES = {  # names of types in the file -> NumPy's types
 def read_tensors(
     path: Path, what: str, remedy: str, *, arrays: bool = True
 ) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """Read the metadata of a safetensors file, and its arrays by name; ``arrays=False``: read only the metadata.
+    """Read the metadata of a safetensors file, and its arrays by name; no arrays with ``arrays=False``.
 
-    SceneError, with ``what`` as the expected file and the ``remedy``, if it is another file or becomes shorter.
+    SceneError if it is another file, or becomes shorter while it is read. The error names ``what`` as the expected
+    file, and has the ``remedy``.
     """
     budget = read_budget(path)
     try:
         with path.open("rb") as file:
-            header_size = 8  # bytes of the number at the start, which is the length of the header
+            header_size = 8  # bytes of the first number, which is the length of the header
             length_bytes = file.read(header_size)
             length = int.from_bytes(length_bytes, "little")
             if not 0 < length <= budget.file_bytes:
                 raise ValueError("no header of a safetensors file")
             header_bytes = file.read(length)
-            # Bytes of memory for each array's description, and copies of the file, while read
+            # Bytes of memory for the description of each array, and copies of the file in memory while it is read
             array_memory, copies = 1800, 3
             budget.check_memory(array_memory * header_bytes.count(b"{") + copies * budget.file_bytes, "arrays")
             header = parse_json(header_bytes.decode("utf-8"), budget)

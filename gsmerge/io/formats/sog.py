@@ -112,7 +112,7 @@ class SogContent:
 def read_rows(path: Path) -> arrays.StoredRows:
     """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or damaged."""
     budget = read_budget(path)
-    with _damage(path), open_archive(path) as archive:
+    with _damage_errors(path), open_archive(path) as archive:
         content = _read_content(_Bundle(archive, budget.file_bytes), budget)
     return arrays.to_stored([content.packed], f".sog version {VERSION}", content.sizes, content.mode)
 
@@ -120,7 +120,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
 def read_unbundled(path: Path) -> SogContent:
     """Read the Gaussians of a ``meta.json`` and the textures beside it; SceneError as in :func:`read_rows`."""
     names = read_text(path)
-    with _damage(path):
+    with _damage_errors(path):
         entries = (entry for entry in os.scandir(path.parent) if f'"{entry.name}"' in names or entry.name == path.name)
         size = sum(entry.stat().st_size for entry in entries)
         return _read_content(_Folder(path.parent, size), ReadBudget(path, size))
@@ -143,7 +143,7 @@ def is_folder(path: Path) -> bool:
 
 
 @contextmanager
-def _damage(path: Path) -> Iterator[None]:
+def _damage_errors(path: Path) -> Iterator[None]:
     """Convert all errors that damaged files cause in a reader to a SceneError."""
     try:
         with read_errors(path):

@@ -104,7 +104,7 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
     axes = _stored_axes(path, extensions) if header.flags & extensions_flag else PLY_AXES
     # from these axes to those of a .ply; it mirrors if the handedness differs
     rotation = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
-    rotate = arrays.turner(rotation * (1, -1, -1) if axes in _REVERSED else rotation, header.num_higher)
+    rotate = arrays.rotator(rotation * (1, -1, -1) if axes in _REVERSED else rotation, header.num_higher)
     rows = arrays.Packed(
         header.count, header.num_higher, lambda block: rotate(_unpack([part[block] for part in parts], header))
     )

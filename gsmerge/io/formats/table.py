@@ -188,7 +188,7 @@ def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
     formats by their size in bytes, whatever they state; zeros for files that cannot be read.
     """
     counts = [
-        ply.header_counts(path, held=True) if find_format(path).read is ply.read_rows else _by_bytes(path)
+        ply.header_counts(path, check_size=True) if find_format(path).read is ply.read_rows else _by_bytes(path)
         for path in paths
     ]
     return sum(count for count, _ in counts), max((rest for _, rest in counts), default=0)
