@@ -87,7 +87,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
 
 
 def _find_white(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[float, list[str]]:
-    """Find the number by which plain colours store a full channel, 1 or 255; also return notes."""
+    """Find the number that stands for a full channel of plain colours as floats, 1 or 255; also return notes."""
     colors = arrays.color_columns(rows.dtype.names)
     float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
     if float_colors and np.nanmedian(read_columns(path, rows, colors[:1])[colors[0]]) > 1:
@@ -108,9 +108,9 @@ def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequen
 
 
 def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
-    """Return a block of rows with three log scales, and with plain colours in [0, 1].
+    """Return a block of rows with three log scales, and with plain colours divided by ``white``.
 
-    2D Gaussians get a thin third scale. ``white``: the number by which plain colours store a full channel.
+    2D Gaussians get a thin third scale.
     """
     columns = {name: rows[name] for name in rows.dtype.names or ()}
     if white != 1:
@@ -159,10 +159,10 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
 
 
 def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return rows without the prefix that all names of columns have, and this prefix; "" if there is none.
+    """Return rows without a prefix in the names of columns, and this prefix; "" if there is none.
 
-    Columns ``rotation_0`` to ``rotation_3`` get their usual names. CloudCompare writes "scalar_" before names that are not
-    its own, and "scalar_scal_" if it writes the file again.
+    Columns ``rotation_0`` to ``rotation_3`` get their usual names. CloudCompare writes "scalar_" before names that are
+    not its own, and "scalar_scal_" if it writes the file again.
     """
     names, known_name = tuple(rows.dtype.names or ()), arrays.QUATS[0]
     prefix = next((name.removesuffix(known_name) for name in names if name.endswith(known_name)), "")

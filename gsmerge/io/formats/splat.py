@@ -1,6 +1,7 @@
-"""Read and write ``.splat``, the format of antimatter15/splat that most viewers read: 32 bytes per Gaussian, no header.
+"""Read and write ``.splat``, the format of antimatter15/splat, which most viewers read.
 
-Quaternions wxyz are bytes 128 + 128 q. Harmonics above degree 0 cannot be stored.
+It has 32 bytes per Gaussian and no header. Quaternions wxyz are bytes 128 + 128 q. Harmonics above degree 0 cannot be
+stored.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from gsmerge.io.formats.arrays import EXPORT_AGAIN, Columns, Packed, StoredRows,
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 
-MAX_DEGREE = 0  # of harmonics; the format has colours alone
+MAX_DEGREE = 0  # of harmonics, since the format has only colours
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 
@@ -46,6 +47,7 @@ def read_rows(path: Path) -> StoredRows:
 
 
 def _unpack(rows: np.ndarray) -> Columns:
+    """Convert stored rows to Gaussians."""
     colors = rows["colors"] / 255
     return Columns(
         means=rows["means"],

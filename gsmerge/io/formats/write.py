@@ -1,4 +1,4 @@
-"""Write Gaussians in the format that the name of a file chooses."""
+"""Write Gaussians in the format that the ending of a file's name chooses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsmerge.values.arguments import check_arguments
 
 
 def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
-    """Note which harmonics a format leaves out, and more Gaussians than readers take; UsageError for its ending."""
+    """Note harmonics that a path's format leaves out, and too many Gaussians for readers; UsageError if it has none."""
     format_, notes = output_format(path, levels=True, cameras=True), list[str]()
     if sh_degree > format_.max_degree:
         notes.append(format_.lost.format(ending=format_.ending, degree=format_.max_degree))
@@ -27,7 +27,7 @@ def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
 
 
 def level_output(output: Path, level: int) -> Path:
-    """Return the path of a coarser level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
+    """Return the path of a coarser level of detail, which count from 1: ``out.ply`` -> ``out.level1.ply``."""
     stem_length = len(output.name) - len(output_format(output).ending)
     return output.with_name(f"{output.name[:stem_length]}.level{level}{output.name[stem_length:]}")
 
@@ -144,7 +144,7 @@ def _write_ply(
     normals: bool,
     extra_columns: np.ndarray | None = None,
 ) -> None:
-    """Write a ``.ply`` to a file of any name."""
+    """Write a ``.ply`` as :func:`write_ply` does, but to a file of any name, and with ``extra_columns``."""
     check_readable(gaussians, comments)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:
@@ -154,7 +154,7 @@ def _write_ply(
 
 
 def check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
-    """Raise ValueError for a file that readers would refuse: without Gaussians, or with invalid comments."""
+    """Raise ValueError for content that readers would refuse: no Gaussians, or invalid comments."""
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none")
     length = sum(len(f"comment {comment}\n") for comment in comments)
