@@ -170,9 +170,8 @@ def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
     for place in (*(folder / name for name in places), folder):
         with suppress(OSError):
             files = (path for path in place.iterdir() if path.is_file())
-            unread = _find_unread(
-                [path for path in files if path.suffix.lower() != ".gif"]
-            )  # a GIF is a clip, and no photo
+            # A GIF is a clip, and no photo
+            unread = _find_unread([path for path in files if path.suffix.lower() != ".gif"])
             if unread is not None:
                 return [f"{place} has {unread[0]}, which cannot be read; {unread[1]}"]
     return []

@@ -27,9 +27,8 @@ _SCALE_RANGES = tuple(f"{bound}_scale_{axis}" for bound in ("min", "max") for ax
 RANGE_COLUMNS = (*_POSITION_RANGES, *_SCALE_RANGES)
 COLORS = tuple(f"{bound}_{channel}" for bound in ("min", "max") for channel in "rgb")
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
-_HARMONICS = (
-    np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5
-) * SH_RANGE  # value of each stored byte
+# Value of each stored byte
+_HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE
 
 
 def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:

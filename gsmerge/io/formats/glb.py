@@ -57,10 +57,10 @@ _WIDTHS = {name: width for width, name in _TYPE_NAMES.items()}
 _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 # The file: mark, version and length. A chunk: length and kind
-_FILE_HEADER, _CHUNK_HEADER = struct.Struct("<4sII"), struct.Struct("<I4s")
+_FILE_HEAD, _CHUNK_HEAD = struct.Struct("<4sII"), struct.Struct("<I4s")
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # turns the axes of a ``.ply`` to those of glTF, and back
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
-_TRANSFORM_KEYS = {"matrix", "rotation", "scale", "translation"}  # keys of a node that moves its mesh and its children
+_MOVING_KEYS = {"matrix", "rotation", "scale", "translation"}  # keys of a node that moves its mesh and its children
 
 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
@@ -125,7 +125,7 @@ def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
     }
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
-    return _FILE_HEADER.pack(b"glTF", 2, _FILE_HEADER.size + len(chunks)) + chunks
+    return _FILE_HEAD.pack(b"glTF", 2, _FILE_HEAD.size + len(chunks)) + chunks
 
 
 def _join(blocks: Sequence[np.ndarray]) -> np.ndarray:
@@ -169,7 +169,7 @@ def _attributes(columns: Columns) -> dict[str, np.ndarray]:
 def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:
     """Encode a chunk of the file, whose content is padded to a multiple of four bytes."""
     content += padding * (-len(content) % 4)
-    return _CHUNK_HEADER.pack(len(content), kind) + content
+    return _CHUNK_HEAD.pack(len(content), kind) + content
 
 
 def holds_gaussians(path: Path) -> bool:
@@ -199,7 +199,7 @@ def read_rows(path: Path) -> StoredRows:
     return replace(
         to_stored(parts, ".glb", sizes),
         format="binary little-endian",
-        notes=note_surplus(budget.file_bytes - total, _FILE_HEADER.size),
+        notes=note_surplus(budget.file_bytes - total, _FILE_HEAD.size),
     )
 
 
@@ -279,12 +279,12 @@ class _Content:
 def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any], int]:
     """Return the JSON of a ``.glb`` and the length that its header states; the file is then at its binary chunk."""
     size = budget.file_bytes
-    start = file.read(_FILE_HEADER.size + _CHUNK_HEADER.size)
-    if len(start) < _FILE_HEADER.size + _CHUNK_HEADER.size:
+    start = file.read(_FILE_HEAD.size + _CHUNK_HEAD.size)
+    if len(start) < _FILE_HEAD.size + _CHUNK_HEAD.size:
         raise _ForeignError("an early end of file")
     (magic, version, total), (length, kind) = (
-        _FILE_HEADER.unpack_from(start),
-        _CHUNK_HEADER.unpack_from(start, _FILE_HEADER.size),
+        _FILE_HEAD.unpack_from(start),
+        _CHUNK_HEAD.unpack_from(start, _FILE_HEAD.size),
     )
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
         raise _ForeignError("a file that is no binary glTF 2.0")
@@ -296,7 +296,7 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any],
     missing = set(document.get("extensionsRequired", ())) - READ_EXTENSIONS
     if missing and NAME in str(document.get("extensionsUsed")):
         raise _ForeignError(f"one that requires {', '.join(sorted(map(str, missing)))}, which is not supported")
-    file.read(_CHUNK_HEADER.size)
+    file.read(_CHUNK_HEAD.size)
     return document, total
 
 
@@ -311,9 +311,7 @@ def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple
             raise _ForeignError(f"one with two parents of node {node_id}")
         visited.add(node_id)
         node = nodes[node_id]
-        transform = (
-            parent_transform if _TRANSFORM_KEYS.isdisjoint(node) else matmul(parent_transform, _node_matrix(node))
-        )
+        transform = parent_transform if _MOVING_KEYS.isdisjoint(node) else matmul(parent_transform, _node_matrix(node))
         primitives = document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []
         yield from ((primitive, transform) for primitive in primitives if NAME in primitive.get("extensions", {}))
         stack += [(child, transform) for child in reversed(node.get("children", []))]

@@ -253,9 +253,8 @@ def open_ply(path: Path) -> tuple[PlyData, int]:
         with _stream(path, end, text=text) as file, quiet_warnings():  # about an empty list, or too large a number
             data = PlyData.read(file, mmap="r")
             num_left = len(file.read().strip()) if text else budget.file_bytes - file.tell()
-        mapped = (
-            () if "chunk" in data or sys.platform == "win32" else ("vertex",)
-        )  # Windows cannot replace a mapped file
+        # Windows cannot replace a mapped file
+        mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)
         for element in data.elements:
             if isinstance(element.data, np.memmap) and element.name not in mapped:
                 with open_rows(path, element.data) as read:
@@ -400,9 +399,7 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
     is_text = ["format", "ascii", "1.0"] in words
     elements = _parse_elements(words)
-    steps_per_element = (
-        50  # steps of 20 microseconds in a ReadBudget, since several readers open a file one after another
-    )
+    steps_per_element = 50  # steps of 20 microseconds in a ReadBudget; several readers open a file one after another
     budget.check_steps(steps_per_element * len(elements), "steps for elements")
     bytes_left = size - end - len(last_line)
     for element in elements:

@@ -299,9 +299,8 @@ def spz_columns(
     ``version``: 2 or 3. ValueError if there is NaN or inf.
     """
     means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
-    fraction = choose_fraction(
-        means if np.isfinite(means).all() else means[:0], FINE
-    )  # means that are not finite are refused below
+    # Means that are not finite are refused below
+    fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], FINE)
     header = Header(version, count, degree, fraction, MIP_FLAG * mip, 0)
     parts = tuple(np.empty((count, width), np.uint8) for width in header.widths)
     for start, columns in arrays.column_blocks(gaussians, max_degree):

@@ -37,7 +37,7 @@ MAX_DEGREE = sog.MAX_DEGREE
 # Thousands of Gaussians in a region for which a viewer chooses one level. A room of a few hundred thousand Gaussians
 # has about twenty regions.
 CHUNK_THOUSANDS = 16
-_CHUNK_FOLDER = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # name of a chunk's folder: level, number, hash
+_CHUNK_NAME = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # name of a chunk's folder: level, number, hash
 
 
 @check_arguments
@@ -279,7 +279,7 @@ def remove_unused_chunks(path: Path) -> None:
     used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
     for folder in path.parent.iterdir():
         if (
-            _CHUNK_FOLDER.fullmatch(folder.name)
+            _CHUNK_NAME.fullmatch(folder.name)
             and folder.name not in used
             and folder.is_dir()
             and not folder.is_symlink()

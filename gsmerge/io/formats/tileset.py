@@ -45,9 +45,8 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
     box = [*matmul(turn, (low + high)[:, None] / 2)[:, 0].tolist(), *halves.reshape(-1).tolist()]
     place = contents.options.place
     root = {"boundingVolume": {"box": box}, "geometricError": 0, "refine": "REPLACE", "content": {"uri": tile.name}}
-    on_globe = matmul(
-        np.eye(4) if place is None else globe_matrix(place), HALF_TURN
-    )  # the half turn lets photos look north
+    # The half turn lets photos look north
+    on_globe = matmul(np.eye(4) if place is None else globe_matrix(place), HALF_TURN)
     root["transform"] = on_globe.T.reshape(-1).tolist()
     extensions = {"extensionsUsed": [NAME, COMPRESSED], "extensionsRequired": [NAME, COMPRESSED]}
     document = {
