@@ -91,12 +91,14 @@ def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixe
     by_ending = _files_by_ending(root, files)
 
     def rank(path: Path, name: str) -> tuple[bool, bool, int]:
+        """Return a sort key by which the preferred file comes first."""
         relative = path.relative_to(root) if path.is_relative_to(root) else path
         whole_paths = str(relative), str(relative.with_suffix(""))
         has_whole_path = any(ending in whole_paths for ending in _endings(PurePosixPath(name)))
         return not has_whole_path, any(part[0] in _HIDDEN for part in relative.parts), -pixels(path)
 
     def choose(name: str) -> Path | None:
+        """Return the preferred file for a name; None without any."""
         matches = _find_matches(by_ending, name)
         return min(matches, key=lambda path: rank(path, name)) if len(matches) > 1 else next(iter(matches), None)
 
@@ -163,9 +165,9 @@ def check_photo_folder(path: Path) -> None:
 
 
 def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
-    """Note pictures or films that cannot be read in a folder, or in one of its sub-folders ``places``; empty without.
+    """Note pictures or films that cannot be read, in one of a folder's sub-folders ``places`` or in the folder itself.
 
-    The first of these folders with such files is noted.
+    Only the first of these folders with such files is noted; empty if none has any.
     """
     for place in (*(folder / name for name in places), folder):
         with suppress(OSError):

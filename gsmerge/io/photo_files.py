@@ -127,6 +127,7 @@ def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size
     _check_together([path for path in paths if path is not None], sum(map(check_file, files)), size)
 
     def decode(view: tuple[Path | None, int]) -> np.ndarray:
+        """Decode the part of one view's photo."""
         path, turn = view
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
@@ -212,7 +213,7 @@ def photo_array(images: np.ndarray | None) -> np.ndarray:
 
 
 def part_size(size: Size, part: Part) -> Size:
-    """Return the size in pixels of a part of a photo of a size."""
+    """Return the size in pixels of a part of a photo that has a ``size``."""
     left, top, right, bottom = (round(side * share) for side, share in zip(size * 2, part, strict=True))
     return max(1, right - left), max(1, bottom - top)
 
@@ -238,6 +239,7 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 
     def brightness(image: Image.Image) -> np.ndarray:
+        """Return the brightness ``[h,w]`` as stored; of 8 bits times the opacity."""
         _check_channels(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
             return np.asarray(image)
@@ -270,6 +272,7 @@ def decode_alpha(path: Path) -> np.ndarray | None:
         return None
 
     def alpha(image: Image.Image) -> Image.Image | None:
+        """Return the channel of opacity; None if the image has none."""
         if "A" not in image.getbands() and "transparency" not in image.info:
             return None
         _check_channels(_photo_budget(path), image)
@@ -363,7 +366,7 @@ def _read_header(path: Path) -> tuple[Size, float]:
 
 
 def orientation_turn(path: Path) -> int:
-    """Return the turn of a photo by its tag, 0 to 7, as :func:`gsmerge.kernels.pictures.turn_picture` takes it."""
+    """Return a photo's orientation by its tag, 0 to 7, as :func:`gsmerge.kernels.pictures.turn_picture` takes it."""
     with read_errors(path), quiet_warnings():
         try:
             with path.open("rb") as file, _open_image(file, (*_FORMATS, "PNG")) as image:
@@ -483,6 +486,7 @@ class PhotoTransform:
         """Resize and crop the uint8 photos ``[h,w,3]``."""
 
         def transform(_: int, image: np.ndarray) -> np.ndarray:
+            """Resize and crop one photo."""
             height, width = image.shape[:2]
             size = round(width * self.scale_x), round(height * self.scale_y)
             shrinks = size[0] * size[1] < width * height

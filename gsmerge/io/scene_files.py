@@ -127,7 +127,7 @@ class SceneFiles:
         return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
 
     def describe_choice(self, cameras: Path | None) -> list[str]:
-        """Note which cameras are read, and not which others, if those were tried before or are COLMAP models beside."""
+        """Note which cameras are read; the note names others that were tried before, or COLMAP models beside them."""
         paths = list(filter(None, (self.cameras, *self.others)))
         if cameras is None or not self.others:
             return []

@@ -403,6 +403,7 @@ def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens 
     """
 
     def undistort(view: int, photo: np.ndarray) -> np.ndarray:
+        """Undistort the photo of one view."""
         lens = lenses[view]
         if lens is None:
             return photo

@@ -69,7 +69,7 @@ def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
 
 
 def set_centred_size(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
-    """Set the size of views to twice their principal points; return them unchanged if these differ or are fractions."""
+    """Set the size of views to twice their principal point, if that is whole and equal in all views."""
     sides = 2 * np.array([view.K for view in views])[:, :2, 2].reshape(-1, 2) if views else np.zeros((0, 2))
     first_size = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
     are_centred = len(sides) > 0 and bool((np.abs(sides - first_size) <= CENTRED_PX).all())

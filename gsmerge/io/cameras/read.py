@@ -60,7 +60,7 @@ def find_other_cameras(folder: Path) -> Path | None:
 
 
 def holds_cameras(path: Path) -> bool:
-    """Return whether a file has an ending of camera files and can be read as one."""
+    """Return whether a file can be read as cameras, by its ending and its content."""
     if path.suffix not in _CANDIDATE_ENDINGS:
         return False
     if path.suffix == ".npz":

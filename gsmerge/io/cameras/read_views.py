@@ -195,7 +195,7 @@ _CUT_PANORAMAS = "cut pinhole pictures out of the 360-degree panoramas first, as
 
 
 def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
-    """Return the lens of a view; None for a pinhole, SceneError for other camera models than those that are read."""
+    """Return the lens of a view; None for a pinhole, SceneError for a camera model that is not read."""
     model = values.get("model", "PINHOLE")
     params = {key: values.get(key, 0.0) for key in _COEFFICIENTS}
     if not any(params.values()):

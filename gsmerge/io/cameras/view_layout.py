@@ -50,6 +50,7 @@ class Matrix:
         return np.asarray(convert_value(self._to_matrix, self.key, values[self.key]))
 
     def _to_matrix(self, value: Any) -> np.ndarray:
+        """Convert a value of the file to the matrix."""
         array = to_array(value)
         return array if self.shape is None else array.reshape(self.shape)
 

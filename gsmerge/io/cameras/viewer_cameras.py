@@ -42,6 +42,7 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     """
 
     def principal_point(K: np.ndarray) -> dict[str, float]:
+        """Return the entries of a principal point; empty if it is in the middle."""
         centred = np.allclose(2 * K[:2, 2], (cameras.width, cameras.height), rtol=0, atol=CENTRED_PX)
         return {} if centred else {"cx": float(K[0, 2]), "cy": float(K[1, 2])}
 

@@ -195,6 +195,7 @@ def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
         return parts[0]
 
     def widen(harmonics: np.ndarray) -> np.ndarray:
+        """Add zeros for missing harmonics."""
         return np.pad(harmonics, ((0, 0), (0, num_higher - harmonics.shape[1]), (0, 0)))
 
     widened = [replace(part, harmonics=widen(part.harmonics)) for part in parts]
@@ -215,7 +216,7 @@ class Packed:
 
 @dataclass(frozen=True)
 class PackedRows:
-    """Rows of a PLY file that are unpacked block by block when they are taken."""
+    """Rows of a PLY file, which are unpacked block by block when they are read."""
 
     parts: Sequence[Packed]
     dtype: np.dtype[np.void]
@@ -271,7 +272,7 @@ def pack_rows(parts: Sequence[Packed]) -> PackedRows:
 
 
 def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], mode: str | None = None) -> StoredRows:
-    """Make the content of a file from packed Gaussians.
+    """Make the stored rows of a file from its packed Gaussians.
 
     ``name``: name of the format. ``sizes``: bytes by attribute. ``mode``: mode of rendering, see :func:`render_mode`.
     """
@@ -309,6 +310,7 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
     """
 
     def check(values: np.ndarray) -> np.ndarray:
+        """Return values unchanged; ValueError if any is not finite as float32."""
         with np.errstate(over="ignore"):
             nonfinite = np.argwhere(~np.isfinite(values.astype(np.float32)))  # no format holds larger numbers
         if len(nonfinite):
@@ -316,6 +318,7 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
         return values
 
     def array(values: Array) -> np.ndarray:
+        """Return values as float64; ValueError as in ``check``."""
         return check(as_array(values).astype(np.float64))
 
     degree = min(max_degree, gaussians.sh_degree)

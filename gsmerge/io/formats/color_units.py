@@ -56,6 +56,6 @@ def find_units(stored: np.ndarray) -> ColorUnits | None:
     return next((units for units, is_inside in shares if is_inside.mean() > 1 - arrays.MAX_STRAY), None)
 
 
-def state_colors(stored: np.ndarray) -> ColorUnits:
+def choose_units(stored: np.ndarray) -> ColorUnits:
     """Return the most likely units of colours ``[n,3]`` that the caller calls RGB; by default, RGB in [0, 1]."""
     return next((units for units in _UNITS if arrays.are_shares(units.rgb(stored))), _UNITS[0])

@@ -227,7 +227,7 @@ def _packed_bytes(rows: np.ndarray | arrays.PackedRows) -> dict[str, int]:
 
 
 def no_ply(path: Path) -> SceneError:
-    """Make the error of a file that is no PLY file: of a picture, by its ending, of cameras, or of any other file."""
+    """Make the error of a file that is no PLY file, which says so if it is a picture or holds cameras."""
     if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES:
         remedy = "make Gaussians from photos with a model first, and name its .ply"
         return SceneError(path, "expected Gaussians, found a picture", remedy)

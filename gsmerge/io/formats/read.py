@@ -13,7 +13,7 @@ from gsmerge.errors import Doubt, SceneError
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits, find_units, judge_colors, state_colors
+from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits, choose_units, find_units, judge_colors
 from gsmerge.io.formats.scale_units import LINEAR_NOTE, SAMPLES, ScaleJudgement, judge_scales, log_of_scales
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
 from gsmerge.kernels.elementary import exp, log
@@ -262,7 +262,7 @@ def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.
 
 
 def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with the rows of all files; return the numbers of clipped Gaussians and of zero quaternions."""
+    """Fill arrays with the rows of all files; return the numbers of rows with clipped values and with zero quats."""
     num_clipped = num_zero_quats = start = 0
     for path, part in zip(paths, parts, strict=True):
         part_rows = slice(start, start + len(part.rows))
@@ -312,7 +312,7 @@ def _choose_colors(
     rows = rows[:: max(1, len(rows) // SAMPLES)]
     stored = out["sh0"][rows, 0]
     if choice == "rgb":
-        return state_colors(stored), "", None
+        return choose_units(stored), "", None
     has_plain = all(name in names and part.rows.dtype[name] == np.uint8 for name in arrays.PLAIN_COLORS[0])
     first = rows[rows < len(part.rows)]
     plain = np.stack([part.rows[name][first] for name in arrays.PLAIN_COLORS[0]], 1) if has_plain else None
@@ -329,11 +329,12 @@ def _with_linear_scales(part: StoredRows) -> StoredRows:
 
 
 def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with the rows of a file; return the numbers of clipped Gaussians and of zero quaternions."""
+    """Fill arrays with the rows of one file; return counts as :func:`_fill_arrays` does."""
     n, block_rows = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
     with ply.open_rows(path, stored.rows) as read:
 
         def convert(start: int) -> tuple[int, int]:
+            """Convert the block of rows from ``start`` on; return its counts."""
             block = slice(start, min(start + block_rows, n))
             rows = read(block) if stored.adapt is None else stored.adapt(read(block))
             counts = _convert(rows, {name: array[block] for name, array in out.items()})
@@ -386,6 +387,7 @@ def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int,
     rest_names = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
 
     def read(names: Sequence[str]) -> np.ndarray:
+        """Return columns side by side, ``[n,len(names)]`` float32."""
         values = np.empty((len(rows), len(names)), np.float32)
         for j, name in enumerate(names):
             values[:, j] = rows[name]

@@ -216,6 +216,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
     """Decode the textures and codebooks, and return the Gaussians in them; ValueError for damaged content."""
 
     def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
+        """Decode the first channels of one of the textures under a key of ``meta``."""
         pixels = _read_texture(files, meta[key]["files"][index], count, budget)
         return pixels[:, :channels].copy()  # a copy, so that unused channels take no memory
 
@@ -284,6 +285,7 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
     textures: dict[str, bytes] = {}
 
     def add(key: str, files: dict[str, bytes], **numbers: Any) -> None:
+        """Add textures, and an entry of ``meta`` with their names and numbers."""
         meta[key] = {**numbers, "files": list(files)}
         textures.update(files)
 

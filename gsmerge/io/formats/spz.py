@@ -160,7 +160,7 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
 
 
 def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
-    """Read versions 1 to 3: header, columns ``[n,width]`` uint8, extensions, and number of bytes after the stream."""
+    """Read version 1 to 3; return header, columns ``[n,width]`` uint8, extensions, and number of bytes after them."""
     path = budget.path
     stream = zlib.decompressobj(wbits=31)
     try:
@@ -181,7 +181,7 @@ def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndar
 
 
 def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
-    """Read version 4: header, columns ``[n,width]`` uint8, extensions, and number of bytes after the streams."""
+    """Read version 4; return header, columns ``[n,width]`` uint8, extensions, and number of bytes after them."""
     import zstandard  # few files need it
 
     path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,))
@@ -333,8 +333,8 @@ def _quantise_harmonics(harmonics: np.ndarray) -> np.ndarray:
 def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
     """Pack unit quaternions ``[n,4]`` wxyz to bytes, which :func:`_read_rotations` unpacks.
 
-    Version 2 has a byte for each of xyz, for the sign of the quaternion with w above 0. Version 3 has a word. From
-    its highest bit on, it has the index of the largest of xyzw, then sign and magnitude of each other component.
+    Version 2 has a byte for each of x, y and z of the quaternion whose w is positive. Version 3 has a word. From its
+    highest bit on, it has the index of the largest of xyzw, then sign and magnitude of each other component.
     """
     if version < 3:
         return arrays.to_bytes(127.5 * (np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] + 1))

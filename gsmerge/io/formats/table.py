@@ -52,8 +52,8 @@ WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]
 class Format:
     """A format of files of Gaussians: its ending, and how to read and write it.
 
-    All properties of a format that a run needs are here, so that a new format is one module and one row. Writers that
-    draw the scene are in higher layers; rows name them lazily, as entry points name commands.
+    All properties of a format that a run needs are here, so that a new format is one module and one row. Rows name most
+    functions by text, and these are imported at their first use. Writers that draw the scene are in higher layers.
     """
 
     ending: str  # of names, in lower case; without a leading dot, it is the whole name of a folder's main file

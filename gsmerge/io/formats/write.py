@@ -16,7 +16,10 @@ from gsmerge.values.arguments import check_arguments
 
 
 def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
-    """Note harmonics that a path's format leaves out, and too many Gaussians for readers; UsageError if it has none."""
+    """Note if the format of a path leaves out harmonics, or if its readers do not read so many Gaussians.
+
+    UsageError if no format has the ending.
+    """
     format_, notes = output_format(path, levels=True, cameras=True), list[str]()
     if sh_degree > format_.max_degree:
         notes.append(format_.lost.format(ending=format_.ending, degree=format_.max_degree))
@@ -27,7 +30,7 @@ def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
 
 
 def level_output(output: Path, level: int) -> Path:
-    """Return the path of a coarser level of detail, which count from 1: ``out.ply`` -> ``out.level1.ply``."""
+    """Return the path of a coarser ``level`` of detail, which is 1 or more: ``out.ply`` -> ``out.level1.ply``."""
     stem_length = len(output.name) - len(output_format(output).ending)
     return output.with_name(f"{output.name[:stem_length]}.level{level}{output.name[stem_length:]}")
 
