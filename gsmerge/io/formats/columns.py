@@ -77,7 +77,8 @@ COLUMN_KINDS = (
         r".*",
     ),
 )  # fmt: skip
-_TYPE_NAMES = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}  # PLY's types of 1, 2 and 4 bytes
+# PLY's types of whole numbers, of 1, 2 and 4 bytes
+_WHOLE_TYPES = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}
 
 
 def _find_kind(name: str) -> ColumnKind | None:
@@ -117,7 +118,7 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
         dtype, is_used = row[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
         is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
         if is_used and dtype.kind != "f" and not is_color_byte:
-            type_name = _TYPE_NAMES[dtype.kind][dtype.itemsize // 2]
+            type_name = _WHOLE_TYPES[dtype.kind][dtype.itemsize // 2]
             meaning = "values of 0 to 255" if dtype.itemsize == 1 else "half floats"
             problem = f"expected {name} as float, found {type_name}, which may be {meaning} or indices of a codebook"
             raise SceneError(path, problem, "export it with floats, opacities as logits or in [0, 1]")
