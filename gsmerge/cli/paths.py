@@ -46,7 +46,7 @@ def with_beside(output: Path) -> list[Path]:
     from gsmerge.io.formats.table import find_format
 
     beside = find_format(output).beside
-    return [output, *([output.with_name(beside)] if beside else [])]
+    return [output, *([output.with_name(beside.format(stem=output.stem))] if beside else [])]
 
 
 def check_outputs(

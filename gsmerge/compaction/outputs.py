@@ -38,8 +38,9 @@ def add_output(
     shows = format_.first_view and contents.options.viewer_cameras
     if shows and len(contents.cameras) == 0:
         contents = replace(contents, cameras=place_viewpoints(gaussians)[:1])
-    settings = format_.settings_path(out) if shows else None
-    if settings and (not settings.exists() or (overwrite and settings.is_file() and is_own_settings(settings))):
+    settings = out.with_name(format_.settings.format(stem=out.name.removesuffix(format_.ending)) or out.name)
+    is_free = not settings.exists() or (overwrite and settings.is_file() and is_own_settings(settings))
+    if format_.settings and shows and is_free:
         add(settings).write_text(viewer_settings(contents.cameras, gaussians.means), encoding="utf-8")
     return format_.write(add, out, temporary, contents)
 

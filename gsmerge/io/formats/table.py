@@ -98,11 +98,6 @@ class Format:
         name = Path(path).name
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
-    def settings_path(self, output: Path) -> Path | None:
-        """Return the path of the settings for viewers beside an output; None if the format has none."""
-        stem = output.name.removesuffix(self.ending)
-        return output.with_name(self.settings.format(stem=stem)) if self.settings else None
-
 
 _page = lazy_functions("gsmerge.pages")
 # Bytes of a Gaussian with harmonics of degree 0 to 3
@@ -221,8 +216,7 @@ def may_hold_gaussians(path: Path) -> bool:
 def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: allow an index, such as ``lod-meta.json``, with files beside it. ``cameras``: allow a page, which has
-    cameras inside it.
+    ``levels``: allow an index with files beside it. ``cameras``: allow a page, which has cameras.
     """
     by_name = next((row for row in FORMATS if row.names(path)), None)
     is_index = by_name is not None and by_name.ending[0] != "."
