@@ -31,7 +31,7 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
     if len(gaussians) == 0:
         return []
     format_, columns = output_format(path, levels=True, cameras=True), gaussians.numpy()
-    extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # formats choose their steps by these
+    extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # from them formats choose their steps
     rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // ROUNDING_GAUSSIANS + 1), *extremes]))
     means, scales = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0)
     sizes = np.sort(scales, axis=1)[:, 1]  # a Gaussian is as large as its second largest scale

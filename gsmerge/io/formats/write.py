@@ -30,7 +30,7 @@ def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
 
 
 def level_output(output: Path, level: int) -> Path:
-    """Return the path of a coarser ``level`` of detail, which is 1 or more: ``out.ply`` -> ``out.level1.ply``."""
+    """Return the path of a coarser level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
     stem_length = len(output.name) - len(output_format(output).ending)
     return output.with_name(f"{output.name[:stem_length]}.level{level}{output.name[stem_length:]}")
 
