@@ -1,4 +1,4 @@
-"""Read and write zip archives; no member unpacks to more bytes than the directory of its archive states."""
+"""Read and write zip archives; no member unpacks to more bytes than the directory of the archive states for it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from contextlib import contextmanager
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
 
-# With other methods, zipfile unpacks each piece of packed bytes completely, even if the directory states fewer bytes
+# With any other method, zipfile unpacks a piece of packed bytes completely, even if the directory states fewer bytes
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 @contextmanager
 def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; SceneError unless all its members are stored or deflated."""
+    """Open a zip archive; SceneError if any member is packed by another method than "stored" or "deflated"."""
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
             if info.compress_type not in _METHODS:
@@ -32,6 +32,6 @@ def new_member(name: str) -> zipfile.ZipInfo:
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """Read as many bytes of a member as the directory states; ``ZipFile.read`` would unpack more."""
+    """Read as many bytes of a member as the directory states; ``ZipFile.read`` might unpack more."""
     with archive.open(info) as file:
         return file.read(info.file_size)

@@ -5,7 +5,8 @@ temporary name contains the process id and a hash of the machine. A later proces
 process.
 
 A file that replaces another one takes its mode, and its owner and group where the system allows that.
-A new file has the rights that the umask leaves, but none that a file lacks whose content it holds, such as a photo.
+A new file has the rights that the umask leaves. If it holds the content of another file, such as a photo, it has only
+rights that this file has as well.
 """
 
 from __future__ import annotations
@@ -32,10 +33,11 @@ from gsmerge.types import StrPath
 
 # Errors of the disk while a file is written; other OSErrors are errors of the caller
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
+# Problem and remedy of an output that exists
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
 _PRIVATE = 0o600  # mode of a file that its owner alone can read and write
 _STALE_SECONDS = 7 * 86400  # age at which a file is stale if its process is not visible here
-_BOOT = "/proc/sys/kernel/random/boot_id"
+_BOOT = "/proc/sys/kernel/random/boot_id"  # holds a random id that Linux makes at each start
 _TEMPORARY = re.compile(r"\.gsmerge-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
 
 AddOutput = Callable[[Path], Path]  # adds a file to :func:`atomic_outputs`, and returns the temporary file to write
@@ -63,8 +65,8 @@ def atomic_outputs(*, overwrite: bool = False, mode: int = 0o666) -> Iterator[Ad
     renamed first, and their names are on the disk before the next folder is renamed. Therefore an index above them
     never names a missing file.
 
-    ``mode``: the most rights of new files, for outputs that hold the content of other files see :func:`common_mode`.
-    New files also have at most the rights of files that the same call replaces.
+    ``mode``: the most rights that new files have. For outputs that hold the content of other files,
+    :func:`common_mode` returns it. New files also have at most the rights of files that the same call replaces.
     """
     outputs = _Outputs(overwrite, [mode])
     try:
@@ -84,17 +86,17 @@ class _Outputs:
     """The files of one call of :func:`atomic_outputs`."""
 
     overwrite: bool
-    modes: list[int]  # those that limit the mode of a new file
+    modes: list[int]  # a new file has only rights that all of these modes have
     # Temporary file -> path as the caller gave it, and path after links
     paths: dict[str, tuple[Path, Path]] = field(default_factory=dict)
     new_folders: list[Path] = field(default_factory=list)  # parents before their children
 
     def add(self, path: Path) -> Path:
-        """Make the temporary file of an output and return it; a temporary file of an outer block is its own."""
+        """Make the temporary file of an output, and return its path; return a path that is temporary itself."""
         if str(path) in _written:
             return path
         self.new_folders.extend(_make_folder(path.parent))
-        _refuse(path, self.overwrite)
+        _check_output(path, self.overwrite)
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
         _remove_stale_once(target.parent.absolute())
         temporary = temporary_path(target)
@@ -144,7 +146,7 @@ class _Outputs:
 
 
 def _make_folder(folder: Path) -> Iterator[Path]:
-    """Make a folder and its parents, and yield each that was missing."""
+    """Make a folder and its parents, and yield each folder that was missing, parents first."""
     missing = list(takewhile(lambda path: not os.path.lexists(path), (folder, *folder.parents)))
     for path in reversed(missing):
         try:
@@ -157,23 +159,26 @@ def _make_folder(folder: Path) -> Iterator[Path]:
 
 
 def common_mode(paths: Iterable[Path]) -> int:
-    """Return the mode of rights that all files give to others, also the files in folders; owners can read and write."""
+    """Return the rights, as a mode, that all files have in common; owners can read and write in any case.
+
+    A folder in ``paths`` stands for all files in it. Missing files do not count.
+    """
     files = (file for path in paths for file in (walk_files(path) if path.is_dir() else [path]))
     return reduce(and_, (os.stat(file).st_mode | _PRIVATE for file in files if os.path.exists(file)), 0o666)
 
 
 def _copy_rights(source: Path, path: str) -> None:
-    """Give a private file the mode of another one, and its group and owner if that is allowed.
+    """Give a file the mode of ``source``, and its group and owner if the system allows that.
 
-    If the group has to be another one, it gets no rights that others do not have.
+    If the file keeps another group, this group gets only rights that ``source`` gives to everyone.
     """
     status = os.stat(source)
     with suppress(OSError):
         os.chown(path, -1, status.st_gid)
         os.chown(path, status.st_uid, -1)
-    mode, is_same = status.st_mode & 0o777, os.stat(path).st_gid == status.st_gid
+    mode, has_group = status.st_mode & 0o777, os.stat(path).st_gid == status.st_gid
     with suppress(OSError):  # a file system without modes
-        os.chmod(path, mode if is_same else mode & (0o707 | (mode & 0o007) << 3))
+        os.chmod(path, mode if has_group else mode & (0o707 | (mode & 0o007) << 3))
 
 
 def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
@@ -195,9 +200,9 @@ def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
 
 
 def _rename_to_new(temporary: str, target: Path) -> None:
-    """Give a file a new name; FileExistsError if it exists, even if another process makes it meanwhile.
+    """Give a file a new name; FileExistsError if a file has this name, even if another process makes it meanwhile.
 
-    The temporary name may stay, for :meth:`_Outputs.remove_rest`.
+    The file may keep its temporary name as well, which :meth:`_Outputs.remove_rest` removes.
     """
     try:
         (os.rename if sys.platform == "win32" else os.link)(temporary, target)  # both fail if the name exists
@@ -266,12 +271,15 @@ _remove_stale_once = cache(remove_stale)  # once per folder and process, since l
 
 
 def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
-    """Return whether the process that wrote a temporary file has ended, or a file of another machine is old."""
-    if machine != _machine_hash() or sys.platform == "win32":  # where no call asks for a process without ending it
+    """Return whether no process writes a temporary file any more: its process has ended, or the file is old.
+
+    The age counts for files of other machines, and on Windows, where ``os.kill`` would end the process.
+    """
+    if machine != _machine_hash() or sys.platform == "win32":
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS
     try:
         os.kill(pid, 0)
-    except (OSError, OverflowError) as error:  # any other error: a process of another user
+    except (OSError, OverflowError) as error:  # any other error means that the process is another user's
         return isinstance(error, ProcessLookupError)
     try:  # a killed process whose parent has not asked for its exit status is still listed, as a zombie
         status = Path(f"/proc/{pid}/stat").read_bytes()
@@ -280,7 +288,7 @@ def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
         return False
 
 
-def _refuse(path: Path, overwrite: bool) -> None:
+def _check_output(path: Path, overwrite: bool) -> None:
     """Raise SceneError for an output that cannot be written or must not be replaced."""
     try:
         status = os.stat(path)

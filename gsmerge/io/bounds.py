@@ -1,4 +1,4 @@
-"""Limit the memory and time for reading a file, before anything is read from it or allocated for it.
+"""Limit the memory and time for reading a file, before its content is read or memory is allocated for it.
 
 All readers have the same budget: at most 64 MB + 20 x the file's bytes of memory, and 5 s + 2 s per MB of processor
 time. A reader checks its :class:`ReadBudget` before it allocates memory or runs a loop whose size the file states.
@@ -29,14 +29,14 @@ MAX_PIXELS = 1 << 26  # of one image
 
 _ADDRESS = re.compile(r"(https?|s3|gs|ftp|file):/")  # start of a URL
 _FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20  # bytes of memory for any file, and for each byte of it
-_FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # steps of 20 microseconds: 5 s, and 2 s for each MB
-# Bytes of Python's objects for each of these characters in JSON, at most, in CPython 3.10 to 3.14
+_FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # steps of 20 microseconds: 5 s for any file, and 2 s for each MB
+# For each of these characters in a JSON text, CPython 3.10 to 3.14 makes objects of at most this many bytes
 _JSON_BYTES = {"[": 88, "{": 130, ":": 110, '"': 30, ",": 34}
 
 
 @dataclass(frozen=True)
 class ReadBudget:
-    """Limits for reading a file: 64 MB + 20 x its bytes of memory, and loops of 5 s + 2 s per MB.
+    """Limits for reading a file: 64 MB + 20 x its bytes of memory, and loops that take 5 s + 2 s per MB.
 
     Args:
         path: The file.
@@ -96,7 +96,7 @@ def read_errors(path: StrPath) -> Iterator[None]:
 
 
 def check_file(path: Path) -> int:
-    """Return the size of a file in bytes; SceneError if it is missing, no file, or of another kind than its name."""
+    """Return the size of a file in bytes; SceneError if it is missing, no file, or has unread content."""
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
@@ -168,9 +168,9 @@ def check_image_size(path: StrPath, width: int, height: int) -> None:
 
 
 def check_whole(value: Any, name: str, least: int, most: int = 2**53) -> int:
-    """Return a number of a document; ValueError if it is not whole or not from ``least`` to ``most``.
+    """Return ``value`` if it is a whole number from ``least`` to ``most``; else ValueError, which begins with ``name``.
 
-    By default ``most`` is 2^53, the largest whole number that every JSON reader stores exactly.
+    By default ``most`` is 2^53. Every JSON reader stores whole numbers up to this one exactly.
     """
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError(f"{name}: expected a whole number from {least} to {most}, found {value!r:.40}")

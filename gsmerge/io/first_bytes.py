@@ -14,44 +14,47 @@ _PACKED_SCENES = (".spz", ".splat", ".sog", ".npz", ".glb", ".gsm")
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".ppm"})
 # Endings of files that are never text
 NO_TEXT = (".ply", *_PACKED_SCENES, *IMAGE_SUFFIXES - {".ppm"}, ".torch", ".safetensors", ".bin")
-_START = 1 << 10  # bytes of a file that are compared with the patterns
-# Reports that gsmerge writes (pages, JSON, CSV) have one of these texts at their start
+_START = 1 << 10  # number of first bytes of a file that are compared with patterns
+# A report that gsmerge writes (a page, JSON or CSV) has one of these texts among its first bytes
 _REPORTS = b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,"
 _DOWNLOAD = "download it again, in a browser if the page needs a click or a login"
 _UNPACK = "unpack it, and name the scene in it"
 _GLB = "export it as .glb, which is a single file"
-_AGAIN = "copy or download it again"
+_COPY_AGAIN = "copy or download it again"
 
 
 @dataclass(frozen=True)
 class OtherContent:
     """Content for which a file is refused, with a remedy."""
 
-    what: str
-    start: str  # a pattern of the first bytes; the message has its group ``quote`` if there is one
+    what: str  # its name in messages
+    start: str  # pattern of the first bytes; messages quote its group ``quote``, if it has one
     remedy: str
     right: tuple[str, ...] = ()  # endings of files that may have this content
-    wrong: tuple[str, ...] | None = None  # endings of files that may not have it; None: all endings except ``right``
+    wrong: tuple[str, ...] | None = None  # endings of files that may not have it; None: all others
 
 
-_TRAIN = "train Gaussians on it, or make Gaussians from the photos with a model"
-_WRITE = "write its Gaussians as .ply, with ns-export gaussian-splat (nerfstudio) or the option save_ply (gsplat)"
+_TRAIN_OR_MAKE = "train Gaussians on it, or make Gaussians from the photos with a model"
+_WRITE_GAUSSIANS = (
+    "write its Gaussians as .ply, with ns-export gaussian-splat (nerfstudio) or the option save_ply (gsplat)"
+)
 _EXPORT = "export the scene from that program as .ply"
 FILM = "a film"
-# A program that reads other formats; remedies may have the path of the file
+# A program that converts other formats
 CONVERTER_PACKAGE = "@playcanvas/splat-transform@3.7"
+# In remedies, {path} stands for the path of the file
 _PACKED_BY_OTHERS = (
     "Gaussians in a format that is not read",
     f"convert it with: npx {CONVERTER_PACKAGE} {{path}} -L 0 scene.ply",
 )
-_FILM = FILM, "save its frames as photos, and make a scene from them with a model such as Depth Anything 3"
-# Other files that are often beside scenes, by ending: their content, and the remedy
+_FILM_ENTRY = FILM, "save its frames as photos, and make a scene from them with a model such as Depth Anything 3"
+# Ending of other files that are often beside scenes -> their content, and the remedy
 FOREIGN: dict[str, tuple[str, str]] = {
-    **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"), _FILM),
-    **dict.fromkeys((".pt", ".pth", ".ckpt", ".pkl"), ("a checkpoint", _WRITE)),
+    **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"), _FILM_ENTRY),
+    **dict.fromkeys((".pt", ".pth", ".ckpt", ".pkl"), ("a checkpoint", _WRITE_GAUSSIANS)),
     **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), _PACKED_BY_OTHERS),
-    **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".ptx"), ("a cloud of points", _TRAIN)),
-    **dict.fromkeys((".obj", ".fbx", ".stl", ".dae", ".off", ".blend", ".abc"), ("a mesh", _TRAIN)),
+    **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".ptx"), ("a cloud of points", _TRAIN_OR_MAKE)),
+    **dict.fromkeys((".obj", ".fbx", ".stl", ".dae", ".off", ".blend", ".abc"), ("a mesh", _TRAIN_OR_MAKE)),
     ".ssproj": ("a project of SuperSplat", _EXPORT),
     ".psht": ("a project of Postshot", _EXPORT),
     ".rad": ("levels of Spark", "name the .ply or .spz that they were made from"),
@@ -76,7 +79,7 @@ OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("TIFF", (".tif", ".tiff"), r"II[*+]\0|MM\0[*+]"),
 )
 CONVERT = "convert it to .jpg or .png"
-# They are tried in this order
+# The first row that matches a file counts
 OTHER_CONTENTS = (
     OtherContent("a Git LFS pointer", r"version https://git-lfs\.github\.com/spec/", "fetch it with: git lfs pull"),
     OtherContent(
@@ -115,7 +118,7 @@ def read_start(path: Path, count: int = 1 << 12) -> bytes:
 
 
 def may_be_replaced(path: Path) -> bool:
-    """Return whether a report may take the place of what is at a path: no file, an empty one, or a report of ours."""
+    """Return whether a report may be written to a path: it has no file, an empty file, or a report of gsmerge."""
     return not path.is_file() or path.stat().st_size == 0 or any(mark in read_start(path) for mark in _REPORTS)
 
 
@@ -129,13 +132,13 @@ def refuse_picture(path: Path) -> None:
 
 
 def check_first_bytes(path: Path, size: int) -> None:
-    """Raise SceneError for a file of ``size`` bytes whose content or ending is none that is read.
+    """Raise SceneError, with a remedy, for a file of ``size`` bytes whose first bytes or ending show unread content.
 
-    No error is raised for a file that cannot be read, since its reader reports that.
+    A file that cannot be opened is not refused here, since its reader reports that.
     """
     ending = path.suffix.lower()
     if size == 0 and ending in NO_TEXT:
-        raise SceneError(path, "expected content, found an empty file", _AGAIN)
+        raise SceneError(path, "expected content, found an empty file", _COPY_AGAIN)
     if ending in FOREIGN:
         content, remedy = FOREIGN[ending]
         raise SceneError(path, f"expected a scene, found {content}", remedy.format(path=shlex.quote(str(path))))

@@ -17,9 +17,10 @@ from gsmerge.types import StrPath
 
 OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of unread formats
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
-# Ends of the videos that gsmerge writes, which tell them from films of a capture: a box or element that players skip
+# Last bytes of the videos that gsmerge writes: a box or an element that players skip. Films of a capture do not have
+# them
 CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
-_CUT = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
+_CUT_FILM = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
 HOLD_PHOTOS = (".npz", ".gsm")  # endings of files that may have photos inside
 _NAME_FOLDER = "name the folder of the photos with {option}"
 _HIDDEN = ".@"  # first characters of hidden folders, such as .thumb and @eaDir
@@ -29,7 +30,7 @@ PathT = TypeVar("PathT", str, Path)
 
 
 def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
-    """Find the image file of every view; see :func:`read_images`."""
+    """Find the image file of each name, in order; ``source`` and errors are those of :func:`read_images`."""
     if isinstance(source, str | os.PathLike):
         root = Path(source)
         if not root.is_dir():
@@ -39,8 +40,8 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
     else:
         files = [Path(p) for p in source]
         root = files[0].parent if files else Path()
-    by_ending = _by_ending(root, files)
-    matched = [_lookup(root, by_ending, name) for name in names]
+    by_ending = _files_by_ending(root, files)
+    matched = [_find_only(root, by_ending, name) for name in names]
     paths = [path for path in matched if path is not None]
     if not paths and len(files) == len(names):
         return files
@@ -48,14 +49,14 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
         missing = names[matched.index(None)]
         problem = f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}"
         raise SceneError(root, problem, "add the missing images, or name another folder with --images")
-    if len(set(paths)) < len(set(names)):  # layers of one view have the same name
+    if len(set(paths)) < len(set(names)):  # several layers of one view share its name, and its file
         ((repeated, _),) = Counter(paths).most_common(1)
         problem = f"expected a different image for each camera, found {repeated.name} for two of them"
         raise SceneError(root, problem, "give each image the name of its camera")
     return paths
 
 
-def _by_ending(root: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
+def _files_by_ending(root: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
     """Map every ending of the files' paths below a folder to the files that have it."""
     by_ending: dict[str, list[Path]] = {}
     for file in files:
@@ -65,42 +66,47 @@ def _by_ending(root: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def _endings(path: PurePath) -> list[str]:
-    """List the endings of a path, such as "a/b.png", "a/b", "b.png" and "b", the longest first."""
-    max_parts = 16  # parts at the end of a path that names are compared with: the file's name and folders above it
+    """List the endings of a path, the longest first: of "a/b.png" these are "a/b.png", "a/b", "b.png" and "b"."""
+    max_parts = 16  # parts at the end of a path that are compared: the file's name, and the folders above it
     parts = path.parts[-max_parts:]
     endings = [PurePosixPath(*parts[i:]) for i in range(len(parts))]
     return list(dict.fromkeys(str(name) for ending in endings for name in (ending, ending.with_suffix(""))))
 
 
 def _find_matches(by_ending: dict[str, list[Path]], name: str) -> list[Path]:
-    """List the files whose paths have the longest ending of a name that any file has; empty without any."""
+    """List the files that match a name best; empty if none does.
+
+    They have the longest ending of the name that any file has.
+    """
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
     return next((by_ending[ending] for ending in _endings(PurePosixPath(*parts)) if ending in by_ending), [])
 
 
 def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixels: PixelCount) -> list[Path | None]:
-    """Propose one of ``files`` below a folder for each name; None if no file has the name.
+    """Propose one of ``files`` below a folder for each name; None if no file matches the name.
 
-    If several files have the name, a file is preferred if its whole path is in the name, then if it is not in a hidden
-    folder, then if it has more ``pixels``.
+    Of several files that match, one whose whole path is in the name is preferred, then one outside hidden folders, then
+    the one with most ``pixels``.
     """
-    by_ending = _by_ending(root, files)
+    by_ending = _files_by_ending(root, files)
 
     def rank(path: Path, name: str) -> tuple[bool, bool, int]:
+        """Return a sort key by which the preferred file comes first."""
         relative = path.relative_to(root) if path.is_relative_to(root) else path
         whole_paths = str(relative), str(relative.with_suffix(""))
         has_whole_path = any(ending in whole_paths for ending in _endings(PurePosixPath(name)))
         return not has_whole_path, any(part[0] in _HIDDEN for part in relative.parts), -pixels(path)
 
     def choose(name: str) -> Path | None:
+        """Return the preferred file for a name; None without any."""
         matches = _find_matches(by_ending, name)
         return min(matches, key=lambda path: rank(path, name)) if len(matches) > 1 else next(iter(matches), None)
 
     return [choose(name) for name in names]
 
 
-def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str = "--images") -> Path | None:
-    """Return the file with a name; None if there is none, SceneError if there are several."""
+def _find_only(root: Path, by_ending: dict[str, list[Path]], name: str, option: str = "--images") -> Path | None:
+    """Return the only file that matches a name; None if no file does, SceneError if several do."""
     matches = _find_matches(by_ending, name)
     if len(matches) > 1:
         first, second = (os.path.relpath(path, root) for path in matches[:2])
@@ -114,22 +120,22 @@ def match_masks(
 ) -> tuple[list[Path | None], list[str]]:
     """Find the mask of every view by the name of its photo, with or without extension; None for a view without a mask.
 
-    Also returns a note on masks that belong to no view. SceneError, which names the ``option``, if a view has two
-    masks, or if no view has one and the folder was ``named``.
+    Also returns notes: on masks that belong to no view, or that no view has a mask. SceneError, which names the
+    ``option``, if a view has two masks, or if no view has one although the caller ``named`` the folder.
     """
 
     def is_of_neighbour(mask: Path, photo: Path) -> bool:
-        """Return whether a mask in a folder is for photos in the folder of the same name, beside that of a photo."""
+        """Return whether a mask lies in a sub-folder with the name of another photo folder beside that of ``photo``."""
         neighbour = photo.parent.parent / mask.parent.name
         return mask.parent != folder and neighbour != photo.parent and neighbour.is_dir()
 
     files = list_images(folder)
-    by_ending = _by_ending(folder, files)
-    found = ((_lookup(folder, by_ending, name, option), Path(name)) for name in names)
-    masks = [None if mask is None or is_of_neighbour(mask, photo) else mask for mask, photo in found]
+    by_ending = _files_by_ending(folder, files)
+    pairs = ((_find_only(folder, by_ending, name, option), Path(name)) for name in names)
+    masks = [None if mask is None or is_of_neighbour(mask, photo) else mask for mask, photo in pairs]
     if not any(masks):
-        rename = "none", f"rename the masks, or name another folder with {option}"
-        content, remedy = (None if files else _find_unread(walk_files(folder))) or rename
+        other_names = "none", f"rename the masks, or name another folder with {option}"
+        content, remedy = (None if files else _find_unread(walk_files(folder))) or other_names
         problem = f"expected masks with the names of the photos, such as {PurePath(names[0]).stem}.png, found {content}"
         if named:
             raise SceneError(folder, problem, remedy)
@@ -150,36 +156,40 @@ def check_photo_folder(path: Path) -> None:
     """Raise SceneError if a path is a file that holds no photos, or a folder without a photo of a known format."""
     ending = path.suffix.lower()
     if path.is_file() and ending not in HOLD_PHOTOS:
-        found, remedy = (FILM, _CUT) if ending in FILMS else ("a file", "name the folder of the photos")
-        raise SceneError(path, f"expected a folder of photos, found {found}", remedy)
+        content, remedy = (FILM, _CUT_FILM) if ending in FILMS else ("a file", "name the folder of the photos")
+        raise SceneError(path, f"expected a folder of photos, found {content}", remedy)
     if not path.is_dir() or list_images(path):
         return
-    found, remedy = _find_unread(walk_files(path)) or ("none", _NAME_FOLDER.format(option="--images"))
-    raise SceneError(path, f"expected photos ({', '.join(sorted(IMAGE_SUFFIXES))}), found {found}", remedy)
+    content, remedy = _find_unread(walk_files(path)) or ("none", _NAME_FOLDER.format(option="--images"))
+    raise SceneError(path, f"expected photos ({', '.join(sorted(IMAGE_SUFFIXES))}), found {content}", remedy)
 
 
 def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
-    """Note pictures and films that are not read, in a folder or in its sub-folders ``places``; empty without any."""
+    """Note pictures or films that cannot be read, in one of a folder's sub-folders ``places`` or in the folder itself.
+
+    Only the first of these folders with such files is noted; empty if none has any.
+    """
     for place in (*(folder / name for name in places), folder):
         with suppress(OSError):
             files = (path for path in place.iterdir() if path.is_file())
-            unread = _find_unread([path for path in files if path.suffix.lower() != ".gif"])  # GIFs are clips
+            # A GIF is a clip, and no photo
+            unread = _find_unread([path for path in files if path.suffix.lower() != ".gif"])
             if unread is not None:
                 return [f"{place} has {unread[0]}, which cannot be read; {unread[1]}"]
     return []
 
 
 def _find_unread(files: Sequence[Path]) -> tuple[str, str] | None:
-    """Describe pictures or films among files that cannot be read, and return a remedy; None without any."""
+    """Describe the pictures, or else films, among files that cannot be read, and return a remedy; None without any."""
     counts = Counter(file.suffix.lower() for file in files)
     if num_pictures := sum(counts[ending] for ending in OTHER_SUFFIXES):
         endings = " and ".join(sorted(ending for ending in counts if ending in OTHER_SUFFIXES))
         return f"{num_pictures} {endings}", "convert them to .jpg or .png, and keep their names"
-    return (FILM, _CUT) if any(file.suffix.lower() in FILMS and not is_clip(file) for file in files) else None
+    return (FILM, _CUT_FILM) if any(file.suffix.lower() in FILMS and not is_clip(file) for file in files) else None
 
 
 def is_clip(film: Path) -> bool:
-    """Return whether gsmerge wrote a film, by the end of the file."""
+    """Return whether gsmerge wrote a film, as the last bytes of the file show."""
     end = CLIP_ENDS.get(film.suffix.lower(), b"")
     with suppress(OSError), film.open("rb") as file:
         file.seek(-len(end), os.SEEK_END)
@@ -194,7 +204,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def natural_order(paths: Iterable[PathT]) -> list[PathT]:
-    """Sort paths so that "view 2" comes before "view 10"; paths with equal numbers, as "view 02", by their letters."""
+    """Sort paths so that "view 2" comes before "view 10"; equal numbers, as in "view 02", are sorted as text."""
     return sorted(sorted(paths), key=lambda path: natural_key(os.fspath(path).replace(os.sep, "/")))
 
 
@@ -202,7 +212,8 @@ def find_image(folder: Path, name: str, cameras: Path, *, option: str = "--image
     """Find the image that a file of ``cameras`` names, with or without extension; None if there is none.
 
     SceneError for an image outside the folder, since a camera file from elsewhere could name any picture of this
-    machine; ``remedy``: by default, to name the folder with the ``option``. Links inside the folder are followed.
+    machine. Its remedy is ``remedy``, or by default to name the folder with the ``option``. Links to files inside the
+    folder are followed.
     """
     path = os.path.normpath(os.path.join(folder, name))
     candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]

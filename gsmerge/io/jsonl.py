@@ -15,13 +15,14 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import ReadBudget, parse_json, read_budget, read_errors
 from gsmerge.io.locks import lock_file
 
-LOCK = ".gsmerge-lock"  # beside a file while a line is appended
+LOCK = ".gsmerge-lock"  # name of the lock file beside a file, while a line is appended to it
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
-    """Yield, for each complete line from byte ``start`` on, the position after it and its value (None if damaged).
+    """Yield the position after each complete line in bytes, and its object, from byte ``start`` on.
 
-    A line whose value takes more memory than the file's budget also counts as damaged.
+    The object of a damaged line is None. A line whose object takes more memory than the file's budget counts as
+    damaged, too.
     """
     if not path.exists():
         return
@@ -35,6 +36,7 @@ def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] 
 
 
 def _parse(line: bytes, budget: ReadBudget) -> dict[str, Any] | None:
+    """Return the JSON object of a line; None if the line is damaged."""
     try:
         value = parse_json(line.decode("utf-8"), budget)
     except (ValueError, SceneError):

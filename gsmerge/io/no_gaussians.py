@@ -17,22 +17,23 @@ from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES, list_images
 from gsmerge.io.scene_files import IMAGE_PLACES
 
-MAX_SEARCHED = 100  # folders that are searched in a folder of scenes
-_NAME = "name the .ply of the Gaussians, or the folder that it is in"
+MAX_SEARCHED = 100  # most folders that are searched in a folder of scenes
+_NAME_PLY = "name the .ply of the Gaussians, or the folder that it is in"
 
 
 @dataclass(frozen=True)
 class PointsOnly:
-    """A model or program whose output has no Gaussians, and how to get Gaussians from it or from another program."""
+    """A model or program whose output has no Gaussians, and how the user gets Gaussians in its place."""
 
     title: str  # the name that people use
     files: tuple[str, ...]  # patterns of its output in a folder; one match is enough
     remedy: str
 
 
-_TRAIN = "train Gaussians on it, or name the .ply of a model, and this file with --cameras"
+_TRAIN_OR_NAME = "train Gaussians on it, or name the .ply of a model, and this file with --cameras"
+# Content of a folder of photos, and the remedy
 _PHOTOS = "photos", "make Gaussians from the photos first, with a model such as Depth Anything 3 or AnySplat"
-# They are tried in this order
+# The first row with a matching file counts
 POINTS_ONLY = (
     PointsOnly(
         "Depth Anything 3",
@@ -41,35 +42,35 @@ POINTS_ONLY = (
     ),
     PointsOnly("gsplat's trainer", ("ckpts/ckpt_*.pt",), "run it with its option save_ply"),
     PointsOnly("nerfstudio", ("nerfstudio_models/*.ckpt",), "write Gaussians with ns-export gaussian-splat"),
-    PointsOnly("DA3-Streaming or VGGT-Long", ("camera_poses.txt",), _TRAIN),
-    PointsOnly("FLARE", ("pred.npz",), f"FLARE writes no Gaussians; {_TRAIN}"),
+    PointsOnly("DA3-Streaming or VGGT-Long", ("camera_poses.txt",), _TRAIN_OR_NAME),
+    PointsOnly("FLARE", ("pred.npz",), f"FLARE writes no Gaussians; {_TRAIN_OR_NAME}"),
     PointsOnly(
         "VGGT or MapAnything",
         ("sparse/points.ply", "dense_mesh.glb", "glbscene_*.glb", "predictions.npz", "points.ply"),
-        _TRAIN,
+        _TRAIN_OR_NAME,
     ),
     PointsOnly(
         "COLMAP",
         tuple(f"{folder}cameras.{kind}" for folder in ("sparse/0/", "sparse/", "0/", "") for kind in ("bin", "txt")),
-        _TRAIN,
+        _TRAIN_OR_NAME,
     ),
-    PointsOnly("a model of points", ("*.glb", "*.npz"), _TRAIN),
+    PointsOnly("a model of points", ("*.glb", "*.npz"), _TRAIN_OR_NAME),
 )
 
 
 def no_gaussians(folder: Path) -> SceneError:
-    """Make the error of a folder without a scene: what it contains instead, and what to do."""
+    """Make the error of a folder without a scene, which says what it contains instead, and what to do."""
     try:
         os.scandir(folder).close()
     except OSError as error:
         return SceneError(folder, f"cannot be read ({error.strerror})")
-    content, remedy = _content(folder) or ("", _NAME)
+    content, remedy = _content(folder) or ("", _NAME_PLY)
     problem = "expected a .ply of Gaussians in the folder, found none"
     return SceneError(folder, f"{problem} but {content}" if content else problem, remedy)
 
 
 def find_remedy(folder: Path) -> str:
-    """Return what to do about a folder whose folders have no scene; empty if none of them has known content."""
+    """Say what a folder without scenes, or one of its folders, has instead, and what to do; "" if nothing is known."""
     with suppress(OSError):
         subfolders = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
         contents = [(path, _content(path)) for path in (folder, *islice(subfolders, MAX_SEARCHED))]
@@ -80,22 +81,22 @@ def find_remedy(folder: Path) -> str:
 
 
 def _content(folder: Path) -> tuple[str, str] | None:
-    """Describe the known content of a folder without a .ply, and what to do with it; None if no content is known."""
+    """Describe what a folder without a scene contains, and return a remedy; None if no content is known."""
     files = (
         path
         for path in sorted(folder.glob("[!.]*"))
         if path.is_file() and path.suffix != ".ply" and may_hold_gaussians(path)
     )
-    named = next(files, None)
-    if named is not None:
-        return named.name, "name that file"
+    scene_file = next(files, None)
+    if scene_file is not None:
+        return scene_file.name, "name that file"
     for row in POINTS_ONLY:
         file = next((path for pattern in row.files for path in sorted(folder.glob(pattern))), None)
         if file is not None:
             return f"{file.relative_to(folder).as_posix()} of {row.title}", row.remedy
     points = next((path for path in sorted(folder.glob("[!.]*.ply")) if header_content(path) == "other"), None)
     if points is not None:
-        return f"points or a mesh ({points.name})", _NAME
+        return f"points or a mesh ({points.name})", _NAME_PLY
     foreign = next((path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() in FOREIGN), None)
     if foreign is not None:
         kind, remedy = FOREIGN[foreign.suffix.lower()]

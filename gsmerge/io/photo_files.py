@@ -26,32 +26,35 @@ from gsmerge.runtime.threads import parallel_map, quiet_warnings
 from gsmerge.types import Cameras
 
 _FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads; that of PNG is read here
-# Turn of each orientation tag: quarter turns counterclockwise, plus 4 if the photo is mirrored first
+# Orientation tag -> number of quarter turns counterclockwise, plus 4 if the photo is mirrored first
 _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
-# Of width over height: what models change that round the shorter side of a picture to a multiple of 14: 7 of 350 pixels
+# Relative difference up to which two ratios of width and height are equal. Models that round the shorter side of a
+# picture to a multiple of 14 change it by 7 of 350 pixels
 ASPECT_TOLERANCE = 0.02
+# First and last bytes of a PNG file
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
-_JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of a scan; a progressive JPEG has any number of scans
-_MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
-_COPIES = 2, 3  # of all pixels in memory: with OpenCV, and at most with Pillow and the conversion of its image
-_PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # of a pixel by mode; 4 in all other modes
-_COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10  # of a pixel, while decoding
-# First bytes of a file -> Pillow's plugin; without a plugin for its first format, Pillow imports those of all formats
+_JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # start of a file, and of each of its scans
+_PHOTO_MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
+_COPIES = 2, 3  # copies of all pixels in memory: while OpenCV decodes, and at most while Pillow decodes and converts
+_PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # bytes of a pixel by Pillow's mode; 4 in all other modes
+# Bytes of memory for each pixel while it is decoded
+_COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10
+# First bytes of a file -> Pillow's plugin. It is imported before, since Pillow would else import those of all formats
 _PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp"}
 _CHANNELS = 3  # bytes of a decoded photo's pixel
-# Bytes of a scene's decoded photos that are allowed in any case, and for each byte of the files: even strongly
-# compressed photos have more than 0.03 bytes per pixel
+# Bytes of a scene's decoded photos that are allowed in any case, and in addition for each byte of the files. Even
+# strongly compressed photos have more than 0.03 bytes per pixel
 _FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100
 _SMALLER = "reduce its size: a mask to that of its photo, a photo to about that of its view"
 _BAND = 256  # rows of a mask that are converted at once
-_REDUCTIONS = {  # by which each side is divided -> OpenCV's flag
+_REDUCTIONS = {  # number by which each side is divided -> OpenCV's flag
     1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
 }  # fmt: skip
-_PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
+_PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})  # those that determine the pixels
 
 Size = tuple[int, int]  # width, height, pixels
-Part = tuple[float, float, float, float]  # left, top, right, bottom of a part of a photo, in shares of its sides
+Part = tuple[float, float, float, float]  # left, top, right and bottom of a part of a photo, as shares of its sides
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)  # all of a photo
 _AT_ONCE = 128 << 20  # bytes of decoded photos in memory; if there are more, photos are decoded at each use
 
@@ -114,16 +117,17 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
 
 
 def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size, part: Part = WHOLE) -> PhotoArrays:
-    """Decode a part of the turned photo of each view to ``[h,w,3]`` uint8 of one ``size``; black without a file.
+    """Decode the photo of each view, turn it, and resize a ``part`` of it to ``[h,w,3]`` uint8 of one ``size``.
 
-    If photos are large, they are decoded at each use; else a photo that several views have is decoded once. SceneError
-    as in :func:`decode_images`.
+    A view without a file has a black photo. If photos are large, they are decoded at each use. Otherwise a photo that
+    several views have is decoded once. SceneError as in :func:`decode_images`.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
     _check_together([path for path in paths if path is not None], sum(map(check_file, files)), size)
 
     def decode(view: tuple[Path | None, int]) -> np.ndarray:
+        """Decode the part of one view's photo."""
         path, turn = view
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
@@ -161,7 +165,10 @@ def decode_small(path: Path, side: int) -> np.ndarray:
 def change_photos(
     photos: PhotoArrays, change: Callable[[int, np.ndarray], np.ndarray], size: Size | None = None
 ) -> PhotoArrays:
-    """Apply ``change(index, photo)`` to every photo; a reader applies it at each use. ``size``: size of the results."""
+    """Apply ``change(index, photo)`` to every photo; a reader applies it at each use.
+
+    ``size``: size of the results, if it is not that of the photos.
+    """
     if isinstance(photos, PhotoReader):
         return PhotoReader(len(photos), size or photos.size, lambda photo: change(photo, photos[photo]))
     return parallel_map(lambda photo: change(photo, photos[photo]), range(len(photos)))
@@ -181,7 +188,7 @@ def decode_image(path: Path, size: Size) -> np.ndarray:
 
 
 def as_floats(images: PhotoArrays) -> np.ndarray:
-    """Convert c uint8 images of one size to ``[c,h,w,3]`` float32 in [0, 1]."""
+    """Convert c photos ``[h,w,3]`` uint8 to one array ``[c,h,w,3]`` float32 in [0, 1]."""
     width, height = photo_size(images) or (1, 1)
     out = make_array((len(images), height, width, 3), np.float32)
 
@@ -201,18 +208,18 @@ def photo_size(photos: PhotoArrays) -> Size | None:
 
 
 def photo_array(images: np.ndarray | None) -> np.ndarray:
-    """Return photos ``[c,h,w,3]`` unchanged, or an empty array if there are none."""
+    """Return photos ``[c,h,w,3]`` unchanged, or an empty array in place of None."""
     return NO_IMAGES if images is None else images
 
 
 def part_size(size: Size, part: Part) -> Size:
-    """Return the size of a part of a photo."""
+    """Return the size in pixels of a part of a photo that has a ``size``."""
     left, top, right, bottom = (round(side * share) for side, share in zip(size * 2, part, strict=True))
     return max(1, right - left), max(1, bottom - top)
 
 
 def cut_part(photo: np.ndarray, part: Part) -> np.ndarray:
-    """Return a part of a photo ``[h,w,...]``."""
+    """Cut a part out of a photo ``[h,w,...]``; the result is a view of the photo."""
     width, height = part_size(photo.shape[1::-1], part)
     left, top = round(photo.shape[1] * part[0]), round(photo.shape[0] * part[1])
     return photo[top : top + height, left : left + width]
@@ -224,14 +231,15 @@ def same_shape(size: Size, other: Size) -> bool:
 
 
 def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
-    """Decode the brightness ``[h,w]`` uint8 of a mask, times its opacity; 255 is white.
+    """Decode the brightness ``[h,w]`` of a mask, times its opacity, as uint8 with white as 255.
 
-    White is 1 if no value of the picture exceeds 1. The bytes of the mask and of its ``photo`` together limit the
-    memory, since masks compress to very few bytes.
+    White in the file is 1, 255 or 65,535: the least of these that no value exceeds. The bytes of the mask and of its
+    ``photo`` together limit the memory, since masks compress to very few bytes.
     """
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 
     def brightness(image: Image.Image) -> np.ndarray:
+        """Return the brightness ``[h,w]`` as stored; of 8 bits times the opacity."""
         _check_channels(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
             return np.asarray(image)
@@ -264,6 +272,7 @@ def decode_alpha(path: Path) -> np.ndarray | None:
         return None
 
     def alpha(image: Image.Image) -> Image.Image | None:
+        """Return the channel of opacity; None if the image has none."""
         if "A" not in image.getbands() and "transparency" not in image.info:
             return None
         _check_channels(_photo_budget(path), image)
@@ -276,14 +285,14 @@ def decode_alpha(path: Path) -> np.ndarray | None:
 
 def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
     """Return the budget of a photo or mask that is decoded alone; the bytes of files ``beside`` it count as well."""
-    return ReadBudget(path, sum(map(check_file, (path, *beside))), _MEMORY_PER_BYTE, _SMALLER)
+    return ReadBudget(path, sum(map(check_file, (path, *beside))), _PHOTO_MEMORY_PER_BYTE, _SMALLER)
 
 
 def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
     """Raise SceneError if Pillow needs more memory for an image and one of its channels than the file allows."""
-    pixel = _PILLOW_BYTES.get(image.mode, 4)
-    more = _decoder_bytes(image) + (_PILLOW_WEBP_BYTES if image.format == "WEBP" else 0)
-    num_bytes = max(_COPIES[1] * pixel, pixel + more) * image.width * image.height
+    pixel_bytes = _PILLOW_BYTES.get(image.mode, 4)
+    decoder_bytes = _decoder_bytes(image) + (_PILLOW_WEBP_BYTES if image.format == "WEBP" else 0)
+    num_bytes = max(_COPIES[1] * pixel_bytes, pixel_bytes + decoder_bytes) * image.width * image.height
     budget.check_memory(num_bytes, f"{image.width} x {image.height} pixels")
 
 
@@ -299,7 +308,10 @@ def _decoder_bytes(image: Image.Image) -> float:
 
 
 def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
-    """Decode an image and return the result of ``choose``; SceneError if it cannot be decoded."""
+    """Open an image with Pillow, and return what ``choose`` makes of it as an array; None if that is None.
+
+    SceneError if the image cannot be decoded.
+    """
     size, _ = _read_header(path)  # raises SceneError for a file that is no image or is too large
     try:
         with quiet_warnings():
@@ -317,14 +329,14 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
 
 
 def _undecodable(path: Path, size: Size) -> SceneError:
-    """Make the error of an image that a library did not decode; MemoryError if there was no memory for it."""
+    """Make the error of an image that a library did not decode; raise MemoryError if there is no memory for it."""
     work_bytes = 9  # additional bytes of a pixel while a library decodes it
-    np.empty((_CHANNELS + work_bytes, *size), np.uint8)  # libraries do not say that memory was the reason
+    np.empty((_CHANNELS + work_bytes, *size), np.uint8)  # libraries do not say if memory was the reason
     return _unreadable(path)
 
 
 def _unreadable(path: Path) -> SceneError:
-    """Make the error of a file that is no image; SceneError if it is one in a format that is not read."""
+    """Make the error of a file that is no image; raise another SceneError if its format is known, but not read."""
     refuse_picture(path)
     return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
 
@@ -341,7 +353,7 @@ def image_size(path: Path) -> Size:
 
 
 def _read_header(path: Path) -> tuple[Size, float]:
-    """Read the size of an image, and the bytes of memory for each pixel while it is decoded."""
+    """Read an image's size, and return it with the bytes of memory for each pixel while it is decoded."""
     num_bytes = check_file(path)
     with read_errors(path), path.open("rb") as file:
         (width, height), pixel_bytes = _parse_header(path, file)
@@ -354,7 +366,7 @@ def _read_header(path: Path) -> tuple[Size, float]:
 
 
 def orientation_turn(path: Path) -> int:
-    """Return the turn by a photo's orientation tag, 0 to 7; see :func:`gsmerge.kernels.pictures.turn_picture`."""
+    """Return a photo's orientation by its tag, 0 to 7, as :func:`gsmerge.kernels.pictures.turn_picture` takes it."""
     with read_errors(path), quiet_warnings():
         try:
             with path.open("rb") as file, _open_image(file, (*_FORMATS, "PNG")) as image:
@@ -400,7 +412,7 @@ def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
 def _check_scans(path: Path, data: np.ndarray, size: Size) -> None:
     """Raise SceneError if the scans of a JPEG file, each over all pixels, take longer than its bytes allow."""
     num_scans = data.tobytes().count(_SCAN) if data[:2].tobytes() == _JPEG else 0
-    pixels_per_step = 50_000  # of an empty scan, per step of a budget
+    pixels_per_step = 50_000  # pixels of an empty scan that are decoded in one step of a budget
     steps = num_scans * size[0] * size[1] // pixels_per_step
     ReadBudget(path, len(data)).check_steps(steps, f"steps of decoding {num_scans:,} scans")
 
@@ -446,7 +458,7 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class PhotoTransform:
-    """A resize and then a crop to ``width`` x ``height``: ``u' = scale_x u - left``, ``v' = scale_y v - top``."""
+    """A resize, and then a crop to ``width`` x ``height``: ``u' = scale_x u - left``, ``v' = scale_y v - top``."""
 
     width: int
     height: int
@@ -474,6 +486,7 @@ class PhotoTransform:
         """Resize and crop the uint8 photos ``[h,w,3]``."""
 
         def transform(_: int, image: np.ndarray) -> np.ndarray:
+            """Resize and crop one photo."""
             height, width = image.shape[:2]
             size = round(width * self.scale_x), round(height * self.scale_y)
             shrinks = size[0] * size[1] < width * height
@@ -488,7 +501,7 @@ def limit_size(size: Size, side: int) -> Size:
     if max(size) <= side:
         return size
     scale = side / max(size)
-    width, height = (max(1, round(whole * scale)) for whole in size)
+    width, height = (max(1, round(length * scale)) for length in size)
     return width, height
 
 
@@ -500,5 +513,5 @@ def resize_to(size: Size, to: Size) -> PhotoTransform:
 def resize_and_crop(size: Size, to: Size) -> PhotoTransform:
     """Make the transform that resizes photos in proportion until they cover ``to``, and crops them at the centre."""
     scale = max(to[0] / size[0], to[1] / size[1])
-    width, height = (max(side, round(whole * scale)) for side, whole in zip(to, size, strict=True))
+    width, height = (max(least, round(length * scale)) for least, length in zip(to, size, strict=True))
     return PhotoTransform(*to, width / size[0], height / size[1], (width - to[0]) // 2, (height - to[1]) // 2)

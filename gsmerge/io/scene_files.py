@@ -45,13 +45,13 @@ from gsmerge.types import StrPath
 _CHECK_SCENE_FILE = LazyFunction("gsmerge.io.no_gaussians", "check_scene_file")
 _NO_GAUSSIANS = LazyFunction("gsmerge.io.no_gaussians", "no_gaussians")
 _HOLDS_VIEWS = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
-# The first of these files that exists and is no result is read; otherwise the folder's only .ply
+# The first of these files that exists and is no result is read. Without any, the folder's only .ply is read
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
-# Among several trained scenes in a folder, the scene of the most steps is read. The places are INRIA's and gsplat's
+# Places of trained scenes, of INRIA and of gsplat. If a folder has several, the scene of the most steps is read
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
-SCENES_PLACE = "gaussians"  # DepthSplat and its relatives write NAME.ply there, with the photos in images/NAME
+SCENES_PLACE = "gaussians"  # folder where DepthSplat and its relatives write NAME.ply; the photos are in images/NAME
 IMAGE_PLACES = (
-    "images_resized",  # what WorldMirror saw; tall photos in its images/ are squeezed
+    "images_resized",  # the photos as WorldMirror saw them; tall photos in its images/ are squeezed
     "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
     "keyframes/images",
 )  # fmt: skip
@@ -69,8 +69,8 @@ _PARTS = {"view", "chunk", "part", "block", "tile"}
 _LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, see :func:`level_output`
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 _PACKED = {*SCENE_SUFFIXES} - {".ply"}
-_MAX_HEADERS = 1_000  # headers of a folder's files that are read; further files count as scenes
-_MAX_ENTRIES = 10_000  # largest number of files and folders in these folders
+_MAX_HEADERS = 1_000  # most headers of a folder's files that are read; further files count as scenes
+_MAX_ENTRIES = 10_000  # most files and folders that a search below a folder lists
 
 
 @dataclass(frozen=True)
@@ -78,33 +78,34 @@ class SceneFiles:
     """The files of a scene.
 
     ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if it holds its cameras. ``images`` may be an ``.npz``
-    that holds them. For a ``.gsm`` both are the file itself.
+    that holds images. For a ``.gsm`` both are the ``.gsm`` itself.
     """
 
     ply: Path
     cameras: Path | None
     images: Path | None
     masks: Path | None = None  # a folder
-    protect: Path | None = None  # a folder; never searched
-    more: tuple[SceneFiles, ...] = ()  # other scenes of the same place, each in a frame of its own
+    protect: Path | None = None  # a folder that the caller names, since it is never searched
+    more: tuple[SceneFiles, ...] = ()  # other scenes that show the same place, each in a frame of its own
     parts: tuple[Path, ...] = ()  # all files of a scene in several files, ``ply`` first; empty for a single file
-    num_copies: int = 0  # number of other files in the folder with the same bytes
-    named: frozenset[str] = frozenset()  # names of the fields that the caller gave, which are not searched
-    photo_option: str = "--images"  # names the folder of ``images``
-    # Photos, cameras and masks in the folder above or in its folders, if the scene has none, by option; never read
+    num_copies: int = 0  # number of other files in the folder with the same bytes as ``ply``
+    named: frozenset[str] = frozenset()  # names of the fields that the caller set, so that they are not searched
+    photo_option: str = "--images"  # option with which the user names the folder of ``images``
+    # Options, with paths of photos, cameras and masks in the folder above that a scene without any could use. They are
+    # only noted, and never read
     above: tuple[tuple[str, Path], ...] = ()
     others: tuple[Path, ...] = ()  # further cameras, which are tried in turn if ``cameras`` do not fit
-    below: bool = False  # whether they are in folders below, and are read only if photos show that they fit
+    below: bool = False  # True: ``others`` are in folders below, and are read only if photos show that they fit
     root: Path | None = None  # the scene's own folder
 
     @property
     def plys(self) -> tuple[Path, ...]:
-        """Paths of the Gaussians, in the order of their rows."""
+        """Paths of the files of Gaussians, in the order of their rows."""
         return self.parts or (self.ply,)
 
     @property
     def all_plys(self) -> tuple[Path, ...]:
-        """Paths of the Gaussians of all scenes of the same place, in the order of their rows."""
+        """Paths of the files of Gaussians of all scenes of the same place, in the order of their rows."""
         return tuple(ply for files in (self, *self.more) for ply in files.plys)
 
     @property
@@ -115,17 +116,18 @@ class SceneFiles:
 
     @property
     def choices(self) -> list[SceneFiles]:
-        """The files with each of the cameras that may belong to the scene, in the order in which they are tried.
+        """The scene's files, once with each of the cameras that are tried, in the order of trials.
 
-        Cameras below are those of one folder; if several have cameras, these may be of other scenes.
+        Cameras in folders below are tried only if one folder has them, since those of several may be of other scenes.
         """
         if self.below and len({Path(os.path.relpath(path, self.root)).parts[0] for path in self.others}) > 1:
             return [self]
-        images = None if self.images == self.cameras else self.images  # those inside the cameras' file belong to it
+        # Images inside the file of ``cameras`` belong to these cameras
+        images = None if self.images == self.cameras else self.images
         return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
 
     def describe_choice(self, cameras: Path | None) -> list[str]:
-        """Note which cameras are read if others were tried before, or are COLMAP models beside them; name those."""
+        """Note which cameras are read; the note names others that were tried before, or COLMAP models beside them."""
         paths = list(filter(None, (self.cameras, *self.others)))
         if cameras is None or not self.others:
             return []
@@ -153,7 +155,7 @@ class SceneFiles:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes that several files are read as one scene, and on cameras and photos outside its folder."""
+        """Notes on several files that are read as one scene, and on cameras and photos outside the scene's folder."""
         notes = []
         if self.num_copies:
             notes.append(f"{self.num_copies + 1} files have the same bytes; {self.ply.name} is read")
@@ -186,26 +188,27 @@ def find_scene_files(
     These folders are searched in this order:
 
     - the given folder;
-    - the folder of the ``.ply``, and those above it up to the given folder; the folder above it if its own is
-      ``gs_ply/``, ``ply/`` or ``gaussians/``, or two above it if its own is ``point_cloud/iteration_n/``;
+    - the folder of the ``.ply``, and the folders above it up to the given folder. If the folder of the ``.ply`` is
+      ``gs_ply/``, ``ply/`` or ``gaussians/``, also the folder above it. If it is ``point_cloud/iteration_n/``, also the
+      folder two above it;
     - for cameras and photos, the folder of the file to which the ``.ply`` links;
-    - for cameras and photos, the folders above it up to ``within``;
-    - for cameras, if these have none, the folders below the first of them.
+    - for cameras and photos, the folders above the ``.ply`` up to ``within``;
+    - for cameras, if none of these folders has any, the folders below the first of them.
 
-    A folder that has Gaussians of its own is a scene, and no file in it belongs to another scene. Masks lie beside the
-    photos that are read, or in the first two of these folders.
+    A folder that has Gaussians of its own is a scene, and no file in it belongs to another scene. Masks are searched
+    beside the photos that are read, and in the first two kinds of these folders.
 
     In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
     their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, but come last if they
-    may not be its own. Of COLMAP's models in one place, the one with the most images comes first. Cameras inside the
-    ``.ply`` precede those beside it. If no place has cameras,
-    the only file of any name that holds cameras is taken. Without it, cameras of a program whose files are not read are
-    taken, so that the reader says so. Images inside the cameras' ``.npz`` take precedence over a folder,
-    because the model saw these. A result of gsmerge is taken as the scene only if a folder has nothing else.
+    may be those of another file. Of COLMAP's models in one place, the one with the most images comes first. Cameras
+    inside the ``.ply`` precede those beside it. If no place has cameras, the only file of any name that holds cameras
+    is taken. Without such a file, cameras of a program whose files are not read are taken, so that the reader says so.
+    Images inside the cameras' ``.npz`` take precedence over a folder, because the model saw these. A result of gsmerge
+    is taken as the scene only if a folder has nothing else.
 
     Raises:
-        SceneError: If there is no ``.ply``, or several to choose from, or if a named file does not exist. Several files
-            are one scene if they are numbered views or parts, see ``docs/reference/formats.md``.
+        SceneError: If there is no ``.ply``, if there are several to choose from, or if a named file does not exist.
+            Numbered files of views or parts are one scene, see ``docs/reference/formats.md``.
     """
     path, given = Path(path), {"cameras": cameras, "images": images, "masks": masks}
     if images is not None and images != NONE:
@@ -247,9 +250,10 @@ def find_scene_files(
 
 
 def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, list[Path], bool]:
-    """Find the cameras of a scene, in the order of precedence of :func:`find_scene_files`; None without.
+    """Find the cameras of a scene, by the precedence that :func:`find_scene_files` states; None if there are none.
 
-    Also list others beside the scene, or if there are none, in the folders below, and return whether these are below.
+    Also return a list of further cameras, and whether these are in folders below the scene. Folders below are searched
+    only if there are no cameras beside the scene.
     """
     of_result = result_cameras(ply)
     if of_result is not None and _count_signs(ply) == 2:
@@ -257,7 +261,7 @@ def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, l
     known = dict.fromkeys(
         path for root in roots for path in list_cameras(root) if not _is_in_other_scene(path, root, ply)
     )
-    # Cameras that are tried in turn; folders in which they are searched below a scene
+    # Most cameras that are tried in turn, and most folders below a scene that are searched for them
     max_cameras, max_folders = 8, 100
     cameras = [*islice(known, max_cameras)] or [*filter(None, map(find_other_cameras, roots))][:1]
     if cameras:
@@ -268,14 +272,14 @@ def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, l
 
 
 def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
-    """Find the images of a scene: inside its cameras' file, or in a folder; None without."""
+    """Find the images of a scene, inside the file of its cameras or in a folder; None if there are none."""
     if cameras is not None and (cameras.suffix == STATE_ENDING or (cameras.suffix == ".npz" and holds_images(cameras))):
         return cameras
     return _find_pictures("images", IMAGE_PLACES, roots, ply)
 
 
 def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], ply: Path) -> Path | None:
-    """Find the first folder with pictures, none of them of another scene, in ``places`` of the ``roots``."""
+    """Find the first of the ``places`` in ``roots`` that has pictures, none of them of another scene."""
     folders = [(root, f) for root in roots for place in places if can_be_listed(f := root / place, option)]
     # If a folder has several scenes, each may have its own folder of pictures
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
@@ -287,7 +291,7 @@ def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], pl
 
 
 def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
-    """Return whether a path is, or lies in, a folder below ``root`` that has Gaussians of its own, others than ``ply``.
+    """Return whether a path is, or lies in, a folder below ``root`` that has Gaussians, but not ``ply``.
 
     Such a folder is a scene, to which all its files belong.
     """
@@ -309,9 +313,10 @@ def can_be_listed(folder: Path, option: str) -> bool:
 
 
 def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Path], ...]:
-    """Find the photos, cameras and masks that a scene lacks in the folder above its own, ``roots``.
+    """Find the photos, cameras and masks that a scene lacks in the folder above its own folders, ``roots``.
 
-    Files of a neighbouring scene belong to that one, and masks have the names of the scene's photos.
+    Files of a neighbouring scene do not count, and masks only if they have the names of the scene's photos. Returns
+    each option with its path.
     """
     folder = min(filter(Path(os.path.realpath(files.ply)).is_relative_to, roots), default=roots[0]).parent
     places = dict[str, Path | None]()
@@ -324,7 +329,7 @@ def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Pa
             )
         masks = _find_pictures("masks", MASK_PLACES, [folder], files.ply)
         if masks and files.images and files.masks is None and "masks" not in files.named:
-            match_masks(masks, [*map(str, list_images(files.images))])  # SceneError without a name of a photo
+            match_masks(masks, [*map(str, list_images(files.images))])  # SceneError if no mask has the name of a photo
             places["masks"] = masks
     return tuple((option, path) for option, path in places.items() if path is not None and path not in roots)
 
@@ -356,16 +361,16 @@ def _list_between(folder: Path, top: Path) -> list[Path]:
 
 
 def scene_title(ply: Path) -> str:
-    """Name a scene for a page: by its file, or by its folder if its program gives the same name to all files."""
+    """Return a scene's name for a page: that of its file, or of its folder if its program names all files alike."""
     path = ply.absolute().with_name(ply.stem.removesuffix(".compact")).as_posix()
     return Path(_USUAL_END.sub("", path)).name or ply.stem
 
 
 def result_cameras(ply: Path) -> Path | None:
-    """Find the cameras that gsmerge wrote beside a result; None without.
+    """Find the cameras that gsmerge wrote beside a result; None if there are none.
 
-    A level of detail has the cameras of the result to which it belongs, if it has none of its own. They belong to a
-    result of the same name beside a ``.ply`` of another program: to ``scene.sog`` beside ``scene.ply``.
+    A level of detail without cameras has those of the result to which it belongs. Cameras do not belong to a ``.ply``
+    of another program if a result beside it has the same name, such as ``scene.sog`` beside ``scene.ply``.
     """
     names = ply.name, _LEVEL.sub("", ply.name)
     beside = (viewer_cameras_path(ply.with_name(name)) for name in names)
@@ -374,10 +379,10 @@ def result_cameras(ply: Path) -> Path | None:
 
 
 def _count_signs(ply: Path) -> int:
-    """Count the signs that the cameras of a file's name are its own, 0 to 2.
+    """Count the signs, 0 to 2, that ``NAME.cameras.json`` has the cameras of the file called NAME.
 
-    The signs are that gsmerge wrote it, and that no other file of Gaussians has this name. A result has both, and so
-    has a file of another format, whose header does not say what it is.
+    One sign is that gsmerge wrote the file. The other is that no other file of Gaussians has this name. A result has
+    both, and so has a file of another format than ``.ply``, whose header does not say what it is.
     """
     if find_format(ply).ending != ".ply" or header_content(ply) == "result":
         return 2
@@ -398,9 +403,9 @@ def named_path(path: StrPath | None) -> Path | None:
 
 
 def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
-    """Find the files of a folder's only scene, as :func:`find_scene_files`; several files are its parts, in order.
+    """Find the files of a folder's only scene; several files are its parts, in order.
 
-    If all files have the same bytes, the first is returned.
+    If all files have the same bytes, only the first is returned. Errors are those of :func:`find_scene_files`.
     """
     plys = list_plys(folder)
     if len(plys) == 1:
@@ -429,7 +434,7 @@ def _are_numbered(plys: Sequence[Path]) -> bool:
 
 
 def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
-    """Make the error of a folder with several files, which may be scenes, moments of a scene, or its parts."""
+    """Make the error of a folder with several files, which may be scenes, or moments or parts of one scene."""
     places = {path.parent for path in plys}
     start = places.pop() if len(places) == 1 else folder
     problem = f"expected one .ply file in the folder, found {len(plys)}"
@@ -445,7 +450,7 @@ def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
 def list_plys(folder: Path) -> list[Path]:
     """List the files that may be a folder's scene.
 
-    The first of these that is there is listed:
+    These are the files of the first kind that the folder has:
 
     1. the file with a usual name, or else all others in the folder;
     2. files in ``gaussians/``;
@@ -467,26 +472,28 @@ def list_plys(folder: Path) -> list[Path]:
 
 
 def _plys_in(folder: Path) -> list[Path]:
+    """List the file with a usual name in a folder, or else all its other files that may be scenes."""
     named = named_ply(folder)
     return other_plys(folder) if named is None else [named]
 
 
 def list_folders(folder: Path) -> list[tuple[Path, list[str]]]:
-    """List a folder and those below it, down to a limited depth, with the names of their files, the nearest first.
+    """List a folder and those below it, down to a limited depth, each with the names of its files, the nearest first.
 
-    Folders that have Gaussians, and belong to those, are left out, and masks, held-out views, and folders of too many
-    entries.
+    These folders are left out: scenes, which have Gaussians of their own, and what is below them; masks; held-out
+    views; and folders with too many entries.
     """
     return [(place, names) for place, names in _walk_down(folder, links=True) if names is not None]
 
 
 def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | None]]:
-    """Walk down from a folder as :func:`list_folders`; None in place of the names for a folder that is a scene.
+    """List folders as :func:`list_folders` does, and also scenes, which have None in place of the names of files.
 
-    ``links``: follow links to folders. Without them, nothing is found if there are too many entries.
+    ``links``: True follows links to folders, and leaves out folders with too many entries. False lists nothing at all
+    if there are too many entries.
     """
     found, places, num_entries = list[tuple[Path, list[str] | None]](), [(folder, 0)], 0
-    max_depth = 3  # of the folders that are searched below a folder without a scene
+    max_depth = 3  # most levels of folders that are searched below a folder without a scene
     for place, depth in places:  # the loop appends to this list
         with suppress(OSError), os.scandir(place) as scan:
             if depth and _plys_in(place):
@@ -506,10 +513,10 @@ def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | Non
 
 
 def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
-    """Return the files that are views or parts of one scene, ordered by number; None if they are several scenes.
+    """Return files that are views or parts of one scene, ordered by number; None if they are several scenes.
 
-    They are parts if their names say so, or if there are as many cameras as files. Files that hold a camera are
-    several scenes, each in its own frame.
+    They are of one scene if their names say so, or if there are as many cameras as files. Files that hold cameras are
+    several scenes, each in its own frame. SceneError if a part is missing.
     """
     matches = [_NUMBERED.fullmatch(path.name) for path in plys]
     names = {match[1].lower() if match else "" for match in matches}
@@ -529,7 +536,8 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
 
 
 def _has_own_camera(path: Path) -> bool:
-    with suppress(SceneError):  # the reader of the part reports it
+    """Return whether a ``.ply`` holds its camera; False if that is damaged."""
+    with suppress(SceneError):  # the reader of the file reports the damage
         return read_sharp_camera(path) is not None
     return False
 
@@ -544,7 +552,7 @@ def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
 
 
 def named_ply(folder: Path) -> Path | None:
-    """Find the scene with a usual name in a folder; among trained scenes, the scene of the most steps. None without."""
+    """Find the scene with a usual name in a folder, or else the trained scene of the most steps; None without any."""
     for place in PLY_PLACES:
         if (folder / place).is_file() and _is_scene(folder / place):
             return folder / place
@@ -555,7 +563,7 @@ def named_ply(folder: Path) -> Path | None:
 
 
 def other_plys(folder: Path) -> list[Path]:
-    """List the ``.ply`` files directly in a folder that may be scenes: no results of gsmerge, no point clouds.
+    """List the ``.ply`` files directly in a folder that may be scenes, since they are neither results nor point clouds.
 
     If there are none, list the only file of another format.
     """
@@ -566,6 +574,6 @@ def other_plys(folder: Path) -> list[Path]:
 
 
 def _is_scene(path: Path) -> bool:
-    """Return whether a file may be a scene, because neither its name nor its header shows a result or a point cloud."""
+    """Return whether a ``.ply`` may be a scene, because neither name nor header shows a result or a point cloud."""
     is_other = path.name in _POINT_CLOUDS or _RESULT.search(path.name)
     return not is_other and header_content(path) == "Gaussians"

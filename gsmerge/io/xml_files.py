@@ -1,7 +1,7 @@
 """Read XML within the budget of its file: without entities and namespaces, and with only some attributes.
 
-The memory of the library's own parser is not limited by the size of the file. It copies the address of a namespace into
-each tag's name, and a million attributes of one tag take thirty times their bytes.
+The parser of Python's library may take far more memory than the file has bytes. It copies the address of a namespace
+into each tag's name, and a million attributes of one tag take thirty times their bytes.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from gsmerge.io.bounds import read_budget, read_text
 
 
 def read_xml(path: Path, attributes: Collection[str]) -> Element:
-    """Read a file with the given ``attributes`` of its elements; SceneError if it is no XML, or too large.
+    """Read an XML file, whose elements keep only ``attributes``; SceneError if it is no XML, or too large.
 
-    Names keep their prefixes. A document type is refused, since its entities could make a short text endless.
+    Names keep the prefixes of their namespaces. A document type is refused, since its entities could make a short text
+    endless.
     """
     text, builder, parser = read_text(path), TreeBuilder(), expat.ParserCreate()
     budget = read_budget(path)
     element_bytes, attribute_bytes = 200, 330  # most bytes of memory for each "<" and "=" of a file
     budget.check_memory(element_bytes * text.count("<") + attribute_bytes * text.count("="), "XML")
 
-    def start(tag: str, own: Mapping[str, str]) -> None:
-        builder.start(tag, {name: own[name] for name in attributes if name in own})
+    def start(tag: str, stored: Mapping[str, str]) -> None:
+        builder.start(tag, {name: stored[name] for name in attributes if name in stored})
 
     def refuse(*_: object) -> None:
         raise SceneError(path, "expected XML without a document type, found <!DOCTYPE", "remove that line")

@@ -211,7 +211,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
     "SECURITY.md": (
         f"{bounds._FREE_MEMORY / 1e6:g} MB + {bounds._MEMORY_PER_BYTE} x its bytes of memory",
         f"{20e-6 * bounds._FREE_STEPS:g} s + {20 / bounds._BYTES_PER_STEP:g} s per MB of processor time",
-        f"64 MB + {photo_files._MEMORY_PER_BYTE} x its bytes",
+        f"64 MB + {photo_files._PHOTO_MEMORY_PER_BYTE} x its bytes",
         f"{photo_files._FREE_PHOTOS / 1e6:g} MB + {photo_files._PHOTOS_PER_BYTE} x their bytes",
     ),
     "docs/results.md": (

@@ -1,4 +1,4 @@
-"""The cameras of a file, the conventions of formats, and photos without lens distortion."""
+"""The cameras of a file: check and convert them, and undistort their photos."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
 from gsmerge.values.arguments import check_arguments
 
-# Limits of numbers in poses and intrinsics, sides and focal lengths. No camera exceeds them, and larger numbers would
-# overflow in later steps
+# Largest number in poses and intrinsics, largest side of an image, and smallest focal length, in pixels. No camera
+# exceeds these limits, and other numbers would overflow in later steps
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # turns OpenGL's camera axes (y up, z backward) to OpenCV's (y down, z forward)
 
-# A principal point is in the middle if twice it differs by at most these pixels from the image's size
+# A principal point is in the middle if its double differs by at most these pixels from the image's size
 CENTRED_PX = 1e-3
-PATCH_SIDE = 14  # sides of vision transformers' inputs are multiples of it
-_WHOLE = 1e-3  # pixels; tolerance of a side that is a whole number
-MAX_NORMALISED_FOCAL = 10.0  # a longer focal length is in pixels, and no image is that small
+PATCH_SIDE = 14  # the sides of vision transformers' inputs are multiples of it, in pixels
+_WHOLE_PX = 1e-3  # a side counts as whole if it differs from a whole number by less than these pixels
+MAX_NORMALISED_FOCAL = 10.0  # longest focal length in sides of the image; a longer one is in pixels
 
-# Orders of the Gaussians' rows that a camera file may name
+# Orders of the Gaussians' rows that a camera file may state
 ORDERS: tuple[str, ...] = get_args(Order)
-# How a format stores poses: direction of the matrix, and axes of the camera
+# How a format stores poses: the direction of the matrix, and the axes of the camera
 Convention = tuple[str, str]
 W2C_OPENCV: Convention = ("world-to-camera", "OpenCV")
 C2W_OPENCV: Convention = ("camera-to-world", "OpenCV")
@@ -40,13 +40,13 @@ W2C_OPENGL: Convention = ("world-to-camera", "OpenGL")
 C2W_OPENGL: Convention = ("camera-to-world", "OpenGL")
 CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
-COEFFICIENTS = {  # names of a lens's coefficients, in order
+COEFFICIENTS = {  # names of the coefficients of each model of lens, in order
     "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 # Smallest share of an undistorted photo's pixels that lie within the photo. A lens with k1 = 1 / r^2, where r is half
-# of the image's diagonal, is stronger than any real lens and still has a third
-_MIN_SHARE = 0.25
+# of the image's diagonal, is stronger than any real lens, and a third of its undistorted photo still lies within
+_MIN_INSIDE = 0.25
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Lens:
 
     name: str  # as the camera file calls the model
     model: Literal["perspective", "fisheye"]  # as ``cv2.undistort`` (radial, tangential), or ``cv2.fisheye``
-    coefficients: tuple[float, ...]  # the first of COEFFICIENTS; further coefficients are 0
+    coefficients: tuple[float, ...]  # values of the first of COEFFICIENTS; those of all others are 0
 
 
 def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients: Sequence[float]) -> Lens | None:
@@ -71,18 +71,18 @@ class CameraFile:
     viewmats: np.ndarray  # ``[c,4,4]`` world to camera, OpenCV axes, float64
     Ks: np.ndarray  # ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5)
     widths: np.ndarray  # ``[c]`` int64, pixels; 0 if unknown, 1 if unknown and the intrinsics are relative to it
-    heights: np.ndarray  # the same
+    heights: np.ndarray  # likewise
     names: tuple[str, ...]  # image names as the file gives them
-    source: str  # the format's name
+    source: str  # name of the format
     convention: Convention = W2C_OPENCV  # how the format stores poses
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty if the file holds no images
-    order: str = "auto"  # order of the Gaussians' rows; "auto" if the file does not name it
+    order: str = "auto"  # order of the Gaussians' rows; "auto" if the file does not state it
     lenses: tuple[Lens | None, ...] = ()  # of each camera, None for a pinhole; empty if all are pinholes
-    masks: Mapping[str, str] = field(default_factory=dict)  # names of images -> of their masks, if the file has them
-    has_intrinsics: bool = True  # False if the file has poses alone; `Ks` are then placeholders
-    # Size of the photos, and the transform of these photos to the cameras' size; None before the photos are known
+    masks: Mapping[str, str] = field(default_factory=dict)  # name of an image -> name of its mask
+    has_intrinsics: bool = True  # False: the file has only poses, and `Ks` are placeholders
+    # Size of the photos, and the transform that gives them the cameras' size; None before the photos are known
     photo_map: tuple[Size, PhotoTransform] | None = None
-    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for none, if the cameras were estimated from the rows
+    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for none; None unless cameras were estimated from rows
     pixel_ids: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -93,7 +93,7 @@ class CameraFile:
 
 
 def drop_repeats(file: CameraFile) -> CameraFile:
-    """Drop views with the name, pose and intrinsics of an earlier view, unless the file holds images or pixel ids."""
+    """Drop views with name, pose and intrinsics of an earlier view; keep all if the file has images or pixel ids."""
     keys = [
         (name, viewmat.tobytes(), K.tobytes())
         for name, viewmat, K in zip(file.names, file.viewmats, file.Ks, strict=True)
@@ -117,11 +117,11 @@ class StoredView(NamedTuple):
 
     name: str  # of its image
     pose: np.ndarray  # 3x4 or 4x4, in the file's convention
-    # ``[3,3]`` intrinsics in pixels, or in all views divided by the image's size; None in all views without any
+    # ``[3,3]`` intrinsics: of all views in pixels, or of all views divided by the image's size, or of all views None
     K: np.ndarray | None
     size: tuple[int, int] = (0, 0)  # (width, height), pixels; 0 where unknown
     lens: Lens | None = None  # None for a pinhole
-    mask: str = ""  # name of its image's mask
+    mask: str = ""  # name of its image's mask; "" without one
 
 
 def make_pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
@@ -139,9 +139,9 @@ def make_camera_file(
 ) -> CameraFile:
     """Make a camera file from poses in any convention: convert them to OpenCV world-to-camera, and check them.
 
-    Intrinsics that are small enough in all views to be divided by the image's size become pixels. ``images [c,h,w,3]``
-    and the ``order`` of rows are given if the file holds them. SceneError if there is no camera, a number is infinite
-    or too large, a rotation is not orthonormal, or a focal length is not positive.
+    If the intrinsics of all views are so small that they must be divided by the image's size, they become pixels.
+    ``images [c,h,w,3]`` and the ``order`` of rows are those that the file holds. SceneError if there is no camera, a
+    number is infinite or too large, a rotation is not orthonormal, or a focal length is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
@@ -215,7 +215,7 @@ def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray
     """Multiply intrinsics that are relative to the image size by that size; an unknown size counts as 1 x 1."""
     is_relative = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
     is_relative &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
-    # in a picture of a few pixels a focal length in pixels is as small as a relative one
+    # In a picture of a few pixels, a focal length in pixels is as small as a relative one
     if not is_relative.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
         return Ks, sizes
     sizes = [size if min(size) > 0 else (1, 1) for size in sizes]
@@ -223,7 +223,7 @@ def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray
 
 
 def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> None:
-    """Raise SceneError if a pose ``[4,4]`` or intrinsics ``[3,3]`` are impossible."""
+    """Raise SceneError if the pose ``[4,4]`` or the intrinsics ``[3,3]`` of a view are impossible."""
     if not (np.isfinite(pose).all() and np.isfinite(K).all()):
         raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
     largest = max(np.abs(pose).max(), np.abs(K).max())
@@ -243,7 +243,7 @@ def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> N
 
 def is_orthonormal(axes: np.ndarray) -> bool:
     """Return whether axes ``[3,3]`` are orthonormal up to rounding, mirrored or not."""
-    max_rotation_error = 0.02  # of the entries of R R^T
+    max_rotation_error = 0.02  # largest error of an entry of R R^T
     return bool(np.abs(matmul(axes, axes.T) - np.eye(3)).max() <= max_rotation_error)
 
 
@@ -251,7 +251,7 @@ def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -
     """Raise SceneError if intrinsics ``[3,3]`` in pixels do not fit an image of (width, height)."""
     if min(size) <= 1:  # not known
         return
-    # Largest focal length and principal point, in longer sides of the image
+    # Largest focal length and principal point, in units of the longer side of the image
     max_focal_sides, max_centre_sides = 1e5, 1e3
     for quantity, pixels, max_sides in (
         ("a focal length", max(K[0, 0], K[1, 1]), max_focal_sides),
@@ -278,13 +278,13 @@ def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
 
 
 def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFile:
-    """Reinterpret the poses of a file in another convention."""
+    """Return cameras whose stored poses are read in another convention."""
     stored = from_viewmats(camera_file.viewmats, camera_file.convention)
     return replace(camera_file, viewmats=to_viewmats(stored, convention), convention=convention)
 
 
 def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
-    """Select views by their ids, in that order."""
+    """Return the cameras of some views, in the order of ``view_ids``."""
     ids = list(view_ids)
     lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
     arrays = {name: getattr(cameras, name)[ids] for name in ("viewmats", "Ks", "widths", "heights")}
@@ -294,6 +294,7 @@ def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
 
 
 def _stored_sizes(camera_file: CameraFile) -> list[tuple[int, int]]:
+    """List the different (width, height) of a file's cameras, with (0, 0) or (1, 1) for unknown sizes."""
     return sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
 
 
@@ -303,10 +304,10 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> CameraFile:
-    """Set the size of cameras without a size to twice their principal point, if photos have clearly another size.
+    """Set the size of cameras without a size to twice their principal point, if photos clearly have another size.
 
-    ``size`` is (width, height) of the photos. The new size must have the shape of the photos. Fractional sides are
-    rounded to multiples of ``PATCH_SIDE``, since the inputs of networks have such sides.
+    ``size`` is (width, height) of the photos. Cameras stay unchanged if the new size has not the shape of the photos.
+    Fractional sides are rounded to multiples of ``PATCH_SIDE``, since the inputs of networks have such sides.
     """
     if size is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file
@@ -316,7 +317,7 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     has_photo_shape = float(ratios.max()) < (1 + min_difference) * float(ratios.min())
     if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > min_difference).all():
         return camera_file
-    step = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH_SIDE
+    step = 1 if (np.abs(sides - sides.round()) < _WHOLE_PX).all() else PATCH_SIDE
     widths, heights = (np.full(len(camera_file), step * round(side / step)) for side in sides.tolist())
     return replace(camera_file, widths=widths, heights=heights)
 
@@ -359,7 +360,7 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFile, PhotoArrays, list[str]]:
     """Undistort photos, and make their cameras pinholes with the same intrinsics; also return a note.
 
-    SceneError if a lens is not a pinhole and photos are missing or of another shape, or if most of an undistorted photo
+    SceneError if a lens has distortion but photos are missing or of another shape, or if most of an undistorted photo
     would lie outside of the photo.
     """
     if not camera_file.lenses:
@@ -377,7 +378,7 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
     Ks = to_cameras(pinholes, size).Ks
     for view, K, lens in zip(camera_file.names, Ks, camera_file.lenses, strict=True):
         share = 1.0 if lens is None else _share_inside(K, lens, size)
-        if lens is not None and share < _MIN_SHARE:
+        if lens is not None and share < _MIN_INSIDE:
             coefficients = zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False)
             nonzero = ", ".join(f"{key} = {coefficient:g}" for key, coefficient in coefficients if coefficient)
             problem = f"view {view}: expected {lens.name} coefficients of a lens, found {nonzero}, with which"
@@ -396,12 +397,13 @@ def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
 
 
 def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> PhotoArrays:
-    """Undistort photos to those of pinholes with the same intrinsics; borders repeat the nearest pixels.
+    """Return the photos that pinholes with the same intrinsics would take; pixels outside repeat the nearest ones.
 
     ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` are for their size, with the top-left pixel's centre at (0.5, 0.5).
     """
 
     def undistort(view: int, photo: np.ndarray) -> np.ndarray:
+        """Undistort the photo of one view."""
         lens = lenses[view]
         if lens is None:
             return photo
@@ -412,7 +414,7 @@ def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens 
 
 
 def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each pixel of a pinhole image its x and y ``[h,w]`` float32 in the image of the lens."""
+    """Return where each pixel of a pinhole image is in the image of the lens: x and y, each ``[h,w]`` float32."""
     centred = K.astype(np.float64).copy()
     centred[:2, 2] -= 0.5  # OpenCV has the top-left pixel's centre at (0, 0)
     coefficients = np.pad(lens.coefficients, (0, len(COEFFICIENTS[lens.model]) - len(lens.coefficients)))
@@ -422,7 +424,7 @@ def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np
 
 
 def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: float) -> list[dict[str, Any]]:
-    """List the name, rotation in degrees, and shift of the centre as a share of ``depth`` for each view.
+    """List for each view its name, its rotation in degrees, and the shift of its centre as a share of ``depth``.
 
     ``start`` and ``end`` are viewmats ``[v,4,4]``; ``depth`` is that of the scene, in the same unit.
     """
@@ -435,7 +437,7 @@ def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: 
 
 
 def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
-    """Describe the mean and the largest of camera moves in words."""
+    """Describe the mean and the largest of the moves of :func:`list_moves` in words."""
     angles, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
     mean, largest = (
         f"{reduce(angles):.2g} degrees and {100 * reduce(shifts):.3g} % of the depth" for reduce in (np.mean, max)

@@ -1,4 +1,4 @@
-"""Arguments and results of camera readers: a file whose content is read once, and cameras before conversion."""
+"""What camera readers take and return: a file whose content is read once, and cameras before their conversion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class CameraSource:
     """A camera file or folder, whose content is read once, at the first use."""
 
     path: Path
-    folder: Path | None = None  # of the Gaussians, beside which some models write how they moved the cameras
+    folder: Path | None = None  # folder of the Gaussians, where some models write how they moved the cameras
 
     @cached_property
     def json(self) -> Any:
@@ -58,17 +58,17 @@ def check_objects(path: Path, entries: Sequence[Any], place: str = "the file") -
 
 
 class StoredCameras(NamedTuple):
-    """Cameras as a file stores them, before conversion."""
+    """Cameras as a file stores them, before their conversion."""
 
     views: list[StoredView]
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
-    order: str = "auto"  # of the Gaussians' rows
-    convention: Convention | None = None  # as the numbers show; None: the format's convention
+    order: str = "auto"  # order of the Gaussians' rows
+    convention: Convention | None = None  # the convention that the numbers show; None: that of the format
 
 
 @contextmanager
 def number_errors(path: Path, expected: str) -> Iterator[None]:
-    """Raise SceneError with the file and what was expected if the block meets a missing key or a wrong value."""
+    """Convert errors of the block about missing keys and wrong values to a SceneError that begins with ``expected``."""
     try:
         yield
     except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError) as error:
@@ -76,7 +76,7 @@ def number_errors(path: Path, expected: str) -> Iterator[None]:
 
 
 def to_number(value: Any) -> float:
-    """Convert a JSON number; TypeError for true, false and null, ValueError for other text."""
+    """Convert a JSON number; TypeError for true, false and null, ValueError for text that is no number."""
     if isinstance(value, bool):
         raise TypeError(f"found {str(value).lower()}")
     return float(value)
@@ -91,7 +91,7 @@ def to_array(values: Any) -> np.ndarray:
 
 
 def convert_value(function: Callable[[Any], Any], key: str, value: Any) -> Any:
-    """Convert the value of a key; ValueError that begins with the key if the value is wrong."""
+    """Convert the value of a key by ``function``; if it is wrong, ValueError that begins with the key."""
     try:
         return function(value)
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:

@@ -1,4 +1,4 @@
-"""COLMAP models: ``cameras`` and ``images`` as text or binary, without points, rigs and frames."""
+"""Read the cameras of COLMAP models, as text or binary; points, rigs and frames are not read."""
 
 from __future__ import annotations
 
@@ -19,32 +19,38 @@ from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.first_bytes import read_start
 
-# Number of parameters of each model, in the order of the models' ids; the first are focal lengths and principal point
+# Camera model -> its number of parameters, in the order of ids. The first parameters are focal lengths, then the
+# principal point
 _NUM_PARAMS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
 }  # fmt: skip
-_NAMES = dict(enumerate(_NUM_PARAMS))
+_MODEL_NAMES = dict(enumerate(_NUM_PARAMS))  # id -> name
+# Models with one focal length for both axes
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
-_FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
-_PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
+_FISHEYE_MODELS = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_PERSPECTIVE_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 
-MAX_NAME = 1 << 16  # bytes of an image's name
+MAX_NAME = 1 << 16  # most bytes of an image's name
 
-_MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # in a camera's line
-_MAX_DIGITS = 18  # in a whole number
-_WHOLE = re.compile(rf"[+-]?[0-9]{{1,{_MAX_DIGITS}}}([.]0*)?")
+_MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # most words in the line of a camera
+_MAX_DIGITS = 18  # most digits of a whole number
+_WHOLE_NUMBER = re.compile(rf"[+-]?[0-9]{{1,{_MAX_DIGITS}}}([.]0*)?")
 
 _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
 
 def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
-    """Read the cameras of a COLMAP model in the order of its images; SceneError if it is damaged or unknown."""
+    """Read the views of a COLMAP model in the order of its images; ``suffix``: ``.bin`` or ``.txt``.
+
+    SceneError if the model is damaged, or if a camera model or a camera is unknown.
+    """
     folder = source.path
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     try:
         if suffix == ".bin":
-            with camera_path.open("rb") as file:  # not mapped: a mapped file that is cut short would end the process
+            # Files are not mapped, since a mapped file that becomes shorter ends the process
+            with camera_path.open("rb") as file:
                 cameras = _binary_cameras(camera_path, file)
             with image_path.open("rb") as file:
                 images = _binary_images(image_path, file)
@@ -73,13 +79,13 @@ def count_images(folder: Path) -> int:
     return 0
 
 
-def _numbers(file: BinaryIO, form: str) -> tuple[Any, ...]:
-    """Read the next numbers of a file; struct.error at its end."""
+def _read_numbers(file: BinaryIO, form: str) -> tuple[Any, ...]:
+    """Read the next numbers of a file by their ``struct`` format; struct.error at the end of the file."""
     return struct.unpack(form, file.read(struct.calcsize(form)))
 
 
-def _name(file: BinaryIO) -> str:
-    """Read text up to its zero byte."""
+def _read_name(file: BinaryIO) -> str:
+    """Read a name, which ends with a zero byte; ValueError if it has no end."""
     name = b""
     name_part = 64  # bytes of a name that are read at a time
     while b"\0" not in name:
@@ -102,52 +108,55 @@ def _pose(numbers: list[float]) -> np.ndarray:
     return np.concatenate([rotation, np.array(numbers[4:7])[:, None]], 1)
 
 
-def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> StoredView:
-    if model not in _PERSPECTIVE | _FISHEYE:
+def _make_view(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> StoredView:
+    """Make a view of a camera, without name and pose; SceneError if the camera model is not supported."""
+    if model not in _PERSPECTIVE_MODELS | _FISHEYE_MODELS:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
         raise SceneError(path, problem, "undistort the images first")
     one_focal = model in _ONE_FOCAL
     K = make_pinhole(params[0], *params[:3]) if one_focal else make_pinhole(*params[:4])
     distortion = params[3 if one_focal else 4 : _NUM_PARAMS[model]]
-    lens = make_lens(model, "fisheye" if model in _FISHEYE else "perspective", distortion)
+    lens = make_lens(model, "fisheye" if model in _FISHEYE_MODELS else "perspective", distortion)
     return StoredView("", np.eye(4), K, size if lens else _size_of(K, size), lens)
 
 
 def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
     """Return the image size that intrinsics belong to: the stored size, or the size of WorldMirror 1's input.
 
-    WorldMirror 1 writes intrinsics for the model's input, but the size of the photos. The size of the input is twice
-    the principal point. It is a whole number, smaller than the photos, and has their shape.
+    WorldMirror 1 writes intrinsics for its input, but the size of the photos. Twice the principal point is then the
+    size of the input: whole numbers, clearly smaller than the photos, in the same ratio.
     """
     sides = 2 * K[:2, 2]
     ratio_x, ratio_y = sides / np.maximum(size, 1)
-    max_difference = 0.01  # images have one shape if the ratios of both sides differ relatively by at most this
+    max_difference = 0.01  # two images have the same shape if the ratios of their sides differ by at most this share
     has_photo_shape = abs(ratio_x - ratio_y) <= max_difference * abs(ratio_x)
-    smaller_ratio = 0.9  # an image is the model's smaller input if the ratio of the sides is below this
+    smaller_ratio = 0.9  # the size is that of a smaller input if the ratio of the sides is below this
     is_input = has_photo_shape and ratio_x < smaller_ratio and (sides == np.rint(sides)).all()
     return (int(sides[0]), int(sides[1])) if is_input else size
 
 
 def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
-    (count,) = _numbers(file, "<Q")
+    """Read ``cameras.bin``: the id of each camera -> its view, without name and pose."""
+    (count,) = _read_numbers(file, "<Q")
     check_camera_count(path, count)
     cameras = {}
     for _ in range(count):
-        camera_id, model_id, width, height = _numbers(file, "<iiQQ")
-        model = _NAMES.get(model_id, f"model {model_id}")
-        params = list(_numbers(file, f"<{_NUM_PARAMS.get(model, 0)}d"))
-        cameras[camera_id] = _camera(path, camera_id, model, (width, height), params)
+        camera_id, model_id, width, height = _read_numbers(file, "<iiQQ")
+        model = _MODEL_NAMES.get(model_id, f"model {model_id}")
+        params = list(_read_numbers(file, f"<{_NUM_PARAMS.get(model, 0)}d"))
+        cameras[camera_id] = _make_view(path, camera_id, model, (width, height), params)
     return cameras
 
 
 def _binary_images(path: Path, file: BinaryIO) -> list[_Image]:
-    (count,) = _numbers(file, "<Q")
+    """Read ``images.bin``, and skip the points of each image."""
+    (count,) = _read_numbers(file, "<Q")
     check_camera_count(path, count)
     images = []
     for _ in range(count):
-        _, *numbers, camera = _numbers(file, "<i7di")
-        name = _name(file)
-        (num_points,) = _numbers(file, "<Q")
+        _, *numbers, camera = _read_numbers(file, "<i7di")
+        name = _read_name(file)
+        (num_points,) = _read_numbers(file, "<Q")
         if file.tell() + 24 * num_points > os.fstat(file.fileno()).st_size:
             raise ValueError("early end of file")
         file.seek(24 * num_points, os.SEEK_CUR)
@@ -156,10 +165,12 @@ def _binary_images(path: Path, file: BinaryIO) -> list[_Image]:
 
 
 def _has_content(line: str) -> bool:
+    """Return whether a line is neither empty nor a comment."""
     return line.strip()[:1] not in ("", "#")
 
 
 def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
+    """Parse the lines of ``cameras.txt``; the result is that of :func:`_binary_cameras`."""
     cameras: dict[int, StoredView] = {}
     for line in filter(_has_content, lines):
         check_camera_count(path, len(cameras) + 1)
@@ -167,14 +178,15 @@ def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
         if len(params) != _NUM_PARAMS.get(model, len(params)) or max(len(width), len(height)) > _MAX_DIGITS:
             raise ValueError("wrong number of parameters, or digits")
         size = int(width), int(height)
-        cameras[int(camera_id)] = _camera(path, int(camera_id), model, size, [float(p) for p in params])
+        cameras[int(camera_id)] = _make_view(path, int(camera_id), model, size, [float(p) for p in params])
     return cameras
 
 
 def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredView]) -> list[_Image]:
-    """Parse the lines of the images: a pose, and a name that may have spaces. A line of points may follow each.
+    """Parse the lines of ``images.txt``; the result is that of :func:`_binary_images`.
 
-    Programs that rewrite ``images.txt`` drop the lines of points, or only those that are empty.
+    The line of an image has a pose, and a name that may have spaces. A line of points follows it, unless a program that
+    rewrote the file dropped all lines of points, or the empty ones.
     """
     images: list[_Image] = []
     after_image = False
@@ -192,12 +204,12 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredV
 
 
 def _lists_points(line: str, cameras: Mapping[int, StoredView]) -> bool:
-    """Return whether the line after an image lists its points, x y id each, and is not another image."""
+    """Return whether the line after an image lists its points, each as x, y and an id, and is no other image."""
     start = line.split(maxsplit=9)
-    if len(start) < 3 or not all(_WHOLE.fullmatch(number) for number in start[2:9:3]):
+    if len(start) < 3 or not all(_WHOLE_NUMBER.fullmatch(number) for number in start[2:9:3]):
         return False
-    if len(start) < 10 or not _WHOLE.fullmatch(start[0]) or int(float(start[8])) not in cameras:
+    if len(start) < 10 or not _WHOLE_NUMBER.fullmatch(start[0]) or int(float(start[8])) not in cameras:
         return True
     quat = np.array(start[1:5], np.float64)
-    not_unit = 0.05  # four numbers are no quaternion if their length differs from 1 by more than this
+    not_unit = 0.05  # four numbers are no quaternion if their norm differs from 1 by more than this
     return bool(abs(np.sqrt((quat * quat).sum()) - 1) > not_unit)

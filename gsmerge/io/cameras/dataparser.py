@@ -1,4 +1,4 @@
-"""Read how programs moved cameras into the Gaussians' world: nerfstudio's map, or an offset of surveys."""
+"""Read how programs moved cameras into the Gaussians' world: by nerfstudio's map, or by an offset of surveys."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from gsmerge.io.cameras.camera_file import MAX_NUMBER, make_similarity
 from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number
 from gsmerge.kernels.matrices import invert, matmul
 
-DATAPARSER = "dataparser_transforms.json"
+DATAPARSER = "dataparser_transforms.json"  # nerfstudio's name of the file with its map
+# Three numbers that are alone in a line, an element or brackets
 _OFFSET = re.compile(r"(?:^|[>:=(])\s*N[\s,;]+N[\s,;]+N\s*(?:$|[<)])".replace("N", r"([-+]?\d+\.?\d*)"), re.MULTILINE)
 
 
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
-    """Read the similarities that nerfstudio may have applied to the cameras: candidates to be measured.
+    """Read the similarities that nerfstudio, or a survey, may have applied to the cameras; the caller tries them.
 
-    Nerfstudio's ``dataparser_transforms.json`` has the map into the Gaussians' world: X' = scale (transform [X; 1]).
-    ``transform`` starts from the world of the capture. A ``transforms.json`` with ``applied_transform`` (and
-    ``applied_scale``) has poses that were moved by these already, so the second candidate undoes them. Empty if
-    there is no such file. SceneError if a file lacks a rotation, shift and positive scale.
+    Nerfstudio's ``dataparser_transforms.json`` has the map from the world of the capture into that of the Gaussians:
+    X' = scale (transform [X; 1]). If a ``transforms.json`` has an ``applied_transform`` (and ``applied_scale``), its
+    poses have been moved by this already, so a second candidate first undoes it. Without nerfstudio's file, offsets of
+    surveys are read. SceneError if nerfstudio's map is not a rotation, a shift and a positive scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
@@ -34,29 +35,30 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
         return _read_offsets(folders)
     data = read_json(path)
     with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
-        transform = _square(data["transform"])
+        transform = _to_square(data["transform"])
         scale = to_number(data["scale"])
     candidates = [make_similarity(path, transform, scale)]
     camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
     if isinstance(camera_data, dict) and "applied_transform" in camera_data:
         with number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
-            applied = _square(camera_data["applied_transform"])
+            applied = _to_square(camera_data["applied_transform"])
             factor = to_number(camera_data.get("applied_scale") or 1)
             candidates.append(make_similarity(path, matmul(transform, invert(applied)), scale / factor))
     return candidates
 
 
 def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
-    """Read offsets that surveys subtract from coordinates in metres: three numbers alone in a small text or XML file.
+    """Return moves by the offsets that surveys subtract from coordinates, in metres.
 
-    Metashape and CloudCompare have them in text files, and DJI Terra in metadata.xml. The cameras are moved by each
-    offset in both directions, since either side may be without it.
+    An offset is three numbers that are alone in a line or element of a small file. Metashape and CloudCompare write it
+    into text files, and DJI Terra into metadata.xml. There is a move in both directions for each offset, since it may
+    be missing in the cameras or in the Gaussians.
     """
-    offset_endings, max_offsets = (".txt", ".xml", ".xyz"), 8  # of files that may have an offset, and how many are read
+    offset_endings, max_offsets = (".txt", ".xml", ".xyz"), 8  # endings of files with offsets; most files that are read
     paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in offset_endings})
     small = [path for path in paths if path.is_file() and os.access(path, os.R_OK) and path.stat().st_size <= 1 << 12]
-    found = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:max_offsets]]
-    offsets = {tuple(map(float, numbers.groups())): name for name, numbers in found if numbers is not None}
+    matches = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:max_offsets]]
+    offsets = {tuple(map(float, numbers.groups())): name for name, numbers in matches if numbers is not None}
     return [
         Similarity(
             np.eye(3), 1.0, sign * np.array(offset), f"moved by {'minus ' if sign < 0 else ''}the offset in {name}"
@@ -67,7 +69,8 @@ def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
     ]
 
 
-def _square(values: Any) -> np.ndarray:
+def _to_square(values: Any) -> np.ndarray:
+    """Convert the rows of a matrix 3x4 or 4x4 to ``[4,4]``, whose last row is 0 0 0 1; ValueError for others."""
     matrix = to_array(values)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.all(np.abs(matrix) < MAX_NUMBER):
         raise ValueError(f"found shape {list(matrix.shape)}, or numbers that are not finite")

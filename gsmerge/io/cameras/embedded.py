@@ -1,4 +1,4 @@
-"""Cameras inside a ``.ply``: the elements of SHARP."""
+"""Read the camera that SHARP writes into its ``.ply`` as elements."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.formats.table import PLY, find_format
 
-SHARP = "SHARP"  # ``source`` of these cameras
-_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first versions lack the last
+SHARP = "SHARP"  # ``source`` of this camera
+_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first versions do not write the last
 
 
 def read_sharp(source: CameraSource) -> StoredCameras | None:
-    """Read the camera that SHARP writes into its ``.ply``, at the size of the grid of Gaussians; None without one.
+    """Read the camera of SHARP in a ``.ply``, with the size of the grid of Gaussians; None without one.
 
-    The grid is square, because SHARP stretches photos of any shape to a square. SceneError if the numbers are damaged.
+    The grid is square, because SHARP stretches photos of any shape to a square. SceneError if the numbers of the camera
+    are damaged.
     """
     if find_format(source.path).read is not PLY.read:
         return None
@@ -28,13 +29,13 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
     for element in (data[name] for name in present):
         if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
             return None
-    with np.errstate(all="ignore"):  # NaN are refused with the cameras
+    with np.errstate(all="ignore"):  # the check of all cameras refuses NaN
         numbers = {name: np.asarray([row[0] for row in data[name].data], np.float64) for name in present}
     extrinsic, intrinsic, size = numbers["extrinsic"], numbers["intrinsic"], numbers.get("image_size", np.zeros(0))
-    if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions: focal lengths and size
+    if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions write focal lengths and size
         focal_lengths, size = intrinsic[:2], intrinsic[2:]
         intrinsic = make_pinhole(*focal_lengths, *(size / 2)).reshape(-1)
-    sharp_layers = 2  # Gaussians in each cell of the grid: a front and a back layer
+    sharp_layers = 2  # Gaussians in each cell of the grid, of a front and a back layer
     side = round((data["vertex"].count / sharp_layers) ** 0.5)
     if sharp_layers * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
         return None
@@ -42,7 +43,7 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
         problem = f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}"
         raise SceneError(source.path, problem)
     pose, K = extrinsic.reshape(-1, 4).copy(), intrinsic.reshape(3, 3)
-    if len(extrinsic) == 12:  # first versions: the rotation column by column
+    if len(extrinsic) == 12:  # first versions write the rotation column by column
         pose[:, :3] = pose[:, :3].T.copy()
     K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
     return StoredCameras([StoredView(source.path.stem, pose, K, (side, side))])

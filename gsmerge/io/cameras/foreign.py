@@ -1,4 +1,4 @@
-"""Places of camera files that are read, and programs whose cameras are not read, with the export to use instead."""
+"""List the places of camera files, and the programs whose cameras are not read, with the export to use instead."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ class Foreign(NamedTuple):
     files: str  # patterns of their names, separated by spaces
     program: str
     remedy: str  # the export of the program that is read
-    start: str = ""  # regular expression that is found in the first bytes of its files, in which $ ends any line
+    start: str = ""  # regular expression that the first bytes of its files contain; ^ and $ are ends of lines
 
 
-INTRINSICS = "intrinsic.txt"  # of DA3-Streaming, beside its poses
-_DEPTH, _MAX_PATHS = 3, 10_000  # limits of the search for files of PROGRAMS: levels of folders, and paths
-_WRITE = "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
-_MODEL = f"name the COLMAP model that it was made from, or {_WRITE}"
+INTRINSICS = "intrinsic.txt"  # file of intrinsics beside the poses of DA3-Streaming
+_DEPTH, _MAX_PATHS = 3, 10_000  # most levels of folders, and most paths, that are searched for files of PROGRAMS
+_WRITE_POSES = (
+    "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
+)
+_MODEL = f"name the COLMAP model that it was made from, or {_WRITE_POSES}"
 _NUMBER = r"[-+.\deE]+"
 _NERFSTUDIO = "`ns-process-data {}` of nerfstudio makes a transforms.json of it"
 _KAPTURE = "kapture_import_{}.py and kapture_export_colmap.py of kapture make a COLMAP model of it"
@@ -34,8 +36,8 @@ _REALITY = "RealityScan or RealityCapture", "export its registration as COLMAP, 
 _OPENMVS = "{}InterfaceCOLMAP of OpenMVS make a COLMAP model of it"
 _ODM = "ODM", "name its opensfm/reconstruction.json"
 _OPENMVG = "OpenMVG", "openMVG_main_openMVG2Colmap makes a COLMAP model of it"
-# The first existing place is read; of the COLMAP models that match a pattern, the one with the most images. A model
-# directly in the folder comes last, because Depth Anything 3 puts a model there at the photos' own size
+# Cameras in earlier places are preferred, and of the COLMAP models that match a pattern, the one with the most images.
+# A model directly in the folder comes last, because Depth Anything 3 writes one there at the photos' own size
 CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
     "cameras.json", "camera_params.json", "sparse/*", "sparse", "colmap/sparse/*", "colmap",
@@ -43,6 +45,7 @@ CAMERA_PLACES = (
     "camera_poses.txt", "keyframes/corrected_cameras", "keyframes/cameras", "reconstruction.json",
     "opensfm/reconstruction.json", "cameras.xml", "[0-9]*", ".",
 )  # fmt: skip
+# The first row that matches a file counts
 PROGRAMS = (
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
     Foreign("*.psx *.psz", "Metashape", "File > Export > Export Cameras writes the .xml that is read"),
@@ -63,25 +66,25 @@ PROGRAMS = (
     Foreign("cameras*.npz", "IDR, NeuS or DTU", _MODEL, "(world|scale|camera)_mat"),
     Foreign("metadata.json *.r3d", "Record3D", _NERFSTUDIO.format("record3d"), '^PK|"(poses|perFrameIntrinsicCoeffs)"'),
     Foreign("*.vrs *_loop_trajectory.csv", "Project Aria", _NERFSTUDIO.format("aria")),
-    Foreign("*.sens", "ScanNet", _WRITE),
-    Foreign("pose/*.txt poses/*.txt", "ScanNet, NSVF or SRN", _WRITE, rf"\A({_NUMBER}\s+){{3,15}}{_NUMBER}\s*$"),
+    Foreign("*.sens", "ScanNet", _WRITE_POSES),
+    Foreign("pose/*.txt poses/*.txt", "ScanNet, NSVF or SRN", _WRITE_POSES, rf"\A({_NUMBER}\s+){{3,15}}{_NUMBER}\s*$"),
     Foreign("*.txt", "TUM, ORB-SLAM or MonST3R", "its timestamps may be those of no photo: keep the pose nearest in"
             " time to each photo, with associate.py of TUM, and turn these with `evo_traj tum` of evo and its option"
             " save_as_kitti into lines of 12 numbers, which are read with one photo for each",
             rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
-    Foreign("*.txt", "RealEstate10K", _WRITE, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
+    Foreign("*.txt", "RealEstate10K", _WRITE_POSES, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
     Foreign("*.torch", "a chunk of RealEstate10K", "write the cameras and photos of its scene into views.npz"
             " (docs/reference/formats.md)"),
-    Foreign("*.log", "Open3D or Tanks and Temples", _WRITE, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),
-    Foreign("*.traj", "ARKitScenes", _WRITE), Foreign("*.jgz", "CO3D", _WRITE),
-    Foreign("*.json", "Open3D", _WRITE, '"PinholeCamera'),
-    Foreign("*.json", "3D Scanner App", _WRITE, '"cameraPoseARFrame"'),
-    Foreign("camera/*.json", "Nerfies", _WRITE, '"(orientation|principal_point)"'),
-    Foreign("*_par.txt *.conf", "Middlebury or Matterport", _WRITE, r"^\s*\d+\s|^dataset"),
-    Foreign("*.out *.mve/meta.ini", "MVE", _WRITE, "drews|MVE view"),
-    Foreign("*.csv", "EuRoC's body", _WRITE, "#(timestamp|time)"),
-    Foreign("camera/*.npz poses.npz", "CUT3R or Spann3R", _WRITE, "pose"),
-    Foreign("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _WRITE),
+    Foreign("*.log", "Open3D or Tanks and Temples", _WRITE_POSES, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),
+    Foreign("*.traj", "ARKitScenes", _WRITE_POSES), Foreign("*.jgz", "CO3D", _WRITE_POSES),
+    Foreign("*.json", "Open3D", _WRITE_POSES, '"PinholeCamera'),
+    Foreign("*.json", "3D Scanner App", _WRITE_POSES, '"cameraPoseARFrame"'),
+    Foreign("camera/*.json", "Nerfies", _WRITE_POSES, '"(orientation|principal_point)"'),
+    Foreign("*_par.txt *.conf", "Middlebury or Matterport", _WRITE_POSES, r"^\s*\d+\s|^dataset"),
+    Foreign("*.out *.mve/meta.ini", "MVE", _WRITE_POSES, "drews|MVE view"),
+    Foreign("*.csv", "EuRoC's body", _WRITE_POSES, "#(timestamp|time)"),
+    Foreign("camera/*.npz poses.npz", "CUT3R or Spann3R", _WRITE_POSES, "pose"),
+    Foreign("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _WRITE_POSES),
     Foreign("*.json", "a path of nerfstudio's viewer, or ns-export", "name the transforms.json of the capture",
            r'"camera_path"\s*:|^\[\s*\{[^{}]*"transform"\s*:'),
     Foreign("*.psht", "Postshot", "name the cameras that were loaded into it"),
@@ -90,7 +93,7 @@ PROGRAMS = (
 
 
 def check_program(place: Path) -> None:
-    """Raise SceneError, with the export to use instead, if a path is, or contains, a file of :data:`PROGRAMS`."""
+    """Raise SceneError, with the export to use instead, if a path is or contains a file of :data:`PROGRAMS`."""
     if (path := find_unread(place)) is not None:
         foreign = next(foreign for foreign in PROGRAMS if _is_of(path, foreign))
         problem = f"expected cameras of a supported format, found those of {foreign.program}"
@@ -98,7 +101,7 @@ def check_program(place: Path) -> None:
 
 
 def find_unread(place: Path) -> Path | None:
-    """Find a file of :data:`PROGRAMS`: the path itself, or a file below this folder that is in no scene's folder."""
+    """Find a file of :data:`PROGRAMS`: the path itself, or one below this folder, but not in the folder of a scene."""
     paths = (path for depth in range(_DEPTH) for path in place.glob("*/" * depth + "[!.]*"))
     files = sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]
     scenes = {p.parent for p in files if p.suffix == ".ply" and p.parent != place and header_content(p) == "Gaussians"}
@@ -107,5 +110,6 @@ def find_unread(place: Path) -> Path | None:
 
 
 def _is_of(path: Path, foreign: Foreign) -> bool:
+    """Return whether a path is a file of a program, by its name and its first bytes."""
     has_name = any(map(path.match, foreign.files.split())) and path.is_file()
     return has_name and re.search(foreign.start, read_start(path).decode("latin-1"), re.MULTILINE) is not None

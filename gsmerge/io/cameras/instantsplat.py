@@ -1,4 +1,4 @@
-"""Read the optimised poses of InstantSplat, beside INRIA's ``cameras.json`` with the first poses."""
+"""Read the optimised poses of InstantSplat, which are beside a ``cameras.json`` with the first poses."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from gsmerge.kernels.matrices import invert
 
 
 def take_optimised_poses(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
-    """Replace poses by the optimised poses of InstantSplat's last iteration.
+    """Replace the poses of views by the optimised poses of InstantSplat's last iteration.
 
-    Views are returned unchanged if InstantSplat wrote no such poses, or optimised other first poses than the file has.
+    Views stay unchanged if InstantSplat wrote no such poses, or if it started from other poses than the file has.
     """
     paths = (source.path.parent / "pose").glob("ours_*/pose_optimized.npy")
     last_path = max(paths, key=lambda path: natural_key(path.parent.name), default=None)
@@ -27,7 +27,7 @@ def take_optimised_poses(source: CameraSource, views: list[StoredView]) -> list[
         first_poses, poses = invert(original)[:, :3], invert(optimised)[:, :3]
     except np.linalg.LinAlgError:
         return views
-    same_pose = 1e-4  # tolerance of numbers in two files with the same poses
+    same_pose = 1e-4  # largest difference of numbers in two files with the same poses, absolute and relative
     if not np.allclose([view.pose for view in views], first_poses, rtol=same_pose, atol=same_pose):
         return views
     return [view._replace(pose=pose) for view, pose in zip(views, poses, strict=True)]

@@ -1,4 +1,4 @@
-"""Move Long-LRM's cameras into the world of its Gaussians, by the list of frames that it writes beside these."""
+"""Move Long-LRM's cameras into the world of its Gaussians, by its list of frames beside the Gaussians."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsmerge.io.bounds import MAX_VIEWS, read_text
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors
 
-FRAMES_FILE = "input_frame_idx.txt"  # which frames the model took
+FRAMES_FILE = "input_frame_idx.txt"  # lists the frames that the model saw
 
 
 def is_long_lrm(source: CameraSource) -> bool:
@@ -22,10 +22,10 @@ def is_long_lrm(source: CameraSource) -> bool:
 
 
 def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
-    """Select the frames that the model took, and move them into the Gaussians' world, which is their mean pose.
+    """Select the views that the model saw, and move them into the Gaussians' world, the frame of their mean pose.
 
-    ``input_frame_idx.txt`` lists the frames. It is beside the Gaussians, or was copied beside the cameras. Without it
-    all views are returned unchanged. SceneError if it has wrong numbers, or a frame does not exist.
+    ``input_frame_idx.txt`` lists these frames. It is beside the Gaussians, or was copied to the cameras. Without it,
+    all views are returned unchanged. SceneError if it has wrong numbers, or names a frame that does not exist.
     """
     folder = source.path.parent
     if source.folder is not None and not (folder / FRAMES_FILE).is_file():
@@ -40,7 +40,7 @@ def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[Sto
 
 
 def _frame_ids(path: Path, count: int) -> list[int]:
-    """Read which of ``count`` frames the model took; empty without the file."""
+    """Read which of ``count`` frames the model saw; empty without the file."""
     words = read_text(path).replace(",", " ").split(maxsplit=MAX_VIEWS) if path.is_file() else []
     if len(words) > MAX_VIEWS:
         raise SceneError(path, f"expected at most {MAX_VIEWS} numbers, found more")

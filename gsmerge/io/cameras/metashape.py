@@ -1,4 +1,4 @@
-"""Read the cameras of Metashape's ``.xml``, and the map to the world of its other exports."""
+"""Read the cameras of Metashape's ``.xml``."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component
 
 
 def list_metashape_cameras(source: CameraSource) -> list[Entry]:
-    """List the cameras of the largest component, each with its sensor."""
+    """List the cameras of the largest component, each with the values of its sensor."""
     path = source.path
     root, cameras = _largest_component(path)
     sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
-    values: dict[str | None, dict[str, Any]] = {}  # by the id of the sensor
+    values: dict[str | None, dict[str, Any]] = {}  # id of a sensor -> its values
     entries = []
     for camera in cameras:
         name, sensor_id = camera.get("label") or "", camera.get("sensor_id")
@@ -59,7 +59,7 @@ def _sensor_values(sensor: Element) -> dict[str, Any]:
 
 
 def _largest_component(path: Path) -> tuple[Element, list[Element]]:
-    """Parse a file, and list the cameras with a pose of the component with most of these cameras."""
+    """Parse a file; return its root, and the cameras with a pose in the component that has most of these."""
     root = read_xml(path, _ATTRIBUTES)
     cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
     check_camera_count(path, len(cameras))

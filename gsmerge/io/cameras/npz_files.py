@@ -1,9 +1,9 @@
-"""Cameras in ``.npz``: ``results.npz`` of Depth Anything 3, and ``views.npz`` of any model.
+"""Read cameras from ``.npz`` files: ``results.npz`` of Depth Anything 3, and ``views.npz`` of any model.
 
-A user writes ``views.npz`` out of a running model that saves no cameras (``examples/04_dump_views.py``). It has
+A user whose model saves no cameras can write ``views.npz`` while it runs (``examples/04_dump_views.py``). It has
 ``c2w [v,4,4]`` (or 3x4; OpenCV axes), ``K [v,3,3]`` (pixels of the processed images, or divided by their size),
-``images [v,h,w,3]`` as the network saw them (uint8, or float in [0, 1]; also ``[v,3,h,w]``), and ``order``, the
-order of the rows of the ``.ply``, where it is known.
+``images [v,h,w,3]`` as the network saw them (uint8, or float in [0, 1]; also ``[v,3,h,w]``), and ``order``, which is
+the order of the rows of the ``.ply`` if it is known.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.photo_files import PhotoArrays
 from gsmerge.runtime.threads import quiet_warnings
 
-_LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of the arrays' names in ``cameras.npz`` of Lyra 2's scripts
+# Names of arrays in the files of several programs; those of Lyra 2's scripts end with one of three words
+_LYRA = ("recon_sampled", "da3", "da3_pred")
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
-_EQUAL_INTRINSICS = 1e-5  # relative tolerance
-_MAX_HEADER = 1 << 16  # bytes of an array's header
+_MAX_HEADER = 1 << 16  # most bytes of an array's header
 _KINDS = "biufU"  # NumPy's kinds of arrays that are read: numbers and text
 
 
@@ -42,27 +42,27 @@ def is_da3(path: Path) -> bool:
 
 
 def read_da3(source: CameraSource) -> StoredCameras:
-    """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
+    """Read the cameras of an npz, and its images if it has any; poses are 3x4 or 4x4, world to camera.
 
-    Intrinsics are scaled to the depth maps if they are divided by the size, or if they are for another image size, as
-    after a COLMAP export in the same call. The function also reads ``cameras.npz`` of Lyra 2, and the outputs of VGGT
-    (``extrinsic``, world to camera) and AnySplat (camera to world, intrinsics divided by the size, in a batch of one).
-    SceneError if the file cannot be read or lacks an array.
+    Intrinsics are in pixels. If they are divided by the size, or are for another image size, as after a COLMAP export
+    in the same call, they are scaled to the images or depth maps. The function also reads ``cameras.npz`` of Lyra 2,
+    and the outputs of VGGT (``extrinsic``, world to camera) and AnySplat (camera to world, intrinsics divided by the
+    size, in a batch of one). SceneError if the file cannot be read or lacks an array.
     """
     path = source.path
-    size_names = () if holds_images(path) else _DEPTHS  # depths are read for their shape alone
+    size_names = () if holds_images(path) else _DEPTHS  # only the shape of depth maps is used
     arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *size_names})
     poses, Ks, images, depths = (
         next((arrays[name] for name in names if name in arrays), None)
         for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS)
     )
     if poses is None:
-        raise _missing(path, [n for n, a in (("extrinsics", poses), ("intrinsics", Ks)) if a is None], arrays)
+        raise _missing_arrays(path, [n for n, a in (("extrinsics", poses), ("intrinsics", Ks)) if a is None], arrays)
     poses = poses[0] if poses.ndim == 4 and len(poses) == 1 else poses
     Ks = Ks[0] if Ks is not None and Ks.ndim == 4 and len(Ks) == 1 else Ks
     _check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
     photos: PhotoArrays = ()
-    pixels = depths  # an array of all pixels, for their number
+    pixels = depths  # an array whose shape gives the size of the views
     if images is not None:
         photos = pixels = _as_images(path, images, len(poses))
     Ks = None if Ks is None else Ks.astype(np.float64)
@@ -73,8 +73,8 @@ def read_da3(source: CameraSource) -> StoredCameras:
     elif Ks is not None:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # AnySplat divides intrinsics by the size
-        return StoredCameras(_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
-    return StoredCameras(_views(poses, Ks, (width, height)), photos)
+        return StoredCameras(_make_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
+    return StoredCameras(_make_views(poses, Ks, (width, height)), photos)
 
 
 def read_dump(source: CameraSource) -> StoredCameras:
@@ -83,14 +83,14 @@ def read_dump(source: CameraSource) -> StoredCameras:
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
     missing = [name for name in ("c2w", "images") if name not in arrays]
     if missing:
-        raise _missing(path, missing, arrays)
+        raise _missing_arrays(path, missing, arrays)
     poses, Ks = arrays["c2w"], arrays.get("K")
     _check_poses(path, poses, Ks, ("c2w [v,4,4]", "K [v,3,3]"))
     images = _as_images(path, arrays["images"], len(poses))
     order = str(arrays.get("order", "auto"))
     if order not in ORDERS:
         raise SceneError(path, f"expected 'order' to be one of {', '.join(ORDERS)}, found {order[:40]!r}")
-    return StoredCameras(_views(poses, Ks, (images.shape[2], images.shape[1])), images, order)
+    return StoredCameras(_make_views(poses, Ks, (images.shape[2], images.shape[1])), images, order)
 
 
 def holds_images(path: Path) -> bool:
@@ -104,16 +104,21 @@ def holds_poses(path: Path) -> bool:
     return {"c2w", "K"} <= names or not (names.isdisjoint(_EXTRINSICS) or names.isdisjoint(_INTRINSICS))
 
 
-def _missing(path: Path, missing: list[str], arrays: dict[str, np.ndarray]) -> SceneError:
+def _missing_arrays(path: Path, missing: list[str], arrays: dict[str, np.ndarray]) -> SceneError:
+    """Make the error of an npz with other ``arrays``, in which those called ``missing`` are missing."""
     return SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
 
 
-def _views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int]) -> list[StoredView]:
+def _make_views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int]) -> list[StoredView]:
+    """Make views of one size, called "view 0", "view 1" and so on."""
     return [StoredView(f"view {i}", pose, None if Ks is None else Ks[i], size) for i, pose in enumerate(poses)]
 
 
 def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tuple[str, str]) -> None:
-    """Raise SceneError unless arrays are c poses and intrinsics ``[c,3,3]`` of finite numbers, called ``names``."""
+    """Raise SceneError unless arrays are c poses and intrinsics ``[c,3,3]`` of finite numbers.
+
+    ``names``: what the two arrays are called in errors.
+    """
     Ks = np.zeros((*poses.shape[:1], 3, 3)) if Ks is None else Ks
     for name, array in zip(names, (poses, Ks), strict=True):
         if array.dtype.kind not in "fiu":
@@ -122,13 +127,16 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tu
     if not is_list or Ks.shape != (len(poses), 3, 3):
         raise SceneError(path, f"expected {names[0]} and {names[1]}, found {poses.shape} and {Ks.shape}")
     check_camera_count(path, len(poses))
-    max_intrinsic = 1e12  # pixels; this refuses NaN and infinity, too
+    max_intrinsic = 1e12  # pixels; the comparison also refuses NaN and infinity
     if not (np.isfinite(poses).all() and np.all(np.abs(Ks.astype(np.float64)) < max_intrinsic)):
         raise SceneError(path, f"expected finite numbers in {names[0]} and {names[1]}, found NaN or inf")
 
 
 def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
-    """Convert images ``[c,h,w,3]`` or ``[c,3,h,w]``, uint8 or [0, 1], to ``[c,h,w,3]`` uint8; NaN become black."""
+    """Convert images ``[c,h,w,3]`` or ``[c,3,h,w]``, as uint8 or in [0, 1], to ``[c,h,w,3]`` uint8.
+
+    NaN become black. ``count``: the number of poses. SceneError if the images have another number or shape.
+    """
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
     if images.ndim != 4 or images.shape[0] != count or images.shape[3] != 3:
@@ -140,19 +148,23 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
         return np.ascontiguousarray(images)
     read_budget(path).check_memory(images.nbytes + images.size, "images")
     out = np.empty(images.shape, np.uint8)
-    for row in range(images.shape[1]):  # row by row, because the floats of a row take little memory
+    for row in range(images.shape[1]):  # row by row, so that floats take little memory
         out[:, row] = np.round(np.nan_to_num(np.clip(images[:, row], 0, 1).astype(np.float32)) * 255)
     return out
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Scale intrinsics to an image size. These networks assume that the principal point is in the middle."""
+    """Scale intrinsics to an image size, if they are for another size.
+
+    The networks assume that the principal point is in the middle, so twice this point is the size of the intrinsics.
+    """
     size = np.array([width, height])
-    least_centre = 1e-9  # smaller principal points are raised to this, because they are divisors
+    least_centre = 1e-9  # smaller principal points are raised to this, since they divide below
     ratio = 2 * np.maximum(Ks[:, :2, 2], least_centre) / size
     normalised = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 0, 2] < 2) & (width > 10)
-    max_ratio_difference, min_size_difference = 0.03, 0.1  # relative: of two axes' ratios, and of two sizes
-    # If the ratios of both axes are equal and not 1, intrinsics are for another size; else the principal point is off
+    max_ratio_difference, min_size_difference = 0.03, 0.1  # relative, of the ratios of two axes, and of two sizes
+    # If the ratios of both axes are equal and not 1, intrinsics are for another size. Otherwise the principal point is
+    # not in the middle
     are_equal = np.abs(ratio[:, 0] / ratio[:, 1] - 1) < max_ratio_difference
     other_size = are_equal & (np.abs(ratio[:, 0] - 1) > min_size_difference)
     scaled = Ks.copy()
@@ -169,7 +181,7 @@ def array_names(path: Path) -> frozenset[str]:
             return frozenset()
         with zipfile.ZipFile(path) as archive:
             return frozenset(_members(archive))
-    except Exception:  # whatever a damaged archive makes the library raise
+    except Exception:  # a damaged archive may make the library raise any error
         return frozenset()
 
 
@@ -183,22 +195,24 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise SceneError(path, "expected a readable .npz file, found something else")
     try:
-        with open_archive(path) as archive, quiet_warnings():  # about headers in old styles
+        with open_archive(path) as archive, quiet_warnings():  # the library warns of headers in old styles
             members = {name: info for name, info in _members(archive).items() if name in names}
             budget.check_memory(sum(info.file_size for info in members.values()), "arrays")
             return {name: _read_array(path, archive, info) for name, info in members.items()}
     except (SceneError, MemoryError):
         raise
-    except Exception as error:  # whatever a damaged archive makes the libraries raise
+    except Exception as error:  # a damaged archive may make the libraries raise any error
         cause = re.sub(r" at 0x[0-9a-f]+", "", str(error))  # addresses of objects differ in every process
         raise SceneError(path, f"expected a readable .npz file, found a damaged one ({cause})") from error
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Return the members of an ``.npz`` that are arrays, by the names of the arrays."""
     return {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
 
 
 def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """Read one array; SceneError if its type is not read, or if its shape does not fit to its bytes."""
     name, (shape, dtype) = info.filename, _read_header(archive.open(info))
     if dtype.kind not in _KINDS:
         kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
@@ -210,6 +224,7 @@ def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
 
 
 def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return the shape and the type in the header of a ``.npy``, and close the stream."""
     with stream:
         start = io.BytesIO(stream.read(_MAX_HEADER))
     is_version_1 = np.lib.format.read_magic(start) == (1, 0)
@@ -219,8 +234,8 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def read_matrices(path: Path) -> np.ndarray | None:
-    """Read matrices ``[c,4,4]`` from a ``.npy``; None if it holds something else, or numbers that are not finite."""
-    with suppress(Exception):  # whatever a damaged file makes the library raise
+    """Read matrices ``[c,4,4]`` from a ``.npy``; None if it holds other arrays, or numbers that are not finite."""
+    with suppress(Exception):  # a damaged file may make the library raise any error
         size, (shape, dtype) = check_file(path), _read_header(path.open("rb"))
         if dtype.kind == "f" and shape[1:] == (4, 4) and 0 < math.prod(shape) * dtype.itemsize <= size:
             matrices = np.load(path, allow_pickle=False).astype(np.float64)

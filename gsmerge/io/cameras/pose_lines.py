@@ -1,4 +1,4 @@
-"""Text files of a pose in each line, as DA3-Streaming and VGGT-Long write them, with intrinsics beside them."""
+"""Read text files with a pose in each line, as DA3-Streaming and VGGT-Long write them, and intrinsics beside them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.foreign import INTRINSICS
 
-_POSE_COLUMNS = (12, 16)  # numbers in a line that is a pose
+_POSE_COLUMNS = (12, 16)  # possible counts of numbers in a line with a pose
 
 
 def lists_poses(path: Path) -> bool:
-    """Return whether the first line of a text file with content is a pose."""
+    """Return whether the first line with content in a text file is a pose."""
     with suppress(OSError, ValueError, SceneError):
         first = next(filter(str.strip, read_lines(path)), "")
         return len(np.array(_words(first), np.float64)) in _POSE_COLUMNS
@@ -27,10 +27,10 @@ def lists_poses(path: Path) -> bool:
 
 
 def read_poses(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a text file with a pose of 12 or 16 numbers in each line, row by row.
+    """Read the cameras of a text file, each line of which lists the 12 or 16 numbers of a pose, row by row.
 
-    Intrinsics may be in :data:`INTRINSICS` beside it, for all views or for each. The size of the views is unknown.
-    SceneError if a line has another count of numbers.
+    The file :data:`INTRINSICS` beside it may have intrinsics in one line for all views, or in a line for each. The size
+    of the views is unknown. SceneError if a line has another count of numbers.
     """
     path, intrinsics = source.path, source.path.parent / INTRINSICS
     poses = _parse(path, read_lines(path), _POSE_COLUMNS)
@@ -45,7 +45,10 @@ def read_poses(source: CameraSource) -> StoredCameras:
 
 
 def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[np.ndarray]:
-    """Parse the numbers of lines; SceneError with the number of the line if one is wrong."""
+    """Parse lines of numbers, and skip empty lines; ``lengths``: the possible counts of numbers in a line.
+
+    SceneError with the number of the line if one is wrong.
+    """
     rows: list[np.ndarray] = []
     for number, line in enumerate(lines, 1):
         words = _words(line)
@@ -62,5 +65,5 @@ def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[n
 
 
 def _words(line: str) -> list[str]:
-    """Split a line into words; the last word holds all that follows the largest count of numbers in a line."""
+    """Split a line into words, at most one more than the largest count of numbers; the last word is then the rest."""
     return line.split(maxsplit=_POSE_COLUMNS[-1])

@@ -1,4 +1,4 @@
-"""List the views of programs that keep them in several lists or files: OpenSfM, Polycam, WorldMirror."""
+"""List the views of programs that write them into several lists or files: OpenSfM, Polycam and WorldMirror."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsmerge.io.image_names import natural_key, natural_order
 
 
 def list_shots(source: CameraSource) -> list[Entry]:
-    """List the shots of OpenSfM's largest reconstruction, each with its camera."""
+    """List the views of OpenSfM's largest reconstruction, which it calls shots, each with its camera."""
     with number_errors(source.path, "expected reconstructions of 'cameras' and 'shots'"):
         largest = max(source.json, key=lambda entry: len(entry["shots"]))
         shots, cameras = dict(largest["shots"]), largest["cameras"]
@@ -32,7 +32,7 @@ def list_shots(source: CameraSource) -> list[Entry]:
 
 
 def list_keyframes(source: CameraSource) -> list[Entry]:
-    """List the views of a folder of Polycam, which has a file for each, with a key for each number of its pose."""
+    """List the views in a folder of Polycam. Each has a file, with a key for each number of its pose."""
     paths, entries = natural_order(source.path.glob("*.json")), list[Entry]()
     check_camera_count(source.path, len(paths))
     for path in paths:
@@ -44,9 +44,9 @@ def list_keyframes(source: CameraSource) -> list[Entry]:
 
 
 def join_matrices(source: CameraSource) -> list[Entry]:
-    """List WorldMirror's views: each has the same ``camera_id`` in the lists "extrinsics" and "intrinsics".
+    """List WorldMirror's views, whose matrices have the same ``camera_id`` in two lists, extrinsics and intrinsics.
 
-    ``camera_id`` is the stem of the image's name, or its number. Views are in the order of these numbers, or else in
+    ``camera_id`` is the stem of the image's name, or a number. Views are in the order of the numbers, or of names in
     the file's order. SceneError if one of the lists lacks a view.
     """
     poses, Ks = (_matrices_by_id(source, key) for key in ("extrinsics", "intrinsics"))
@@ -59,7 +59,7 @@ def join_matrices(source: CameraSource) -> list[Entry]:
 
 
 def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
-    """Return the matrices of a list by their ``camera_id``; the last of equal ids counts."""
+    """Return the matrices of the list ``key`` by their ``camera_id``; the last of equal ids counts."""
     entries: Sequence[Mapping[str, Any]] = source.object[key]
     if not isinstance(entries, list):
         raise SceneError(source.path, f"expected {key!r} to be a list, found something else")
@@ -69,7 +69,7 @@ def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
 
 
 def set_centred_size(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
-    """Set the size of views to twice their principal points; return them unchanged if these are not all centred."""
+    """Set the size of views to twice their principal point, if that is whole and equal in all views."""
     sides = 2 * np.array([view.K for view in views])[:, :2, 2].reshape(-1, 2) if views else np.zeros((0, 2))
     first_size = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
     are_centred = len(sides) > 0 and bool((np.abs(sides - first_size) <= CENTRED_PX).all())

@@ -22,16 +22,16 @@ _lazy = lazy_functions(__package__)
 holds_images = _lazy("npz_files.holds_images")
 _holds_poses = _lazy("npz_files.holds_poses")
 count_images = _lazy("colmap.count_images")
-_CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt")
+_CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt")  # endings of files that may be cameras whatever their name
 
 
 def find_cameras(folder: Path) -> Path | None:
-    """Find the first of :func:`list_cameras`; None without."""
+    """Return the first of :func:`list_cameras`; None if there are none."""
     return next(list_cameras(folder), None)
 
 
 def list_cameras(folder: Path) -> Iterator[Path]:
-    """Yield the known camera files below a folder, the one to prefer first."""
+    """Yield the camera files in the known places of a folder, the most preferred first."""
     for place in CAMERA_PLACES:
         candidate = folder / place
         if "*" in place:
@@ -42,6 +42,7 @@ def list_cameras(folder: Path) -> Iterator[Path]:
 
 
 def _is_camera_folder(folder: Path) -> bool:
+    """Return whether a folder itself is cameras, such as a COLMAP model."""
     return any(row.recognise(CameraSource(folder)) for row in CAMERA_FORMATS if not row.ending)
 
 
@@ -52,14 +53,14 @@ def find_other_cameras(folder: Path) -> Path | None:
     """
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _CANDIDATE_ENDINGS)
     files = [path for path in files if path.name != INTRINSICS and not path.name.endswith(ENDING)]
-    max_candidates = 16  # files in a folder that are searched for cameras
+    max_candidates = 16  # most files in a folder that are searched for cameras
     files = [path for path in files if path.is_file()][:max_candidates]
     files = [path for path in files if holds_cameras(path)]
     return files[0] if len(files) == 1 else None
 
 
 def holds_cameras(path: Path) -> bool:
-    """Return whether a file has an ending of camera files and can be read as one."""
+    """Return whether a file can be read as cameras, by its ending and its content."""
     if path.suffix not in _CANDIDATE_ENDINGS:
         return False
     if path.suffix == ".npz":
@@ -72,7 +73,7 @@ def holds_cameras(path: Path) -> bool:
 
 @check_arguments
 def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
-    """Read cameras from a file, or from a folder that holds one of the known kinds.
+    """Read cameras from a file, or from a folder that holds cameras of a known format.
 
     The formats are those of docs/reference/formats.md. Poses become world-to-camera with OpenCV axes.
 
@@ -100,7 +101,7 @@ def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
 
 
 def _resolve(path: Path) -> Path:
-    """Return the camera file that a path means, or the folder if the format has several files.
+    """Return the camera file that a path means, or the folder of the cameras if their format has several files.
 
     A folder means the camera file in it. A file of a COLMAP model or of keyframes means its folder. SceneError if there
     are no cameras.
@@ -136,7 +137,7 @@ def read_sharp_camera(path: Path) -> CameraFile | None:
     return SHARP_PLY.cameras(source) if SHARP_PLY.recognise(source) else None
 
 
-_UNKNOWN = {  # what was expected of a file with an ending, and a remedy
+_UNKNOWN = {  # ending -> what was expected of such a file, and a remedy
     "": (f"expected cameras as {', '.join(CAMERA_ENDINGS)} or a COLMAP folder, found another kind of file",),
     ".json": ("expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither",),
     ".ply": ("expected cameras inside it, found none", "name another file"),

@@ -1,4 +1,4 @@
-"""Read the views of any file whose layout is declared."""
+"""Read the views of a file by its declared layout, a :class:`ViewLayout`."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ from gsmerge.kernels.elementary import cos, sin
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's "distortion_params"
 _COEFFICIENTS = (*_DISTORTION, "k5", "k6")
+# Names of camera models with distortion, and of all models that are read besides OPENCV_FISHEYE
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
-_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
+_PINHOLE_OR_OPENCV = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
 _FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length follows
 
 
 def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
-    """Read the cameras of a file by its layout; SceneError with file, view and key if a value is missing or wrong."""
+    """Read the cameras of a file by its layout; if a value is missing or wrong, SceneError names file, view and key."""
     entries = layout.views(source) if callable(layout.views) else _list_entries(source, layout.views)
-    shared: dict[int, dict[str, Any]] = {}  # values that views share, by id; converted once, since they may be large
+    shared: dict[int, dict[str, Any]] = {}  # id of an object -> its values, which views share and which may be large
     cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
     for i, entry in enumerate(entries):
-        named = (entry.values[name] for name in _alternatives(layout.name) if entry.values.get(name) not in (None, ""))
-        path, name = entry.path or source.path, entry.name or str(next(named, f"view {i}"))
+        names = (entry.values[key] for key in _alternatives(layout.name) if entry.values.get(key) not in (None, ""))
+        path, name = entry.path or source.path, entry.name or str(next(names, f"view {i}"))
         _check_keys(path, name, layout, entry)
         if id(entry.shared) not in shared:
             with number_errors(path, "expected numbers"):
@@ -61,7 +62,7 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
 
 
 def _list_entries(source: CameraSource, key: str) -> list[Entry]:
-    """List the views under a key of a file's object; "" if the file itself is the list."""
+    """List the views under a key of a file's object; for the key "", the file itself is the list."""
     views = source.object.get(key) if key else source.json
     place = repr(key) if key else "the file"
     if not isinstance(views, list):
@@ -72,6 +73,7 @@ def _list_entries(source: CameraSource, key: str) -> list[Entry]:
 
 
 def _alternatives(key: Key) -> tuple[str, ...]:
+    """Return the keys of a :data:`Key`, the most preferred first."""
     return (key,) if isinstance(key, str) else key
 
 
@@ -81,7 +83,7 @@ def _find_value(values: Mapping[str, Any], key: Key) -> Any:
 
 
 def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None:
-    """Raise SceneError with the keys that a view lacks."""
+    """Raise SceneError if a view lacks keys that the layout requires, and name them."""
     missing: list[Key] = [key for key in layout.pose.keys if entry.values.get(key) is None]
     for key in layout.required_keys:
         if _find_value(entry.values, key) is None and _find_value(entry.shared, key) is None:
@@ -94,8 +96,9 @@ def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None
 def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
     """Convert the intrinsics, size and lens in the values of a view, or of the object that views share.
 
-    The result has the keys of ``number_keys``, "K" for a matrix, "mask", and for a lens "model", "is_fisheye",
-    "distortion_params" and the coefficients, as far as the file has them. Errors as in :func:`convert_value`.
+    The result has the keys of ``number_keys``, "K" for a matrix, and "mask". For a lens it has "model", "is_fisheye",
+    "distortion_params" and the coefficients. Keys are left out if the file has no value. Errors are those of
+    :func:`convert_value`.
     """
     keys = layout.number_keys | ({name: name for name in _COEFFICIENTS} if layout.lens else {})
     camera: dict[str, Any] = {}
@@ -113,7 +116,7 @@ def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, A
         return camera
     if values.get(layout.lens) is not None:
         model = values[layout.lens]
-        max_model = 40  # letters of a camera model's name
+        max_model = 40  # most letters of a camera model's name
         camera["model"] = str(layout.models.get(model, model)).upper()[:max_model]
     if values.get("is_fisheye") is not None:
         camera["is_fisheye"] = values["is_fisheye"]
@@ -124,6 +127,7 @@ def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, A
 
 
 def _two_numbers(values: Any) -> tuple[float, float]:
+    """Convert a list of two JSON numbers; ValueError for another count."""
     if len(values) != 2:
         raise ValueError(f"expected two numbers, found {len(values)}")
     return to_number(values[0]), to_number(values[1])
@@ -132,7 +136,10 @@ def _two_numbers(values: Any) -> tuple[float, float]:
 def _with_size(
     path: Path, name: str, layout: ViewLayout, values: dict[str, Any], size_of: Callable[[Path], Size]
 ) -> dict[str, Any]:
-    """Return the values of a view with the size of its image, if intrinsics need a size that the file may lack."""
+    """Return the values of a view, with the size of its image if intrinsics need a size that the file may lack.
+
+    ``size_of`` returns the size of an image. SceneError if intrinsics or the size are missing.
+    """
     keys = layout.number_keys
     if not any(key in values for key in _FOCAL):
         missing = ", ".join(str(keys[field]) for field in ("fx", "w", "h") if field not in values)
@@ -150,7 +157,7 @@ def _with_size(
 
 
 def _intrinsics(path: Path, name: str, layout: ViewLayout, values: Mapping[str, Any]) -> np.ndarray:
-    """Return the intrinsics ``[3,3]`` of a view, in pixels unless the file has shares of the size as "pixels"."""
+    """Return the intrinsics ``[3,3]`` of a view in pixels; if the layout's unit is "pixels", they stay as they are."""
     width, height = values.get("w", 0.0), values.get("h", 0.0)
     if isinstance(layout.K, Matrix):
         K = values["K"]
@@ -170,7 +177,10 @@ def _intrinsics(path: Path, name: str, layout: ViewLayout, values: Mapping[str, 
 
 
 def _focal(values: Mapping[str, float], axis: str, side: float) -> float:
-    """Return the focal length along an axis, from the angle of view if need be; 0 where the file has none."""
+    """Return the focal length along an axis, if need be from the angle of view; 0 if the file has neither.
+
+    ``side``: the image's size along the axis, in pixels.
+    """
     if f"f{axis}" in values:
         return values[f"f{axis}"]
     if f"angle_{axis}" in values:
@@ -185,7 +195,7 @@ _CUT_PANORAMAS = "cut pinhole pictures out of the 360-degree panoramas first, as
 
 
 def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
-    """Return the lens of a view, None for a pinhole."""
+    """Return the lens of a view; None for a pinhole, SceneError for a camera model that is not read."""
     model = values.get("model", "PINHOLE")
     params = {key: values.get(key, 0.0) for key in _COEFFICIENTS}
     if not any(params.values()):
@@ -193,7 +203,7 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
         return make_lens("OPENCV_FISHEYE", "fisheye", [params[key] for key in ("k1", "k2", "k3", "k4")])
     ambiguous = next((key for key in ("k4", "k5", "k6") if params[key]), None)
-    if model not in _PERSPECTIVE or ambiguous is not None:
+    if model not in _PINHOLE_OR_OPENCV or ambiguous is not None:
         reason = f"lens distortion {ambiguous}, which formats understand differently"
         found = f"camera model {model}" if ambiguous is None else reason
         problem = f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {found}"

@@ -1,6 +1,6 @@
 """The table of camera formats: how to recognise a file, how it stores its views, and its convention of poses.
 
-If files of a format have a key for each value, a :class:`ViewLayout` reads them; a function reads any other format.
+Files with a key for each value are read by their :class:`ViewLayout`, and files of other formats by a function.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
 
 _lazy = lazy_functions(__package__)
-FFGS = "ffgs cameras.json"  # format of cameras whose photos were resized to cover the model's input, and cropped
-KEYFRAME = "t_00"  # key in files of Polycam, within their first bytes
+FFGS = "ffgs cameras.json"  # a format whose photos were resized until they cover the model's input, and cropped
+KEYFRAME = "t_00"  # key by which files of Polycam are recognised; it is within their first bytes
 
 
 @dataclass(frozen=True)
 class CameraFormat:
     """A format of camera files."""
 
-    name: str  # the ``source`` of its cameras
+    name: str  # name of the format, which is the ``source`` of its cameras
     files: str  # description for people
-    ending: str  # of files' names, in lower case; "" for a folder
-    read: ViewLayout | Callable[[CameraSource], StoredCameras]  # the function raises SceneError for damaged files
-    convention: Convention  # of its poses
-    intrinsics: str  # description of how they are stored, for people
-    recognise: Callable[[CameraSource], bool] = lambda _: True  # called for files with the ending
+    ending: str  # ending of files' names, in lower case; "" for a folder
+    read: ViewLayout | Callable[[CameraSource], StoredCameras]  # a function raises SceneError for damaged files
+    convention: Convention  # convention of the poses
+    intrinsics: str  # how intrinsics are stored, described for people
+    recognise: Callable[[CameraSource], bool] = lambda _: True  # is called only for files with the ending
 
     def cameras(self, source: CameraSource) -> CameraFile:
         """Read the cameras of a file; SceneError if it is damaged or incomplete."""
@@ -51,18 +51,18 @@ def is_colmap(folder: Path) -> bool:
 
 
 def _holds_model(folder: Path, suffix: str) -> bool:
-    """Return whether a folder holds the files of a COLMAP model with an ending, ``.bin`` or ``.txt``."""
+    """Return whether a folder holds the files of a COLMAP model with the ending ``suffix``, ``.bin`` or ``.txt``."""
     return (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file()
 
 
 def is_keyframes(folder: Path) -> bool:
-    """Return whether a folder holds the cameras of Polycam's keyframes, a ``.json`` each."""
+    """Return whether a folder holds the cameras of Polycam's keyframes, each in a ``.json``."""
     first_file = min(folder.glob("[!.]*.json"), default=folder)
     return first_file.is_file() and f'"{KEYFRAME}"'.encode() in read_start(first_file)
 
 
 def _has_views_with(source: CameraSource, key: str) -> bool:
-    """Return whether a JSON file has a list ``views`` of objects, and any of them has the key."""
+    """Return whether a JSON file has a list ``views`` of objects, any of which has the key."""
     views = source.object.get("views")
     return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any(key in v for v in views)
 
@@ -72,7 +72,7 @@ _READ_COLMAP, _READ_DA3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3
 _LISTS_POSES = _lazy("pose_lines.lists_poses")
 _READ_STATE = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 
-_TRANSFORMS = ViewLayout(
+_TRANSFORMS_JSON = ViewLayout(
     views="frames",
     name=("file_path", "image_path", "name"),
     pose=Matrix("transform_matrix"),  # applied_transform is not applied: poses are in the Gaussians' world
@@ -154,9 +154,9 @@ CAMERA_FORMATS = (
                  lambda file: _LISTS_POSES(file.path)),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", _LONG_LRM, W2C_OPENCV, "pixels", is_long_lrm),
     CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
-                 ".json", _TRANSFORMS, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
+                 ".json", _TRANSFORMS_JSON, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
                  lambda file: "frames" in file.object),
-    CameraFormat("frame list", "list of frames with `transform_matrix`", ".json", replace(_TRANSFORMS, views=""),
+    CameraFormat("frame list", "list of frames with `transform_matrix`", ".json", replace(_TRANSFORMS_JSON, views=""),
                  C2W_OPENCV, "pixels or field of view; may be missing; lenses",
                  lambda file: "transform_matrix" in file.first),
     CameraFormat("INRIA cameras.json", "`cameras.json` of INRIA; InstantSplat's `pose/ours_N/pose_optimized.npy`",

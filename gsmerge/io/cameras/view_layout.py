@@ -1,6 +1,6 @@
-"""Declare how a file stores its views: the keys of the pose, intrinsics, size and lens of each view.
+"""Classes that declare how a file stores its views: the keys of the pose, intrinsics, size and lens of each view.
 
-The rows of ``table.py`` hold such declarations, and ``read_views.py`` reads files by them.
+The table of camera formats holds such declarations, and ``read_views.py`` reads files by them.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Key = str | tuple[str, ...]  # a key, or several keys; the first key with a valu
 
 
 class Entry(NamedTuple):
-    """One view as a file stores it, before conversion."""
+    """One view as a file stores it, before its conversion."""
 
-    values: Mapping[str, Any]  # its own
-    shared: Mapping[str, Any] = {}  # values of several views, such as one camera's; they replace missing values
-    name: str = ""  # of its image, if no value has the name
+    values: Mapping[str, Any]  # values of this view alone
+    shared: Mapping[str, Any] = {}  # values of several views, such as those of one camera, for missing values
+    name: str = ""  # name of its image, if no value has it
     path: Path | None = None  # the view's own file, if each view has a file
 
 
@@ -34,7 +34,7 @@ class Matrix:
 
     Args:
         key: The key.
-        shape: The matrix's shape, where a file may also list its numbers without rows; None: the file has rows.
+        shape: The matrix's shape, if a file may list its numbers without rows; None: files list rows.
     """
 
     key: str
@@ -50,6 +50,7 @@ class Matrix:
         return np.asarray(convert_value(self._to_matrix, self.key, values[self.key]))
 
     def _to_matrix(self, value: Any) -> np.ndarray:
+        """Convert a value of the file to the matrix."""
         array = to_array(value)
         return array if self.shape is None else array.reshape(self.shape)
 
@@ -60,14 +61,14 @@ def rotation_of_matrix(numbers: np.ndarray) -> np.ndarray:
 
 
 def rotation_of_vector(numbers: np.ndarray) -> np.ndarray:
-    """Return the rotation ``[3,3]`` of a vector ``[3]`` along the axis, whose length is the angle in radians."""
+    """Return the rotation ``[3,3]`` about the direction of a vector ``[3]``, whose length is the angle in radians."""
     motion = np.concatenate([numbers.reshape(1, 3), np.zeros((1, 3))], 1)
     return motion_matrices(motion)[0, :3, :3]
 
 
 @dataclass(frozen=True, eq=False)
 class RotationAndShift:
-    """A pose ``[3,4]`` under two keys: its rotation, and its last column.
+    """A pose ``[3,4]`` under two keys, one for its rotation and one for its last column.
 
     Args:
         rotation: Key of the rotation.
@@ -94,15 +95,15 @@ class RotationAndShift:
 
 @dataclass(frozen=True)
 class PinholeKeys:
-    """Intrinsics with a key for each number. If the layout makes a key optional, the defaults below apply.
+    """Intrinsics with a key for each number; views without an optional number have the defaults below.
 
     Args:
         fx: Key of the horizontal focal length. A view without it has square pixels.
         fy: Key of the vertical focal length. A view without it has square pixels.
         cx: Key of the principal point's x. A view without it has the principal point in the middle of the image.
-        cy: Key of the principal point's y, likewise.
+        cy: Key of the principal point's y, with the same default.
         angle_x: Key of the horizontal field of view in radians, for views without ``fx``; "" if there is none.
-        angle_y: Key of the vertical field of view.
+        angle_y: Key of the vertical field of view, for views without ``fy``.
     """
 
     fx: Key
@@ -117,8 +118,8 @@ class PinholeKeys:
 class ViewLayout:
     """The place of a file's list of views, and the keys of a view's values.
 
-    A value of null counts as missing. The object with the list of views replaces missing values of a view, except for
-    its name and pose.
+    A value of null counts as missing. If a view lacks a value other than its name and pose, the value of the object
+    with the list of views is taken.
 
     Args:
         pose: The pose, in the convention of the format.
@@ -126,13 +127,13 @@ class ViewLayout:
         views: Key of the list of views; "" if the file itself is the list; or a function that lists them.
         name: Key of the image's name. Views without a name are called "view 0", "view 1" and so on.
         size: Keys of width and height in pixels, or the key of a list [height, width]; "" if the file has no size.
-        unit: Unit of the intrinsics: pixels, the image's width and height, or its larger side. Small intrinsics in
-            "pixels" count as shares of width and height, see :func:`make_camera_file`.
+        unit: Unit of the intrinsics: a pixel, the image's width and height, or its larger side. If all intrinsics in
+            "pixels" are small, they count as shares of width and height, see :func:`make_camera_file`.
         origin: The point of the image from which the principal point is measured: the upper left corner or the middle.
-        lens: Key of the camera model, with the coefficients k1, k2 and so on beside it; "" for pinholes.
+        lens: Key of the camera model; the coefficients have the keys k1, k2 and so on. "": views are pinholes.
         models: The program's names of camera models -> COLMAP's names; equal names are left out.
-        optional: Keys that a view may lack. Without a size, the size of the image counts. If no view of the file has a
-            focal length, it is estimated later.
+        optional: Keys that a view may lack. A view without a size has the size of its image. If no view of the file
+            has a focal length, it is estimated later.
         mask: Key of the name of the image's mask; "" if there is none.
         finish: A function that completes the views from other content of the file or folder; None: nothing to add.
     """
@@ -152,14 +153,14 @@ class ViewLayout:
 
     @property
     def number_keys(self) -> dict[str, Key]:
-        """Keys of single numbers: of the fields of :class:`PinholeKeys`, and of the width "w" and height "h"."""
+        """Keys of single numbers, by the fields of :class:`PinholeKeys`, and by "w" and "h" for width and height."""
         keys: dict[str, Key] = dict(vars(self.K)) if isinstance(self.K, PinholeKeys) else {}
         keys |= dict(zip(("w", "h"), self.size, strict=True)) if isinstance(self.size, tuple) else {}
         return {name: key for name, key in keys.items() if key}
 
     @property
     def required_keys(self) -> list[Key]:
-        """Keys of intrinsics, size and lens that each view, or what views share, must have."""
+        """Keys of intrinsics, size and lens that each view must have, or the object that views share."""
         keys = [key for name, key in self.number_keys.items() if not name.startswith("angle")]
         keys += [self.K.key] if isinstance(self.K, Matrix) else []
         keys += [key for key in (self.size, self.lens) if isinstance(key, str) and key]

@@ -1,4 +1,4 @@
-"""Write cameras beside a result, for viewers: as INRIA's ``cameras.json``."""
+"""Encode cameras for viewers: as INRIA's ``cameras.json``, and as settings of SuperSplat's viewer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from gsmerge.io.cameras.camera_file import CENTRED_PX
 from gsmerge.types import Cameras
 
 ENDING = ".cameras.json"
-TRACK = "gsmerge"  # name of the track of our settings
+TRACK = "gsmerge"  # name of the camera track in settings that gsmerge writes
+# Effects of SuperSplat's viewer, all disabled, with the numbers that its settings must have
 _EFFECTS: dict[str, dict[str, Any]] = {
     "sharpness": {"amount": 0}, "bloom": {"intensity": 1, "blurLevel": 2},
     "grading": {"brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
@@ -36,11 +37,12 @@ def viewer_cameras_path(output: Path) -> Path:
 def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     """Return the text of cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers.
 
-    :func:`gsmerge.read_cameras` reads it. Viewers assume that the principal point is in the middle; one that is not is
+    :func:`gsmerge.read_cameras` reads it. Viewers assume that the principal point is in the middle. If it is not, it is
     written as ``cx`` and ``cy``, which viewers ignore.
     """
 
     def principal_point(K: np.ndarray) -> dict[str, float]:
+        """Return the entries of a principal point; empty if it is in the middle."""
         centred = np.allclose(2 * K[:2, 2], (cameras.width, cameras.height), rtol=0, atol=CENTRED_PX)
         return {} if centred else {"cx": float(K[0, 2]), "cy": float(K[1, 2])}
 
@@ -57,31 +59,31 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
 
 
 def order_views(cameras: Cameras) -> list[int]:
-    """Return the views in order; the first is nearest to the median centre and the mean viewing direction."""
+    """Return the numbers of the views, the one nearest to the median centre and the mean viewing direction first."""
     if len(cameras) == 0:
         return []
     centres, forward = camera_centres(cameras.viewmats), cameras.viewmats[:, 2, :3]
-    offsets, turns = centres - lower_median(centres), forward - normalize(forward.mean(0))
-    distances, turned = (np.sqrt((rows * rows).sum(1)) for rows in (offsets, turns))
-    return np.argsort(distances / (distances.mean() or 1.0) + turned, kind="stable").tolist()
+    offsets, deviations = centres - lower_median(centres), forward - normalize(forward.mean(0))
+    distances, turns = (np.sqrt((rows * rows).sum(1)) for rows in (offsets, deviations))
+    return np.argsort(distances / (distances.mean() or 1.0) + turns, kind="stable").tolist()
 
 
 def vertical_field(cameras: Cameras, view: int) -> float:
-    """Return the vertical field of a view in radians, rounded so that every processor gives the same."""
+    """Return the vertical field of a view in radians, rounded so that it is equal on every processor."""
     return round(2 * math.atan(cameras.height / (2 * float(cameras.Ks[view, 1, 1]))), 9)
 
 
 def is_own_settings(path: Path) -> bool:
-    """Return whether settings are of :func:`viewer_settings`, by the name of their track."""
+    """Return whether a file of settings is of :func:`viewer_settings`, by the name of its track."""
     return f'"{TRACK}"' in path.read_text(encoding="utf-8", errors="replace")
 
 
 def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
-    """Return the text of settings for SuperSplat's viewer (its ``settings.json``, version 2): where to look from.
+    """Return the text of settings that tell SuperSplat's viewer where to look from (its ``settings.json``, version 2).
 
-    The camera is the first of :func:`order_views`. Its target lies at the median depth of the ``means [n,3]`` in
-    front of it. The viewer turns the scene by half a turn about z, and takes the field of view for that of the longer
-    side. It would move by itself without a track; here both keys of the track are this view.
+    The camera is the first of :func:`order_views`. Its target lies at the median depth of the ``means [n,3]`` in front
+    of it. The viewer turns the scene by half a turn about z, and takes the field of view for that of the longer side.
+    Without a track its camera would move. The track here has two keys, which are both this view.
     """
     view = order_views(cameras)[0]
     forward, centre = cameras.viewmats[view, 2, :3].astype(np.float64), cameras.centres[view].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Convert Gaussians to and from the units of most file formats: :class:`Columns`, :class:`StoredRows`, comments."""
+"""Hold Gaussians in the units of most file formats, convert from and to these units, and read header comments."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gsmerge.types import Gaussians
 from gsmerge.values.arrays import Array, as_array
 
 MAX_POSITION = 1e13  # no scene is larger, in any unit; float32 can square and sum positions and scales below
-BLOCK_ROWS = 1 << 16  # rows converted at a time
+BLOCK_ROWS = 1 << 16  # rows that are converted at a time
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
 LOGIT_COMMENT = "opacity: logit"  # states the encoding in files of gsmerge, so that no reader guesses it
 RESULT_COMMENT = "gsmerge result"  # replaces LOGIT_COMMENT in results of commands, and has the same length
@@ -42,10 +42,11 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of compressed PLYs
 REQUIRED_COLUMNS = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
-SHARE_ROUNDING = 0.01  # by which shares that were rounded to half floats may exceed [0, 1]
-MAX_STRAY = 0.01  # share of a column's values that may contradict the rest, because of roundings and damage
+SHARE_ROUNDING = 0.01  # shares that were rounded to half floats may exceed [0, 1] by this
+MAX_STRAY = 0.01  # share of a column's values that may contradict the others, because of roundings and damage
 _EXACT = 1e-5  # largest rounding error of a whole number in a matrix that rotates harmonics
-GAUSSIAN_BYTES = 4 * len(REQUIRED_COLUMNS) + 1  # in memory, without higher harmonics, with its flag of validity
+EXPORT_AGAIN = "copy or export it again"  # remedy for a damaged file
+GAUSSIAN_BYTES = 4 * len(REQUIRED_COLUMNS) + 1  # bytes in memory with the flag of validity, without higher harmonics
 
 
 def sh_degree(num_higher: int) -> int:
@@ -132,7 +133,7 @@ def read_new_views(comments: Sequence[object]) -> ExpectedScores | None:
 
 
 def note_surplus(num_bytes: int, least: int) -> tuple[Doubt, ...]:
-    """Doubt a file with bytes after its last row; fewer than ``least``, a row or a header, may be padding."""
+    """Return a doubt about a file with at least ``least`` bytes after its last row; fewer bytes may be padding."""
     reason = "as if the header's count were too small or another file were appended"
     return (Doubt(f"{num_bytes:,} bytes follow the last row, {reason}"),) if num_bytes >= least else ()
 
@@ -181,7 +182,7 @@ class Columns:
 
     @property
     def colors(self) -> np.ndarray:
-        """Base colours ``[n,3]``; only values from 0 to 1 can be displayed."""
+        """Base colours ``[n,3]`` as RGB; only values from 0 to 1 can be displayed."""
         return sh0_to_rgb(self.sh0)
 
     def along_curve(self) -> Columns:
@@ -199,6 +200,7 @@ def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
         return parts[0]
 
     def widen(harmonics: np.ndarray) -> np.ndarray:
+        """Add zeros for missing harmonics."""
         return np.pad(harmonics, ((0, 0), (0, num_higher - harmonics.shape[1]), (0, 0)))
 
     widened = [replace(part, harmonics=widen(part.harmonics)) for part in parts]
@@ -219,7 +221,7 @@ class Packed:
 
 @dataclass(frozen=True)
 class PackedRows:
-    """Rows of a PLY file that are unpacked block by block when they are taken."""
+    """Rows of a PLY file, which are unpacked block by block when they are read."""
 
     parts: Sequence[Packed]
     dtype: np.dtype[np.void]
@@ -239,6 +241,7 @@ class PackedRows:
 
 
 def _num_rest(row: np.dtype[np.void]) -> int:
+    """Count the columns of harmonics above degree 0."""
     return sum(name.startswith("f_rest_") for name in row.names or ())
 
 
@@ -274,7 +277,7 @@ def pack_rows(parts: Sequence[Packed]) -> PackedRows:
 
 
 def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], mode: str | None = None) -> StoredRows:
-    """Make the content of a file from packed Gaussians.
+    """Make the stored rows of a file from its packed Gaussians.
 
     ``name``: name of the format. ``sizes``: bytes by attribute. ``mode``: mode of rendering, see :func:`render_mode`.
     """
@@ -290,12 +293,15 @@ def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], mode: s
 
 
 def max_array_bytes(file_bytes: int) -> int:
-    """Return the bytes above which arrays are mapped, since harmonics may be many times as large as the file."""
+    """Return the size in bytes from which an array of Gaussians is mapped from a temporary file.
+
+    Harmonics in memory may be many times as large as the file that is read.
+    """
     return max(1 << 25, 8 * file_bytes)
 
 
 def check_gaussian_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
-    """Raise SceneError if the file is too small for ``count`` Gaussians of ``packed_bytes`` each."""
+    """Raise SceneError if ``count`` Gaussians, with ``packed_bytes`` each, take more memory than the file allows."""
     harmonics = min(12 * num_higher * count, max_array_bytes(budget.file_bytes))  # bytes in memory
     unpacked_bytes = 16_000_000  # bytes of all blocks that are unpacked at the same time
     num_bytes = count * (packed_bytes + GAUSSIAN_BYTES) + harmonics + unpacked_bytes
@@ -309,6 +315,7 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
     """
 
     def check(values: np.ndarray) -> np.ndarray:
+        """Return values unchanged; ValueError if any is not finite as float32."""
         with np.errstate(over="ignore"):
             nonfinite = np.argwhere(~np.isfinite(values.astype(np.float32)))  # no format holds larger numbers
         if len(nonfinite):
@@ -316,6 +323,7 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
         return values
 
     def array(values: Array) -> np.ndarray:
+        """Return values as float64; ValueError as in ``check``."""
         return check(as_array(values).astype(np.float64))
 
     degree = min(max_degree, gaussians.sh_degree)
@@ -335,17 +343,21 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 
 
 def column_blocks(gaussians: Gaussians, max_degree: int, num_rows: int | None = None) -> Iterator[tuple[int, Columns]]:
-    """Yield the first row of each block of ``num_rows`` Gaussians, and the block as :func:`to_columns` gives it.
+    """Yield the number of the first row of each block of Gaussians, and the block as :func:`to_columns` returns it.
 
-    None: ``BLOCK_ROWS``. The columns take a few times the memory of the Gaussians.
+    ``num_rows``: rows of a block; None: ``BLOCK_ROWS``. Blocks save memory, since columns take several times as much as
+    Gaussians.
     """
     num_rows = num_rows or BLOCK_ROWS
     for start in range(0, len(gaussians), num_rows):
         yield start, to_columns(gaussians[start : start + num_rows], max_degree, start)
 
 
-def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
-    """Return a function that rotates Gaussians by an orthogonal matrix ``[3,3]``, which may mirror them."""
+def rotator(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
+    """Return a function that rotates Gaussians by an orthogonal matrix ``[3,3]``, which may mirror them.
+
+    ``num_higher``: number of the Gaussians' harmonics above degree 0.
+    """
     if np.array_equal(rotation, np.eye(3)):
         return lambda columns: columns
     # A mirror acts on an ellipsoid as the rotation by the negative matrix does; the sign is that of the determinant
@@ -365,7 +377,7 @@ def _harmonics_rotator(rotation: np.ndarray, num_higher: int) -> Callable[[np.nd
     matrix = harmonics_rotation(num_higher, rotation) if num_higher else np.zeros((0, 0))
     matrix = np.where(np.abs(matrix - np.round(matrix)) < _EXACT, np.round(matrix), matrix)
     signs = np.diagonal(matrix)[:, None]
-    if np.array_equal(matrix, np.diag(np.diagonal(matrix))):  # such as for a half turn
+    if np.array_equal(matrix, np.diag(np.diagonal(matrix))):  # such as that of half a turn
         return lambda harmonics: harmonics * signs
     return lambda harmonics: apply_harmonics_rotation(harmonics, matrix)
 

@@ -1,4 +1,4 @@
-"""Recognise columns of a PLY file besides those of Gaussians: ignore them, name them in a note, or refuse the file."""
+"""Recognise columns of a PLY file that are not those of Gaussians: ignore them, note them, or refuse the file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ColumnKind:
     remedy: str = ""  # files with these columns are refused with it; empty: a note names the columns
 
 
-# Kinds are tried in this order; the note lists columns of floats without a kind as unknown
+# The first kind that matches a name counts. The note lists columns of floats that match no kind as unknown
 COLUMN_KINDS = (
     ColumnKind(
         "when each Gaussian appears",
@@ -77,7 +77,8 @@ COLUMN_KINDS = (
         r".*",
     ),
 )  # fmt: skip
-_NUMBERS = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}  # types of 1, 2 and 4 bytes
+# PLY's types of whole numbers, of 1, 2 and 4 bytes
+_WHOLE_TYPES = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}
 
 
 def _find_kind(name: str) -> ColumnKind | None:
@@ -86,10 +87,10 @@ def _find_kind(name: str) -> ColumnKind | None:
 
 
 def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
-    """Return a note on unused columns and elements that would change renders; empty if there are none.
+    """Return a note on columns and elements that are not used, though they would change renders; empty without any.
 
     ``layers``: names of elements with more Gaussians. SceneError if a column shows that the file alone is no scene, or
-    if a column of Gaussians has whole numbers.
+    if a column of Gaussians is stored as whole numbers.
     """
     _check_types(path, row)
     by_kind: dict[ColumnKind | None, list[str]] = {}
@@ -111,20 +112,20 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
 
 
 def _check_types(path: Path, row: np.dtype[np.void]) -> None:
-    """Raise SceneError if columns of Gaussians are whole numbers; plain colours may be bytes."""
+    """Raise SceneError if a column of Gaussians is stored as whole numbers; plain colours may be bytes."""
     colors = arrays.color_columns(row.names)
     for name in row.names or ():
         dtype, is_used = row[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
         is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
         if is_used and dtype.kind != "f" and not is_color_byte:
-            type_name = _NUMBERS[dtype.kind][dtype.itemsize // 2]
-            whole = "values of 0 to 255" if dtype.itemsize == 1 else "half floats"
-            problem = f"expected {name} as float, found {type_name}, which may be {whole} or indices of a codebook"
+            type_name = _WHOLE_TYPES[dtype.kind][dtype.itemsize // 2]
+            meaning = "values of 0 to 255" if dtype.itemsize == 1 else "half floats"
+            problem = f"expected {name} as float, found {type_name}, which may be {meaning} or indices of a codebook"
             raise SceneError(path, problem, "export it with floats, opacities as logits or in [0, 1]")
 
 
 def describes_places(name: str) -> bool:
-    """Return whether a column may hold positions or directions, such as a motion; labels and weights do not."""
+    """Return whether a column may hold positions or directions, such as a motion; False for labels and weights."""
     kind = _find_kind(name)
     return kind is None or bool(kind.what)
 

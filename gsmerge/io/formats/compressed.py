@@ -23,10 +23,12 @@ from gsmerge.kernels.elementary import log, log1p
 CHUNK = 256  # Gaussians that share a range
 _POSITION_RANGES = tuple(f"{bound}_{axis}" for bound in ("min", "max") for axis in "xyz")
 _SCALE_RANGES = tuple(f"{bound}_scale_{axis}" for bound in ("min", "max") for axis in "xyz")
+# Columns that a chunk must have; those of colours may be missing
 RANGE_COLUMNS = (*_POSITION_RANGES, *_SCALE_RANGES)
 COLORS = tuple(f"{bound}_{channel}" for bound in ("min", "max") for channel in "rgb")
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
-_HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE  # by stored byte
+# Value of each stored byte
+_HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE
 
 
 def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
@@ -54,11 +56,12 @@ def _check_types(path: Path, element: PlyElement, columns: tuple[str, ...], type
 
 
 def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
+    """Unpack a block of Gaussians, with opacities as logits."""
     vertex, chunk = data["vertex"].data[block], data["chunk"].data
     words = {name: vertex[name].astype(np.uint32) for name in PACKED}
     chunk_ids = np.arange(block.start, block.stop) // CHUNK
     *colors, alpha = _shares(words["packed_color"], (8, 8, 8, 8))
-    largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # of wxyz
+    largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # index of a component of wxyz
     smallest = np.stack(_shares(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
     codes = np.empty((len(vertex), 3 * num_higher), np.uint8)
     for i in range(3 * num_higher):
@@ -74,6 +77,7 @@ def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
 
 
 def _num_rest(path: Path, data: PlyData, count: int) -> int:
+    """Count the columns of harmonics above degree 0; SceneError if it is no number of a degree from 0 to 3."""
     if "sh" not in data:
         return 0
     names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}
@@ -85,12 +89,12 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
 
 
 def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...], chunk_ids: np.ndarray) -> np.ndarray:
-    """Interpolate between the minima and maxima of chunks; return numbers ``[n,3]``.
+    """Interpolate between the minima and maxima of chunks; return values ``[n,3]``.
 
-    If the file lacks these ranges, the shares are the numbers.
+    If the file lacks these ranges, the values are the shares themselves.
 
-    ``shares``: three arrays ``[n]`` in [0, 1]. ``ranges``: names of the columns with the minima, then of the maxima.
-    ``chunk_ids [n]``: the chunk of each Gaussian.
+    ``shares``: three arrays ``[n]`` in [0, 1]. ``ranges``: names of the columns with the minima, then of those with the
+    maxima. ``chunk_ids [n]``: the chunk of each Gaussian.
     """
     if all(name in (chunk.dtype.names or ()) and chunk.dtype[name].kind == "f" for name in ranges):
         bounds = [chunk[name][chunk_ids].astype(np.float32) for name in ranges]
@@ -101,7 +105,7 @@ def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...
 
 
 def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
-    """Unpack numbers from 0 to 1 from words; ``bits`` are their widths, and the last number is in the lowest bits."""
+    """Unpack numbers in [0, 1] from words; ``bits`` are their widths, and the last number has the lowest bits."""
     out = []
     for i, width in enumerate(bits):
         shifted = words >> np.uint32(sum(bits[i + 1 :]))

@@ -1,4 +1,4 @@
-"""Read additional columns of PLY files, such as labels, and join them, for results that keep the rows."""
+"""Read and join additional columns of PLY files, such as labels, for outputs that have the same rows."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
 
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """Join the columns of files, row after row; also return the names of columns that are not the same in all files."""
+    """Join the rows of files; also return the names of columns that some files lack or have in another type."""
     types = [{name: part.dtype[name] for name in part.dtype.names or ()} for part in parts]  # by column, for each file
     names = dict.fromkeys(name for file_types in types for name in file_types)
     common = [name for name in names if len({file_types.get(name) for file_types in types}) == 1]
@@ -41,9 +41,9 @@ def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[st
 
 
 def describe_extra_columns(columns: np.ndarray, missing: Sequence[str], format_: Format, *, moves: bool) -> list[str]:
-    """Note which columns a file of a format keeps: one sentence each, without a full stop.
+    """Note which additional columns a file of a format keeps: one sentence each, without a full stop.
 
-    ``missing``: columns that some inputs lack. ``moves``: Gaussians are moved or rotated.
+    ``missing``: columns that some inputs lack. ``moves``: whether Gaussians are moved or rotated.
     """
     names, notes = list(columns.dtype.names or ()), list[str]()
     if missing:

@@ -3,7 +3,8 @@
 The axis y points up in glTF, and down in a ``.ply``. Therefore the writer rotates Gaussians by half a turn about z, and
 the reader rotates them back. Viewers that do not know the extension show points in the base colours.
 
-A ``.spz`` in place of the values is read. Drafts of the extension are not, whose scales are logarithms.
+Files with a packed ``.spz`` in place of the values are read as well. Files of the extension's drafts, whose scales are
+logarithms, are refused.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from gsmerge.io.formats.arrays import (
     are_logarithms,
     column_blocks,
     note_surplus,
+    rotator,
     to_bytes,
     to_stored,
-    turner,
 )
 from gsmerge.io.formats.spz import read_packed
 from gsmerge.kernels.elementary import exp, log, power
@@ -48,21 +49,24 @@ _OPACITY = f"{NAME}:OPACITY"
 COMPRESSED = f"{NAME}_compression_spz_2"  # of which Cesium's tiles consist
 COLOR_SPACE = "srgb_rec709_display"
 READ_EXTENSIONS = {NAME, COMPRESSED, "KHR_mesh_quantization", "KHR_materials_unlit"}
-_FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # constants of glTF
-_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_WIDTHS = {name: width for width, name in _TYPES.items()}
+# Constants of glTF: float32, uint8, a buffer of vertices, and a mesh of points
+_FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
+_TYPE_NAMES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # width of a value -> its type in glTF
+_WIDTHS = {name: width for width, name in _TYPE_NAMES.items()}
+# NumPy's types -> the numbers of glTF's types of components, and back
 _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
-HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # between the axes of a ``.ply`` and of glTF
+# The file: mark, version and length. A chunk: length and kind
+_FILE_HEAD, _CHUNK_HEAD = struct.Struct("<4sII"), struct.Struct("<I4s")
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # turns the axes of a ``.ply`` to those of glTF, and back
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
-_TRANSFORMS = {"matrix", "rotation", "scale", "translation"}  # keys of a node with a transform of its own
+_MOVING_KEYS = {"matrix", "rotation", "scale", "translation"}  # keys of a node that moves its mesh and its children
 
 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
-    """Encode a ``.glb`` file as :func:`glb_bytes` does, with a camera node for each view.
+    """Encode a ``.glb`` file as :func:`glb_bytes` does, with a camera node for each view of the contents.
 
-    The first is the view that stands nearest to the middle of all, since viewers look from the first.
+    The view nearest to the middle of all is the first camera, since viewers look from that one.
     """
     cameras = contents.cameras if contents.options.viewer_cameras else NO_CAMERAS
     names = contents.names or number_views(len(cameras))
@@ -84,12 +88,12 @@ def glb_bytes(
 ) -> bytes:
     """Encode a ``.glb`` file without comments; ValueError if there is NaN or inf.
 
-    ``nodes`` and ``cameras`` are added to its document.
+    ``nodes`` and ``cameras`` are those of glTF, and are added to its document.
 
     Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
     num_higher = (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2 - 1
-    half_turn = turner(np.diag([-1.0, -1.0, 1.0]), num_higher)  # from y down to y up
+    half_turn = rotator(np.diag([-1.0, -1.0, 1.0]), num_higher)  # from y down to y up
     blocks = [_attributes(half_turn(columns)) for _, columns in column_blocks(gaussians, MAX_DEGREE)]
     attributes = {name: _join([block.pop(name) for block in blocks]) for name in tuple(blocks[0])}
     views, accessors = _describe_arrays(list(attributes.values()))
@@ -111,7 +115,7 @@ def glb_bytes(
 
 
 def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
-    """Encode a ``.glb`` from a ``document`` without head, whose scene has all nodes, and its binary ``content``."""
+    """Encode a ``.glb`` from its binary ``content`` and a ``document``; version, scene and buffer are added to this."""
     document = {
         "asset": {"version": "2.0", "generator": "gsmerge"},
         "scene": 0,
@@ -121,31 +125,31 @@ def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
     }
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
-    return _HEADER.pack(b"glTF", 2, _HEADER.size + len(chunks)) + chunks
+    return _FILE_HEAD.pack(b"glTF", 2, _FILE_HEAD.size + len(chunks)) + chunks
 
 
 def _join(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """Join blocks of rows, with their padding."""
+    """Join blocks ``[n,width]``; if they are views of padded rows, the result is such a view as well."""
     return np.concatenate([block if block.base is None else block.base for block in blocks])[:, : blocks[0].shape[1]]
 
 
 def _describe_arrays(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return the buffer views and the accessors of glTF for arrays ``[n,width]`` that follow each other in a buffer."""
+    """Return the buffer views and the accessors in glTF of arrays ``[n,width]`` that follow each other in a buffer."""
     views, accessors, offset = list[dict[str, Any]](), list[dict[str, Any]](), 0
     for view_id, array in enumerate(arrays):
         row_bytes, width = array.strides[0], array.shape[1]
         size = len(array) * row_bytes
         stride = {"byteStride": 4} if row_bytes == 4 and width == 1 else {}  # rows of two bytes are padded
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, **stride, "target": _VERTICES})
-        number: dict[str, Any] = {"componentType": _COMPONENTS[array.dtype.str]}
-        number |= {} if array.dtype.kind == "f" else {"normalized": True}
-        accessors.append({"bufferView": view_id, **number, "count": len(array), "type": _TYPES[width]})
+        component: dict[str, Any] = {"componentType": _COMPONENTS[array.dtype.str]}
+        component |= {} if array.dtype.kind == "f" else {"normalized": True}
+        accessors.append({"bufferView": view_id, **component, "count": len(array), "type": _TYPE_NAMES[width]})
         offset += size
     return views, accessors
 
 
 def _attributes(columns: Columns) -> dict[str, np.ndarray]:
-    """Return the attributes ``[n,width]`` by name; rows of two bytes are padded to four, as glTF requires."""
+    """Return the attributes ``[n,width]`` of glTF by name; rows of two bytes are padded to four, as glTF requires."""
     padded_opacities = np.zeros((len(columns), 2), "<u2")
     padded_opacities[:, 0] = np.rint(columns.opacities.clip(0, 1) * 65535)
     values = {
@@ -163,8 +167,9 @@ def _attributes(columns: Columns) -> dict[str, np.ndarray]:
 
 
 def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:
+    """Encode a chunk of the file, whose content is padded to a multiple of four bytes."""
     content += padding * (-len(content) % 4)
-    return _CHUNK.pack(len(content), kind) + content
+    return _CHUNK_HEAD.pack(len(content), kind) + content
 
 
 def holds_gaussians(path: Path) -> bool:
@@ -173,7 +178,7 @@ def holds_gaussians(path: Path) -> bool:
     A file that cannot be read also returns True, so that its reader reports the error.
     """
     try:
-        with _damage(path), path.open("rb") as file:
+        with _damage_errors(path), path.open("rb") as file:
             return NAME in str(_read_document(file, read_budget(path))[0].get("extensionsUsed"))
     except SceneError:
         return True
@@ -182,7 +187,7 @@ def holds_gaussians(path: Path) -> bool:
 def read_rows(path: Path) -> StoredRows:
     """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if it has none or is damaged."""
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
-    with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
+    with _damage_errors(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
         document, total = _read_document(file, budget)
         content = _Content(budget, file, document, file.tell(), total)
         for primitive, transform in _walk_splats(document, budget):
@@ -194,12 +199,12 @@ def read_rows(path: Path) -> StoredRows:
     return replace(
         to_stored(parts, ".glb", sizes),
         format="binary little-endian",
-        notes=note_surplus(budget.file_bytes - total, _HEADER.size),
+        notes=note_surplus(budget.file_bytes - total, _FILE_HEAD.size),
     )
 
 
 @contextmanager
-def _damage(path: Path) -> Iterator[None]:
+def _damage_errors(path: Path) -> Iterator[None]:
     """Convert all errors that damaged or foreign files cause in the reader to a SceneError."""
     try:
         with read_errors(path):
@@ -210,7 +215,7 @@ def _damage(path: Path) -> Iterator[None]:
 
 
 class _ForeignError(ValueError):
-    """Content that the reader does not support; the message continues "expected a .glb of Gaussians, found"."""
+    """The reader does not support the content; the message follows "expected a .glb of Gaussians, found"."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +223,7 @@ class _Values:
     """Stored values ``[n,width]`` of an accessor; an index with a slice returns its rows as float64."""
 
     stored: np.ndarray
-    unit: int  # stored number of the value 1; 1 if values are stored as they are
+    unit: int  # the number by which 1 is stored; 1 if stored numbers are the values
 
     def __getitem__(self, block: slice) -> np.ndarray:
         rows = self.stored[block]
@@ -227,17 +232,17 @@ class _Values:
 
 @dataclass(frozen=True)
 class _Content:
-    """The content of a ``.glb``; its binary chunk is read part by part."""
+    """The content of a ``.glb``, whose binary chunk is read part by part."""
 
     budget: ReadBudget
     file: IO[bytes]
     document: dict[str, Any]
     start: int  # of the binary chunk, in bytes from the start of the file
-    end: int
+    end: int  # of this chunk, likewise
     num_read: list[int] = field(default_factory=lambda: [0])  # bytes read so far, at most the size of the chunk
 
-    def packed(self, view_id: int) -> bytes:
-        """Read the bytes of a view of the buffer."""
+    def read_view(self, view_id: int) -> bytes:
+        """Read the bytes of a buffer view, which must lie in the chunk."""
         view = self.document["bufferViews"][view_id]
         at, length = view.get("byteOffset", 0), view["byteLength"]
         self.num_read[0] += length
@@ -246,7 +251,7 @@ class _Content:
         self.file.seek(self.start + at)
         return self.file.read(length)
 
-    def values(self, accessor_id: int) -> _Values:
+    def read_values(self, accessor_id: int) -> _Values:
         """Read the values of an accessor, which must lie in the chunk."""
         accessor = self.document["accessors"][accessor_id]
         if "sparse" in accessor or "bufferView" not in accessor:
@@ -272,12 +277,15 @@ class _Content:
 
 
 def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any], int]:
-    """Read the JSON of a ``.glb`` and the length that its header states, and move to the start of its binary chunk."""
+    """Return the JSON of a ``.glb`` and the length that its header states; the file is then at its binary chunk."""
     size = budget.file_bytes
-    start = file.read(_HEADER.size + _CHUNK.size)
-    if len(start) < _HEADER.size + _CHUNK.size:
+    start = file.read(_FILE_HEAD.size + _CHUNK_HEAD.size)
+    if len(start) < _FILE_HEAD.size + _CHUNK_HEAD.size:
         raise _ForeignError("an early end of file")
-    (magic, version, total), (length, kind) = _HEADER.unpack_from(start), _CHUNK.unpack_from(start, _HEADER.size)
+    (magic, version, total), (length, kind) = (
+        _FILE_HEAD.unpack_from(start),
+        _CHUNK_HEAD.unpack_from(start, _FILE_HEAD.size),
+    )
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
         raise _ForeignError("a file that is no binary glTF 2.0")
     if total > size or length > total - len(start):
@@ -288,7 +296,7 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any],
     missing = set(document.get("extensionsRequired", ())) - READ_EXTENSIONS
     if missing and NAME in str(document.get("extensionsUsed")):
         raise _ForeignError(f"one that requires {', '.join(sorted(map(str, missing)))}, which is not supported")
-    file.read(_CHUNK.size)
+    file.read(_CHUNK_HEAD.size)
     return document, total
 
 
@@ -303,13 +311,14 @@ def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple
             raise _ForeignError(f"one with two parents of node {node_id}")
         visited.add(node_id)
         node = nodes[node_id]
-        transform = parent_transform if _TRANSFORMS.isdisjoint(node) else matmul(parent_transform, _node_matrix(node))
+        transform = parent_transform if _MOVING_KEYS.isdisjoint(node) else matmul(parent_transform, _node_matrix(node))
         primitives = document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []
         yield from ((primitive, transform) for primitive in primitives if NAME in primitive.get("extensions", {}))
         stack += [(child, transform) for child in reversed(node.get("children", []))]
 
 
 def _node_matrix(node: dict[str, Any]) -> np.ndarray:
+    """Return the matrix ``[4,4]`` by which a node moves its mesh and its children."""
     if "matrix" in node:
         return np.ascontiguousarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
     x, y, z, w = node.get("rotation", (0, 0, 0, 1))
@@ -321,18 +330,18 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Attributes:
-    """The attributes of a primitive; ``read`` adds the bytes of each to ``sizes``."""
+    """The attributes of a primitive, and the bytes that were read of them."""
 
     content: _Content
     ids: dict[str, Any]  # of accessors, by name of the attribute
-    sizes: dict[str, int]  # bytes by attribute of Gaussians
+    sizes: dict[str, int]  # attribute of Gaussians -> bytes
 
     def read(self, kind: str, width: int, name: str) -> _Values:
-        """Read the attribute with a name, whose values have ``width`` numbers."""
+        """Read the glTF attribute ``name``, whose values have ``width`` numbers; add its bytes to those of ``kind``."""
         if name not in self.ids:
             raise _ForeignError(f"one whose Gaussians have no {name}")
         bytes_before = self.content.num_read[0]
-        values = self.content.values(self.ids[name])
+        values = self.content.read_values(self.ids[name])
         if values.stored.shape[1] != width:
             raise _ForeignError(f"one with {values.stored.shape[1]} numbers of {name} per Gaussian")
         self.sizes[kind] = self.sizes.get(kind, 0) + self.content.num_read[0] - bytes_before
@@ -340,12 +349,12 @@ class _Attributes:
 
 
 def _read_splats(content: _Content, primitive: dict[str, Any], transform: np.ndarray, sizes: dict[str, int]) -> Packed:
-    """Read one primitive, apply the matrix ``transform [4,4]``, and add its bytes to ``sizes`` by attribute."""
+    """Read a primitive, and add its bytes to ``sizes``; the matrix ``transform [4,4]`` is applied to its Gaussians."""
     splats, attributes = primitive["extensions"][NAME], _Attributes(content, primitive.get("attributes", {}), sizes)
     if COMPRESSED in splats.get("extensions", {}):
-        packed = content.packed(splats["extensions"][COMPRESSED]["bufferView"])
-        _, rows, of_columns, _ = read_packed(content.budget.path, packed)
-        sizes |= {name: sizes.get(name, 0) + size for name, size in of_columns.items()}
+        packed = content.read_view(splats["extensions"][COMPRESSED]["bufferView"])
+        _, rows, column_bytes, _ = read_packed(content.budget.path, packed)
+        sizes |= {name: sizes.get(name, 0) + size for name, size in column_bytes.items()}
         rotate = _transformer(transform, rows.num_higher)
         return Packed(rows.count, rows.num_higher, lambda block: rotate(rows.unpack(block)))
     kind = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
@@ -390,7 +399,7 @@ def _transformer(transform: np.ndarray, num_higher: int) -> Callable[[Columns], 
     tolerance = 1e-3  # largest difference of the scales of a node's axes, and largest cosine between two axes
     if is_mirror or not (np.isfinite(transform).all() and deviation < tolerance):
         raise _ForeignError("one with a node that stretches or mirrors its Gaussians")
-    rotate = turner(rotation, num_higher)
+    rotate = rotator(rotation, num_higher)
 
     def apply(columns: Columns) -> Columns:
         rotated = rotate(columns)

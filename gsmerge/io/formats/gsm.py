@@ -1,4 +1,4 @@
-"""Read and write states (``.gsm``), in which ``extend`` stores batches of views: a safetensors file with a header.
+"""Read and write states (``.gsm``), safetensors files with a header in which ``extend`` stores batches of views.
 
 The only metadata entry is the header in JSON, with checksums of itself and of each array. Files of the kind ``scene``
 hold results with their cameras and pictures, which are read here. Files of the kind ``features`` hold Feature Gaussians
@@ -31,13 +31,13 @@ from gsmerge.version import __version__
 
 SCHEMA = 3  # version of the whole file; gsmerge 0.3.0 and earlier wrote lower ones
 HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; gsmerge 0.1 wrote the second
-SCENE, FEATURES = "scene", "features"  # kinds
+SCENE, FEATURES = "scene", "features"  # kinds of files
 REMEDY = "run extend again with all batches"
-# Each entry of the header, with its type
+# Entry of the header -> its type
 HEADER_ENTRIES: Mapping[str, type] = {
     "schema": int, "gsmerge": str, "kind": str, "width": int, "height": int, "names": list, "about": dict,
 }  # fmt: skip
-NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0, by the degree
+NUM_HIGHER = (0, 3, 8, 15, 24)  # numbers of harmonics above degree 0, for degree 0 to 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class GsmFile:
         return SceneError(self.path, problem, "copy it again, or " + REMEDY)
 
     def array(self, name: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
-        """Return an array of a type and shape (None: any size); SceneError if no array has these."""
+        """Return the array of a name; SceneError unless it has this type and shape, in which None is any size."""
         array = self.arrays.get(name)
         expected = f"{name}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
         if array is None:
@@ -82,9 +82,8 @@ def write_gsm(
     data = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     with atomic_output(path, overwrite=overwrite, mode=mode) as temporary:
         header["checksums"] = _checksums(header, data)
-        temporary.write_bytes(
-            save(data, {HEADER: json.dumps(header)})
-        )  # one entry, since safetensors varies the order of several
+        # One entry, since safetensors writes several in an order that varies
+        temporary.write_bytes(save(data, {HEADER: json.dumps(header)}))
 
 
 def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
@@ -96,7 +95,7 @@ def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> d
 
 
 def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
-    """Read a ``.gsm`` of a ``kind``, or of any kind (None); SceneError for other files or a wrong checksum."""
+    """Read a ``.gsm`` of a ``kind``, or of any kind if None; SceneError for other files or a wrong checksum."""
     path = Path(path)
     metadata, arrays = read_tensors(path, "a .gsm file", REMEDY)
     header = _parse_header(path, metadata)
@@ -116,7 +115,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Parse the header of a file; SceneError if there is none or it has another schema."""
+    """Parse the header of a file; SceneError if there is none, or if its schema or an entry is wrong."""
     text = metadata.get(HEADER, metadata.get(ENCODED))
     if text is None:
         raise SceneError(path, "expected a .gsm of gsmerge, found another safetensors file", "name the .gsm")
@@ -142,7 +141,7 @@ def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwrite: bool, mode: int) -> None:
-    """Write a scene without pixels, with its cameras, its pictures as uint8, and facts ``about`` it as JSON."""
+    """Write a scene without pixels: its Gaussians, cameras, pictures as uint8, and facts ``about`` it as JSON."""
     arrays = {name: np.asarray(column, np.float32) for name, column in vars(scene.gaussians).items()}
     cameras = scene.cameras
     arrays |= {name: np.asarray(getattr(cameras, name), np.float64) for name in ("viewmats", "Ks")}
@@ -208,7 +207,7 @@ def holds_views(path: Path) -> bool:
 
 
 def read_views(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a ``.gsm``, with the pictures of results."""
+    """Read the cameras and pictures of a ``.gsm`` of results; SceneError if any of them are missing or damaged."""
     file = read_gsm(source.path)
     cameras = stored_cameras(file)
     names = stored_names(file, len(cameras))
@@ -219,7 +218,7 @@ def read_views(source: CameraSource) -> StoredCameras:
 
 
 def stored_names(file: GsmFile, num_views: int) -> tuple[str, ...]:
-    """Return the names of a file's views."""
+    """Return the names of a file's views; SceneError unless there are ``num_views``."""
     names = file.header["names"]
     if len(names) != num_views or not all(isinstance(name, str) for name in names):
         raise file.error(f"names: expected {num_views} names, one per view, found others")
@@ -227,7 +226,7 @@ def stored_names(file: GsmFile, num_views: int) -> tuple[str, ...]:
 
 
 def stored_cameras(file: GsmFile) -> Cameras:
-    """Return the cameras of a file."""
+    """Return the cameras of a file; SceneError if they are damaged."""
     viewmats = file.finite("viewmats", np.float64, None, 4, 4)
     width, height = file.header["width"], file.header["height"]
     check_image_size(file.path, width, height)

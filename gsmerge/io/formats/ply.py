@@ -1,4 +1,4 @@
-"""Read and write PLY files with INRIA's columns; headers are checked against the size of the file."""
+"""Read and write PLY files with INRIA's columns; each header is checked against the size of its file."""
 
 from __future__ import annotations
 
@@ -36,17 +36,16 @@ MAX_DEGREE = 3  # of the harmonics in results; splat-transform 3.7 and gsply ref
 COMMENT_BYTES = len(f"comment {arrays.new_views_comment(arrays.ExpectedScores(-100, -100, -100, -100))}\n")
 MAX_READ_DEGREE = 4  # of harmonics in files of other programs
 THIN = 1e-3  # third scale of a 2D Gaussian, relative to its smaller scale
-MAX_LOGIT = 16.0  # from 16.6 on, the sigmoid rounds to 1 in float32, whose logit is infinite
-BLOCK_BYTES = 1 << 19  # rows converted at a time; they stay in the processor's cache for all columns
+MAX_LOGIT = 16.0  # from 16.6 on, the sigmoid rounds to 1 in float32, and the logit of 1 is infinite
+BLOCK_BYTES = 1 << 19  # bytes of rows that are converted at a time; they stay in the processor's cache
 
 _PREFIXED = "the prefix {!r} of the columns' names, as CloudCompare writes it, is ignored"
-_AGAIN = "copy or export it again"
 MAX_HEADER_BYTES = 1 << 20
-MAX_LINE = 1 << 20  # characters of a row of text; its words take many times as much memory
-_TYPES = {  # PLY's names of types by NumPy's
+MAX_LINE = 1 << 20  # most characters of a row of text, since its words take many times as much memory
+_PLY_TYPES = {  # NumPy's names of types -> PLY's names
     "i1": "char", "i2": "short", "i4": "int", "f4": "float", "u1": "uchar", "u2": "ushort", "u4": "uint", "f8": "double"
 }  # fmt: skip
-_SIZES = {
+_SIZES = {  # names of types -> bytes of a number
     **dict.fromkeys(("char", "uchar", "int8", "uint8", "i1", "u1", "b1"), 1),
     **dict.fromkeys(("short", "ushort", "int16", "uint16", "i2", "u2"), 2),
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32", "i4", "u4", "f4"), 4),
@@ -88,7 +87,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
 
 
 def _find_white(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[float, list[str]]:
-    """Find the stored value of a full channel of plain colours; also return notes."""
+    """Find the number that stands for a full channel of plain colours as floats, 1 or 255; also return notes."""
     colors = arrays.color_columns(rows.dtype.names)
     float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
     if float_colors and np.nanmedian(read_columns(path, rows, colors[:1])[colors[0]]) > 1:
@@ -109,9 +108,9 @@ def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequen
 
 
 def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
-    """Return a block of rows with three log scales; 2D Gaussians get a thin third scale.
+    """Return a block of rows with three log scales, and with plain colours divided by ``white``.
 
-    ``white``: stored value of a full colour channel.
+    2D Gaussians get a thin third scale.
     """
     columns = {name: rows[name] for name in rows.dtype.names or ()}
     if white != 1:
@@ -132,7 +131,10 @@ def is_from_gsmerge(comments: Sequence[str]) -> bool:
 
 
 def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
-    """Return the rows of the Gaussians without the prefix of their columns' names, and this prefix."""
+    """Return the rows of the Gaussians without a prefix in the names of columns, and this prefix.
+
+    SceneError if required columns are missing, or if there is no row.
+    """
     if "vertex" not in data:
         names = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
         raise SceneError(path, f"expected an element 'vertex', found {names}", "name a .ply of Gaussians")
@@ -157,10 +159,10 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
 
 
 def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return rows without the prefix before the names of the columns, and this prefix; "" if there is none.
+    """Return rows without a prefix in the names of columns, and this prefix; "" if there is none.
 
-    Columns ``rotation_0`` to ``rotation_3`` are renamed, too. CloudCompare writes "scalar_" before names that are not
-    its own, and "scalar_scal_" if it writes the file again.
+    Columns ``rotation_0`` to ``rotation_3`` get their usual names. CloudCompare writes "scalar_" before names that are
+    not its own, and "scalar_scal_" if it writes the file again.
     """
     names, known_name = tuple(rows.dtype.names or ()), arrays.QUATS[0]
     prefix = next((name.removesuffix(known_name) for name in names if name.endswith(known_name)), "")
@@ -175,6 +177,7 @@ def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
+    """Count the columns ``f_rest_*``; SceneError if they are not those of a degree."""
     names = {name for name in columns if name.startswith("f_rest_")}
     if len(names) not in (0, 9, 24, 45, 72) or names != {f"f_rest_{i}" for i in range(len(names))}:
         numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
@@ -214,14 +217,17 @@ def _bytes_by_attribute(row: np.dtype[Any], count: int) -> dict[str, int]:
 
 
 def _packed_bytes(rows: np.ndarray | arrays.PackedRows) -> dict[str, int]:
-    """Count the bytes of packed rows by attribute: a word for each, the fourth with colour and opacity."""
+    """Count the bytes of packed rows by attribute.
+
+    A row has four words of 4 bytes, one of which holds colour and opacity, and a byte for each higher harmonic.
+    """
     num_rest = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
     each = {"means": 4, "quats": 4, "scales": 4, "sh0": 3, "opacities": 1, "shN": num_rest}
     return {name: size * len(rows) for name, size in each.items() if size}
 
 
 def no_ply(path: Path) -> SceneError:
-    """Make the error of a file that is no PLY file: a picture by its ending, cameras by its content, or another one."""
+    """Make the error of a file that is no PLY file, which says so if it is a picture or holds cameras."""
     if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES:
         remedy = "make Gaussians from photos with a model first, and name its .ply"
         return SceneError(path, "expected Gaussians, found a picture", remedy)
@@ -234,8 +240,8 @@ def no_ply(path: Path) -> SceneError:
 def open_ply(path: Path) -> tuple[PlyData, int]:
     """Open a PLY file, and count the bytes after its last element.
 
-    Binary vertices that are not packed are mapped for :func:`open_rows`.
-    SceneError if it is no PLY file, is truncated or damaged, or is shorter than its header says.
+    Binary vertices that are not packed are mapped, and :func:`open_rows` reads them. SceneError if the file is no PLY
+    file, is damaged, or is shorter than its header says.
     """
     budget = read_budget(path)
     try:
@@ -244,10 +250,11 @@ def open_ply(path: Path) -> tuple[PlyData, int]:
         if start[:4] not in (b"ply\n", b"ply\r"):
             raise no_ply(path)
         end, text = _check_header(start, budget)
-        with _stream(path, end, text=text) as file, quiet_warnings():  # of an empty list, or too large a number
+        with _stream(path, end, text=text) as file, quiet_warnings():  # about an empty list, or too large a number
             data = PlyData.read(file, mmap="r")
             num_left = len(file.read().strip()) if text else budget.file_bytes - file.tell()
-        mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)  # Windows replaces no mapped file
+        # Windows cannot replace a mapped file
+        mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)
         for element in data.elements:
             if isinstance(element.data, np.memmap) and element.name not in mapped:
                 with open_rows(path, element.data) as read:
@@ -261,11 +268,14 @@ def open_ply(path: Path) -> tuple[PlyData, int]:
         raise _truncated(path, expected, row or 0, error.message) from error
     except (PlyParseError, ValueError, ArithmeticError) as error:
         problem = f"expected a readable PLY file, found a damaged one ({error})"
-        raise SceneError(path, problem, _AGAIN) from error
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN) from error
 
 
 def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
-    """Open a PLY file for the parser, without bytes beyond ASCII in the header and without empty lines of text."""
+    """Open a PLY file for the parser, which gets only ASCII in the header, and no empty lines of text.
+
+    ``end``: the size of the header in bytes. ``text``: whether the rows are text.
+    """
     if text:
         return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
     file = _BinaryRows(FileIO(str(path)))
@@ -274,7 +284,7 @@ def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
 
 
 class _TextRows(TextIOWrapper):
-    """A PLY file of text, whose empty lines are skipped."""
+    """A PLY file of text that skips empty lines."""
 
     def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # bytes in the base of all
         line = super().readline(MAX_LINE)
@@ -299,8 +309,8 @@ class _BinaryRows(BufferedReader):
 def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
-    Rows of a mapped file are read from the file, not from its memory. Access to a mapped file that became shorter would
-    end the process; reading the file raises SceneError.
+    Rows of a mapped file are read from the file, not from the mapped memory. If the file becomes shorter, access to
+    that memory would end the process, while reading the file raises SceneError.
     """
     if not isinstance(rows, np.memmap):
         yield rows.__getitem__
@@ -322,12 +332,12 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
         yield read
 
 
-def header_counts(path: Path, *, held: bool = False) -> tuple[int, int]:
-    """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if unreadable.
+def header_counts(path: Path, *, check_size: bool = False) -> tuple[int, int]:
+    """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if it is unreadable.
 
-    ``held``: zeros also if the file is too short for its header.
+    ``check_size``: also return zeros if the file is too short for the rows in its header.
     """
-    header = _read_start(path, check=held)
+    header = _read_header(path, check_size=check_size)
     match = re.search(r"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
     num_rest = len(re.findall(r"^property \S+ \w*f_rest_\d+\s*$", header, re.MULTILINE))
     return int(match[1]) if match else 0, min(num_rest, 3 * ((MAX_READ_DEGREE + 1) ** 2 - 1))
@@ -336,9 +346,9 @@ def header_counts(path: Path, *, held: bool = False) -> tuple[int, int]:
 def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
     """Guess from the header of a PLY file whether it is a result of gsmerge, has Gaussians, or has other columns.
 
-    A file that cannot be read, or has a longer header, counts as Gaussians.
+    A file that cannot be read, or whose header is longer than 64 KiB, counts as Gaussians.
     """
-    header = _read_start(path)
+    header = _read_header(path)
     if arrays.RESULT_COMMENT in _list_comments(header):
         return "result"
     columns = re.findall(r"^property .*?(\w+)\s*$", header, re.MULTILINE)
@@ -349,32 +359,35 @@ def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
 
 def is_file_from_gsmerge(path: Path) -> bool:
     """Return whether the comments of a PLY file say that gsmerge wrote it."""
-    return is_from_gsmerge(_list_comments(_read_start(path)))
+    return is_from_gsmerge(_list_comments(_read_header(path)))
 
 
-def _read_start(path: Path, *, check: bool = False) -> str:
-    """Return a PLY file's header, of at most 64 KiB; empty if it is longer or unreadable, or fails the ``check``."""
+def _read_header(path: Path, *, check_size: bool = False) -> str:
+    """Return a PLY file's header of at most 64 KiB; "" if it is longer or unreadable.
+
+    ``check_size``: also return "" if :func:`_check_header` refuses the file.
+    """
     try:
         budget = read_budget(path)  # first, since reading a pipe would never end
         with path.open("rb") as file:
             start = file.read(1 << 16)
-        if check:
+        if check_size:
             _check_header(start, budget)
-    except (OSError, SceneError, ValueError):  # ValueError: no number of rows
+    except (OSError, SceneError, ValueError):  # ValueError: a number of rows with too many digits
         return ""
     header, end, _ = start.decode("latin-1").partition("end_header")
     return header if end else ""
 
 
 def _list_comments(header: str) -> list[str]:
+    """List the comments of a header."""
     return re.findall(r"^comment (.*?)\s*$", header, re.MULTILINE)
 
 
 def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
-    """Return the size of a header in bytes, and whether rows are text.
+    """Return the size of a header in bytes, and whether rows are text; SceneError if the file is too short for them.
 
-    SceneError if the file is too short for its rows. ``start``: the first bytes of the file. The parser checks the rest
-    of the header.
+    ``start``: the first bytes of the file. The parser checks what this function does not.
     """
     path, size = Path(budget.path), budget.file_bytes
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
@@ -382,11 +395,11 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     end = start.find(last_line)
     if end < 0:
         found = f"no 'end_header' within {MAX_HEADER_BYTES >> 20} MiB" if size > len(start) else "an early end of file"
-        raise SceneError(path, f"expected a PLY header, found {found}", _AGAIN)
+        raise SceneError(path, f"expected a PLY header, found {found}", arrays.EXPORT_AGAIN)
     words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
     is_text = ["format", "ascii", "1.0"] in words
     elements = _parse_elements(words)
-    steps_per_element = 50  # steps of 20 microseconds in a ReadBudget; several readers open a file in turn
+    steps_per_element = 50  # steps of 20 microseconds in a ReadBudget; several readers open a file one after another
     budget.check_steps(steps_per_element * len(elements), "steps for elements")
     bytes_left = size - end - len(last_line)
     for element in elements:
@@ -408,7 +421,7 @@ class _Element:
 
     name: str
     count: int  # number of rows
-    # The words between "property" and the name: a type, or "list", the type of its length and the type of its values
+    # Of each column the words between "property" and its name: a type, or "list" with the types of length and values
     properties: list[list[str]] = field(default_factory=list)
 
 
@@ -428,27 +441,33 @@ def _check_element(budget: ReadBudget, element: _Element) -> None:
     path, name, count, num_columns = Path(budget.path), element.name, element.count, len(element.properties)
     has_lists = any(words[0] == "list" for words in element.properties)
     if count < 0:
-        raise SceneError(path, f"expected a number of rows, found {count} rows of element '{name}'", _AGAIN)
+        raise SceneError(
+            path, f"expected a number of rows, found {count} rows of element '{name}'", arrays.EXPORT_AGAIN
+        )
     if count and not num_columns:
-        raise SceneError(path, f"expected columns, found element '{name}' of {count} rows without any", _AGAIN)
+        raise SceneError(
+            path, f"expected columns, found element '{name}' of {count} rows without any", arrays.EXPORT_AGAIN
+        )
     unknown = sorted({words[0] for words in element.properties if len(words) == 1} - _SIZES.keys())
     if unknown:
         problem = f"expected columns of float or another type of PLY, found {unknown[0]!r:.40} in element '{name}'"
         raise SceneError(path, problem, "export it again with columns of float")
     if has_lists and name == "vertex":
-        raise SceneError(path, "expected one number per column and vertex, found a list property", _AGAIN)
-    max_list_values = 1_000_000  # lists of an element; they are read one value at a time
+        raise SceneError(path, "expected one number per column and vertex, found a list property", arrays.EXPORT_AGAIN)
+    max_list_values = 1_000_000  # most lists of an element, since they are read one value at a time
     if has_lists and count * num_columns > max_list_values:
         problem = f"expected at most {max_list_values:,} lists, found element '{name}' with lists in {count:,} rows"
         raise SceneError(path, problem, "export it without this element")
     if has_lists:
-        list_bytes = 140  # memory of each list
+        list_bytes = 140  # bytes of memory for each list
         budget.check_memory(list_bytes * count * num_columns, f"lists in {count:,} rows")
 
 
 def _truncated(path: Path, expected: str, num_whole: int, reason: str) -> SceneError:
-    """Make the SceneError for a file that ends early or is damaged after ``num_whole`` complete rows."""
-    return SceneError(path, f"truncated or damaged: expected {expected}, found {num_whole} complete ({reason})", _AGAIN)
+    """Make the SceneError of a file that ends early, or is damaged, after ``num_whole`` complete rows."""
+    return SceneError(
+        path, f"truncated or damaged: expected {expected}, found {num_whole} complete ({reason})", arrays.EXPORT_AGAIN
+    )
 
 
 def ply_blocks(
@@ -492,7 +511,7 @@ def _header(
 ) -> tuple[bytes, int]:
     """Return the header of a ``.ply`` of ``count`` Gaussians, and its number of float32 columns.
 
-    ``extra``: names of the columns that follow these -> NumPy's names of their types.
+    ``extra``: name of each column that follows these -> NumPy's name of its type.
     """
     num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
     names = [
@@ -506,12 +525,12 @@ def _header(
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
     lines += [f"property float {name}" for name in names]
-    lines += [*(f"property {_TYPES[kind]} {name}" for name, kind in extra.items()), "end_header", ""]
+    lines += [*(f"property {_PLY_TYPES[kind]} {name}" for name, kind in extra.items()), "end_header", ""]
     return "\n".join(lines).encode("ascii"), len(names)
 
 
 def file_bytes(count: int, sh_degree: int) -> int:
-    """Return the size in bytes of a result of ``count`` Gaussians as a ``.ply`` without further comments."""
+    """Return the size in bytes of a ``.ply`` with ``count`` Gaussians, whose only comment is that on opacities."""
     header, num_columns = _header(count, min(sh_degree, MAX_DEGREE))
     return len(header) + 4 * num_columns * count
 
@@ -519,7 +538,7 @@ def file_bytes(count: int, sh_degree: int) -> int:
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits.
 
-    A comment on new views is counted, whether the result has one or not.
+    The longest comment on new views is counted, whether the result has one or not.
     """
     if not 0 <= sh_degree <= MAX_READ_DEGREE:
         raise ValueError(f"sh_degree: expected 0 to {MAX_READ_DEGREE}, got {sh_degree}")

@@ -1,4 +1,4 @@
-"""Read Gaussians from files: convert log scales, logits and channel-major harmonics to the units of the package."""
+"""Read Gaussians from files: convert stored columns, such as log scales and logits, to the units of the package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsmerge.errors import Doubt, SceneError
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits, find_units, judge_colors, state_colors
+from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits, choose_units, find_units, judge_colors
 from gsmerge.io.formats.scale_units import LINEAR_NOTE, SAMPLES, ScaleJudgement, judge_scales, log_of_scales
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
 from gsmerge.kernels.elementary import exp, log
@@ -26,7 +26,7 @@ from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
 MAX_HARMONIC = 1e6  # no scene has larger harmonics; float32 can square and sum rendered values below
-FREED_ROWS = 1 << 17  # rows after which the memory of large columns is freed
+FREED_ROWS = 1 << 17  # the memory of large columns is freed each time when this number of rows is converted
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class FileInfo:
     """Facts about a file of Gaussians; its columns are those of a PLY file with the same content."""
 
     path: str
-    layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
+    layout: str  # name of the column layout, such as "17-column export" or "INRIA, SH degree 3"
     format: str  # "ascii", "binary little-endian" or "binary big-endian"
     count: int  # number of rows, including unusable ones
-    file_bytes: int  # an index of levels counts with the chunks of the level that is read
+    file_bytes: int  # bytes of the file; of levels of detail, also of the chunks of the level that is read
     # Bytes of the rows by attribute: means, normals, sh0, shN, opacities, scales, quats, extra. For an ascii file, the
     # bytes of the binary types; for .spz, before compression; for .sog, of the textures (sh0 includes the opacities)
     bytes_by_attribute: dict[str, int]
@@ -52,11 +52,11 @@ class FileInfo:
     num_nonfinite: int  # rows with NaN, inf, a log scale above 30 or a harmonic beyond +-1e6, which are set aside
     num_empty: int  # rows that only pad the file, which are set aside
     num_zero_quats: int  # Gaussians with a zero quaternion, read as the identity
-    # why the scales are likely wrong, one sentence without a full stop; empty if they are plausible
+    # Why the scales are likely wrong, in one sentence without a full stop; empty if they are plausible
     odd_scales: str = ""
-    color_units: ColorUnits | None = None  # in which the file has RGB in the columns of harmonics; None if it has not
-    color_note: str = ""  # that these units were guessed, one sentence without a full stop
-    open_units: ColorUnits | None = None  # in which the columns may hold RGB, if photos show that; None: they do not
+    color_units: ColorUnits | None = None  # units of RGB in the columns of harmonics; None if these hold harmonics
+    color_note: str = ""  # says that these units were guessed, in one sentence without a full stop
+    open_units: ColorUnits | None = None  # units in which the columns hold RGB if photos show it; None: no such units
     adapted: tuple[str, ...] = ()  # how the content was adapted, one sentence each without a full stop
 
 
@@ -140,9 +140,9 @@ def read_parts(
     scales: ScaleChoice = "auto",
     colors: ColorChoice = "auto",
 ) -> GaussianFile:
-    """Read files as one, in the given order: a PLY file or PLY files with equal columns.
+    """Read one or several PLY files as one file, in the given order.
 
-    Errors are those of :func:`read_ply`.
+    Errors are those of :func:`read_ply`; SceneError also if their columns differ.
     """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
@@ -192,7 +192,10 @@ def convert_files(
     scales: ScaleChoice = "auto",
     colors: ColorChoice = "auto",
 ) -> GaussianFile:
-    """Convert the rows of files to Gaussians, file by file; facts that are not sums are those of the first file."""
+    """Convert the rows of files to Gaussians, file by file.
+
+    Counts and bytes in the facts are sums over the files, and all other facts are those of the first file.
+    """
     path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
     names = tuple(dtype.names or ())
     file_bytes = sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True))
@@ -245,9 +248,9 @@ def convert_files(
 
 
 def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.ndarray]:
-    """Make the uninitialised arrays of ``n`` Gaussians, with ``valid``.
+    """Make uninitialised arrays of ``n`` Gaussians by name, and the array ``valid``.
 
-    ``dtype``: the columns of the stored rows. ``file_bytes``: the size of the files, which bounds arrays in memory.
+    ``dtype``: the columns of the stored rows. ``file_bytes``: the size of the files, which limits arrays in memory.
     """
     names = tuple(dtype.names or ())
     num_higher = sum(name.startswith("f_rest_") for name in names) // 3
@@ -259,7 +262,7 @@ def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.
 
 
 def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with the rows of all files; return the numbers of clipped Gaussians and of zero quaternions."""
+    """Fill arrays with the rows of all files; return the numbers of rows with clipped values and with zero quats."""
     num_clipped = num_zero_quats = start = 0
     for path, part in zip(paths, parts, strict=True):
         part_rows = slice(start, start + len(part.rows))
@@ -271,15 +274,17 @@ def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[s
 def _judge_scales(
     paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray], choice: ScaleChoice
 ) -> ScaleJudgement:
-    """Judge whether stored scales are linear, from ``out``, into which they were read as logarithms.
+    """Judge whether stored scales are linear; ``out`` has the scales that follow if they are logarithms.
 
-    Only rows of a PLY file may be linear. Unless the caller states it, they are not in files that gsmerge wrote.
+    Only the scales of a PLY file may be linear. Those in a file of gsmerge are logarithms, unless the caller states
+    something else.
     """
     judgement, columns = judge_scales(out), arrays.color_columns(parts[0].rows.dtype.names)
     if not isinstance(parts[0].rows, np.ndarray) or (choice == "auto" and parts[0].encoding is not None):
         return ScaleJudgement(False, "" if judgement.linear else judgement.why)
     if choice == "linear":
         with np.errstate(all="ignore"):
+            # ``out`` has the exponentials of the stored numbers, which are below 1 for negative numbers
             negative = 100 * float(np.count_nonzero(out["scales"][out["valid"]] < 1)) / max(1, 3 * out["valid"].sum())
         if negative > 100 * arrays.MAX_STRAY:
             problem = f"expected scales of at least 0, as --hint scales=linear says, found {negative:.3g} % below"
@@ -296,8 +301,8 @@ def _choose_colors(
 ) -> tuple[ColorUnits | None, str, ColorUnits | None]:
     """Choose the units of stored colours, None for harmonics; return them, a note, and units that photos may confirm.
 
-    Only rows of a PLY file may hold RGB in place of harmonics. Unless the caller states it, files that gsmerge wrote do
-    not.
+    Only a PLY file may have RGB in place of harmonics. A file of gsmerge has harmonics, unless the caller states
+    something else.
     """
     names = part.rows.dtype.names or ()
     is_stated = choice == "sh" or (choice == "auto" and part.encoding is not None)
@@ -307,7 +312,7 @@ def _choose_colors(
     rows = rows[:: max(1, len(rows) // SAMPLES)]
     stored = out["sh0"][rows, 0]
     if choice == "rgb":
-        return state_colors(stored), "", None
+        return choose_units(stored), "", None
     has_plain = all(name in names and part.rows.dtype[name] == np.uint8 for name in arrays.PLAIN_COLORS[0])
     first = rows[rows < len(part.rows)]
     plain = np.stack([part.rows[name][first] for name in arrays.PLAIN_COLORS[0]], 1) if has_plain else None
@@ -318,17 +323,18 @@ def _choose_colors(
 
 
 def _with_linear_scales(part: StoredRows) -> StoredRows:
-    """Return rows whose scales are stored linearly as rows with log scales."""
+    """Return rows that convert their linear scales to log scales when a block is read."""
     adapt = part.adapt
     return replace(part, adapt=lambda rows: log_of_scales(rows) if adapt is None else adapt(log_of_scales(rows)))
 
 
 def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with the rows of a file; return the numbers of clipped Gaussians and of zero quaternions."""
+    """Fill arrays with the rows of one file; return counts as :func:`_fill_arrays` does."""
     n, block_rows = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
     with ply.open_rows(path, stored.rows) as read:
 
         def convert(start: int) -> tuple[int, int]:
+            """Convert the block of rows from ``start`` on; return its counts."""
             block = slice(start, min(start + block_rows, n))
             rows = read(block) if stored.adapt is None else stored.adapt(read(block))
             counts = _convert(rows, {name: array[block] for name, array in out.items()})
@@ -341,7 +347,7 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
 
 
 def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of a block of rows, with opacities as stored; return counts as :func:`_convert_file`."""
+    """Fill the arrays of a block of rows, with opacities as stored; return counts as :func:`_convert_file` does."""
     num_plain = _convert_plain(rows, out)
     out["valid"][:num_plain] = True
     if num_plain == len(rows):
@@ -350,10 +356,10 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
 
 
 def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
-    """Fill arrays with the rows before the first one that needs special treatment, and return their number.
+    """Fill arrays with the plain rows at the start of a block, and return the number of these rows.
 
-    :func:`gsmerge.kernels.stored_rows.convert_rows` defines these rows. The number is 0 if a used column is missing or
-    any column is not float32.
+    :func:`gsmerge.kernels.stored_rows.convert_rows` says which rows are plain. The number is 0 if a used column
+    is missing or any column is not float32.
     """
     columns: dict[str, Any] = dict(rows.dtype.fields or {})  # name -> type and offset in bytes
     num_higher = out["shN"].shape[1]
@@ -373,7 +379,7 @@ def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
 
 
 def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of rows of any kind; return counts as :func:`_convert_file`.
+    """Fill the arrays of rows with columns of any kind; return counts as :func:`_convert_file` does.
 
     A row is valid if all its values are finite, except for infinite logits and scales of zero.
     """
@@ -381,6 +387,7 @@ def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int,
     rest_names = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
 
     def read(names: Sequence[str]) -> np.ndarray:
+        """Return columns side by side, ``[n,len(names)]`` float32."""
         values = np.empty((len(rows), len(names)), np.float32)
         for j, name in enumerate(names):
             values[:, j] = rows[name]
@@ -408,7 +415,7 @@ def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int,
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions to ``out [n,4]``, or the identity for zero quaternions; return the mask of the latter."""
+    """Write unit quaternions to ``out [n,4]``, and the identity for zero quaternions; return which are zero ``[n]``."""
     w, x, y, z = quats
     squared = w * w + x * x + y * y + z * z
     inverse = 1 / np.sqrt(squared)
@@ -428,7 +435,7 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
 def _choose_encoding(
     paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray, empty: np.ndarray, choice: OpacityChoice
 ) -> tuple[str, bool]:
-    """Choose the encoding of opacities, and return whether it is guessed; ``empty`` rows are not considered."""
+    """Choose the encoding of opacities, and also return whether it is guessed; ``empty`` rows do not count."""
     if choice == "raw":
         _check_raw(paths[0], opacities)
     if choice != "auto":
@@ -506,7 +513,7 @@ def _spread_low_degree(shN: np.ndarray) -> None:
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
-    """Make invalid rows transparent, in place, and return their number; SceneError if hardly a row is valid."""
+    """Make invalid rows transparent, in place, and return their number; SceneError if hardly any row is valid."""
     valid = out["valid"]
     invalid = np.flatnonzero(~valid)
     num_valid = len(valid) - len(invalid)
@@ -523,9 +530,9 @@ def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
 def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     """Return the valid rows that only pad the file.
 
-    A row at the origin pads the file if it is not rotated, round and grey, as a row of zeros is. Rows at the origin
-    that are all equal also pad the file; VolSplat writes these. If a file has no other rows, a few of them count as
-    Gaussians; SceneError for many.
+    A row at the origin pads the file if it is not rotated, round and grey, as a row of zeros is. Many equal rows at
+    the origin also pad the file; VolSplat writes these. If a file has only such rows, a few of them count as Gaussians,
+    and many raise SceneError.
     """
     rows = np.flatnonzero((out["means"][:, 0] == 0) & out["valid"])
     rows = rows[(out["means"][rows] == 0).all(1)]
@@ -547,7 +554,7 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
-    """Make ``rows`` invalid and transparent, in place; they get the position and scales of the valid row before."""
+    """Make ``rows`` invalid, transparent and grey, in place, with position and scales of the valid row before them."""
     if len(rows) == 0:
         return
     out["valid"][rows] = False
@@ -560,7 +567,7 @@ def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
 
 
 def _set_aside_impossible(out: dict[str, np.ndarray]) -> list[str]:
-    """Make rows with numbers that no scene has invalid, in place; doubt a file in which these are more than strays."""
+    """Make rows invalid, in place, if they have numbers that no scene has; return a doubt if these rows are many."""
     is_possible = (out["scales"] < exp(np.float32(arrays.MAX_LOG_SCALE))).all(1)
     is_possible &= (np.abs(out["means"]) <= arrays.MAX_POSITION).all(1)
     is_possible &= (np.abs(np.concatenate([out["sh0"], out["shN"]], 1)) < MAX_HARMONIC).all((1, 2))
@@ -571,7 +578,7 @@ def _set_aside_impossible(out: dict[str, np.ndarray]) -> list[str]:
 
 
 def _describe_incomplete(valid: np.ndarray) -> tuple[str, ...]:
-    """Note a file whose export seems incomplete, because its last rows or most of its rows are no Gaussians."""
+    """Return a doubt about an export in which the last rows, or most rows, are no Gaussians; empty for other files."""
     valid_rows = np.flatnonzero(valid)
     num_last = len(valid) - 1 - int(valid_rows[-1])  # rows after the last Gaussian
     num_invalid = len(valid) - len(valid_rows)

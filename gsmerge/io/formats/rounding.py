@@ -15,29 +15,28 @@ from gsmerge.io.formats.write import limit_notes, write_gaussians
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arrays import distinct
 
-# Renders change above this mean square of the moves of Gaussians: by .05 dB of 27. A move is in units of the Gaussian's
-# size and at most 1. Scenes around their origin have at most a tenth of this.
+# Renders change visibly, by .05 dB of 27, if the mean square of the Gaussians' moves is above this. A move is in units
+# of the Gaussian's size, and at most 1. Scenes around their origin have at most a tenth of this mean square.
 SHOWN_MOVE = 0.005
 ROUNDING_GAUSSIANS = 1 << 17  # number of Gaussians from which the mean is estimated
 
 
 def format_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
-    """Note what a file's format leaves out or rounds of Gaussians; UsageError for an unknown ending."""
+    """Note what a file's format leaves out of Gaussians, and how it moves them; UsageError for an unknown ending."""
     return limit_notes(path, gaussians.sh_degree, len(gaussians)) + rounding_notes(path, gaussians)
 
 
 def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
-    """Note how far a file's rounding moves Gaussians, and the remedy; empty if renders do not change visibly."""
+    """Note how far a format's rounding moves Gaussians, and the remedy; empty if renders do not change visibly."""
     if len(gaussians) == 0:
         return []
     format_, columns = output_format(path), gaussians.numpy()
     extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # from them formats choose their steps
     rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // ROUNDING_GAUSSIANS + 1), *extremes]))
-    means, (x, y, z) = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0).T
-    sizes = np.maximum(np.minimum(x, y), np.minimum(np.maximum(x, y), z))  # the second largest
+    means, scales = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0)
+    sizes = np.sort(scales, axis=1)[:, 1]  # a Gaussian is as large as its second largest scale
     with np.errstate(over="ignore"):
-        x, y, z = np.abs(format_.round_means(means) - means).T
-    moves = np.maximum(np.maximum(x, y), z)
+        moves = np.abs(format_.round_means(means) - means).max(axis=1)
     mean_square = float(np.square(np.minimum(moves / np.maximum(sizes, 1e-30), 1)).mean())
     if mean_square <= SHOWN_MOVE:
         return []
@@ -51,9 +50,9 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
 
 
 def round_as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
-    """Write Gaussians in the format of a path and read them back; return them unchanged if rounding is invisible.
+    """Return Gaussians as a file of the format of ``path`` has them; unchanged if rounding is invisible.
 
-    Formats that cannot be read back round the positions.
+    A temporary file is written and read. If the format cannot be read, only positions are rounded.
     """
     if not rounding_notes(path, gaussians):
         return gaussians

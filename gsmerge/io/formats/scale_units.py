@@ -1,4 +1,4 @@
-"""Judge whether stored scales are logarithms, as in most files, or linear, by the size of the scene."""
+"""Judge from the size of the scene whether stored scales are logarithms, as in most files, or linear."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ SAMPLES = 20_000  # Gaussians whose scales and colours are judged
 
 @dataclass(frozen=True)
 class ScaleJudgement:
-    """The more likely reading of stored scales; ``why`` is a clause, or "" if there is nothing to say."""
+    """The more likely meaning of stored scales."""
 
-    linear: bool
-    why: str
+    linear: bool  # False: logarithms
+    why: str  # clause that says why scales are linear, or why logarithms seem wrong; "": nothing to say
 
 
 def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
@@ -58,17 +58,17 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
 
 
 def _vary_little_as_logs(stored: np.ndarray) -> bool:
-    """Return whether positive ``stored [s]`` vary much as sizes, but hardly as logarithms of sizes."""
+    """Return whether numbers ``stored [s]`` are positive, and vary much as sizes, but hardly as logarithms of sizes."""
     low, high = (float(value) for value in quantiles(stored.astype(np.float64), (0.1, 0.9)))
-    # Natural logarithm of large sizes divided by small ones, at least: as a number, and for each unit of the difference
-    # of the stored values. Sizes in a file vary by 1.5:1 and more. Linear scales that are read as logarithms are all
-    # close to 1
+    # The natural logarithm of large sizes divided by small ones is at least the first number, and at least the second
+    # number times the difference of the stored values. Sizes in a file vary by 1.5:1 and more. Linear scales that are
+    # read as logarithms are all close to 1
     min_variation, min_slope = 0.4, 4.0
     return low > 0 and float(log(high / low)) > max(min_variation, min_slope * (high - low))
 
 
 def log_of_scales(rows: np.ndarray) -> np.ndarray:
-    """Return a copy of a block of rows with the logarithms of its linear scales; of a negative scale it is NaN."""
+    """Return a copy of a block of rows with logarithms of its linear scales; negative scales become NaN."""
     out: Any = rows.copy()
     with np.errstate(all="ignore"):
         for name in arrays.SCALES:

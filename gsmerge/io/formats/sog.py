@@ -42,7 +42,7 @@ from gsmerge.types import Gaussians
 from gsmerge.values.arrays import to_float32
 
 MAX_DEGREE = 3  # of harmonics, the highest of the format
-VERSION = 2  # of the format, in its metadata
+VERSION = 2  # of the format, as its metadata states it
 MODELS = {arrays.MIP: "antialiased", arrays.FLAT: "2dgs"}  # splat-transform's names of the modes of rendering
 GENERATOR = "gsmerge"
 # All files that writers make
@@ -51,24 +51,26 @@ SOG_FILES = (
     META,
 )  # fmt: skip
 FIRST_MODE = 252  # alpha of a rotation with w as the largest component; 253 to 255 stand for x, y and z
-PALETTE_BITS = 16  # of the number of a set of harmonics
-PALETTE_COLUMNS = 64  # sets of harmonics side by side in the texture of the palette
+PALETTE_BITS = 16  # bits of an index in the palette
+PALETTE_COLUMNS = 64  # entries of the palette that are side by side in its texture
 PACKED_BYTES = 19  # bytes of a Gaussian in the decoded textures
 CODES = 256  # number of values in a codebook
-_CELLS = 1 << 11  # number of cells of equal width, and of cells with equal counts of values, before mergers
+_CELLS = 1 << 11  # number of cells of equal width, and of cells with equal counts of values, before any are merged
 
 
 @dataclass(frozen=True)
 class _Bundle:
-    """Files of a ``.sog`` by name, in a zip; a file is refused if it unpacks to more bytes than the whole zip."""
+    """The files of a ``.sog`` in a zip; a file is refused if it unpacks to more bytes than the whole zip has."""
 
     archive: zipfile.ZipFile
     size: int  # bytes of the zip
 
     def num_bytes(self, name: str) -> int:
+        """Return the bytes of a file in the zip."""
         return self.archive.getinfo(name).compress_size
 
     def member(self, name: str) -> bytes:
+        """Read the content of a file; ValueError if it is refused."""
         info = self.archive.getinfo(name)
         if info.file_size > self.size:
             raise ValueError(f"{name} of {info.file_size} bytes")
@@ -77,12 +79,13 @@ class _Bundle:
 
 @dataclass(frozen=True)
 class _Folder:
-    """Files of a ``.sog`` by name, in a folder; names of files outside it are refused."""
+    """The files of a ``.sog`` in a folder; files outside it are refused."""
 
     folder: Path
     size: int  # bytes of all files
 
     def num_bytes(self, name: str) -> int:
+        """Return the bytes of a file; ValueError if it is refused."""
         path = self.folder / name
         inside = Path(os.path.realpath(path)).parent == Path(os.path.realpath(self.folder))
         if path.name != name or "\\" in name or not inside:
@@ -90,6 +93,7 @@ class _Folder:
         return check_file(path)
 
     def member(self, name: str) -> bytes:
+        """Read the content of a file; ValueError if it is refused."""
         size = self.num_bytes(name)
         if size > self.size:
             raise ValueError(f"{name} of {size} bytes")
@@ -104,24 +108,24 @@ class SogContent:
     """Content of one ``.sog``."""
 
     packed: arrays.Packed
-    sizes: dict[str, int]  # bytes of the textures by attribute
-    mode: str | None  # of rendering; see arrays.render_mode
+    sizes: dict[str, int]  # attribute -> bytes of its textures
+    mode: str | None  # mode of rendering, see arrays.render_mode
     num_bytes: int  # of all files
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
     """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or damaged."""
     budget = read_budget(path)
-    with _damage(path), open_archive(path) as archive:
+    with _damage_errors(path), open_archive(path) as archive:
         content = _read_content(_Bundle(archive, budget.file_bytes), budget)
     return arrays.to_stored([content.packed], f".sog version {VERSION}", content.sizes, content.mode)
 
 
 def read_unbundled(path: Path) -> SogContent:
     """Read the Gaussians of a ``meta.json`` and the textures beside it; SceneError as in :func:`read_rows`."""
-    names = read_text(path)
-    with _damage(path):
-        entries = (entry for entry in os.scandir(path.parent) if f'"{entry.name}"' in names or entry.name == path.name)
+    text = read_text(path)
+    with _damage_errors(path):
+        entries = (entry for entry in os.scandir(path.parent) if f'"{entry.name}"' in text or entry.name == path.name)
         size = sum(entry.stat().st_size for entry in entries)
         return _read_content(_Folder(path.parent, size), ReadBudget(path, size))
 
@@ -143,8 +147,8 @@ def is_folder(path: Path) -> bool:
 
 
 @contextmanager
-def _damage(path: Path) -> Iterator[None]:
-    """Convert all errors that damaged files cause in a reader to a SceneError."""
+def _damage_errors(path: Path) -> Iterator[None]:
+    """Convert all errors that a damaged file causes in the block to a SceneError."""
     try:
         with read_errors(path):
             yield
@@ -157,7 +161,7 @@ def _damage(path: Path) -> Iterator[None]:
         raise SceneError(path, problem, "export it again") from error
     except zlib.error as error:
         problem = f"expected a readable .sog file, found a damaged one ({error})"
-        raise SceneError(path, problem, "copy or export it again") from error
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN) from error
 
 
 def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
@@ -180,19 +184,19 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
 
 def _image_size(data: bytes) -> tuple[int, int]:
     """Return width and height of a lossless WebP image; ValueError for any other file."""
-    at = 12  # bytes of "RIFF", the file's size and "WEBP"
+    at = 12  # position after "RIFF", the file's size and "WEBP", bytes
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         # A chunk has 4 bytes of name, 4 bytes of size, and content that is padded to an even number of bytes
         while at + 8 <= len(data) and data[at : at + 4] in (b"VP8X", b"ICCP"):  # chunks before the image
             at += 8 + (int.from_bytes(data[at + 4 : at + 8], "little") + 1) // 2 * 2
         if data[at : at + 4] == b"VP8L" and len(data) >= at + 13:
-            bits = int.from_bytes(data[at + 9 : at + 13], "little")  # after the signature: 14 bits each, less 1
+            bits = int.from_bytes(data[at + 9 : at + 13], "little")  # width and height, less 1, of 14 bits each
             return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     raise ValueError("no WebP texture without loss")
 
 
 def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> np.ndarray:
-    """Decode ``[count,4]`` pixels RGBA of a texture; alpha is 255 if it has none."""
+    """Decode the first ``count`` pixels of a texture to RGBA ``[count,4]``; alpha is 255 if it has none."""
     data = files.member(name)
     width, height = _image_size(data)
     if not count <= width * height <= 4 * count + (1 << 16):
@@ -209,9 +213,10 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
 
 
 def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> arrays.Packed:
-    """Decode the textures and codebooks, and return their Gaussians; ValueError for damaged content."""
+    """Decode the textures and codebooks, and return the Gaussians in them; ValueError for damaged content."""
 
     def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
+        """Decode the first channels of one of the textures under a key of ``meta``."""
         pixels = _read_texture(files, meta[key]["files"][index], count, budget)
         return pixels[:, :channels].copy()  # a copy, so that unused channels take no memory
 
@@ -280,19 +285,22 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
     textures: dict[str, bytes] = {}
 
     def add(key: str, files: dict[str, bytes], **numbers: Any) -> None:
+        """Add textures, and an entry of ``meta`` with their names and numbers."""
         meta[key] = {**numbers, "files": list(files)}
         textures.update(files)
 
     fixed, low, high = _quantise_means(columns.means)
-    means_bytes = {"means_l.webp": _texture(fixed & 255), "means_u.webp": _texture(fixed >> 8)}
+    means_bytes = {"means_l.webp": _encode_texture(fixed & 255), "means_u.webp": _encode_texture(fixed >> 8)}
     add("means", means_bytes, mins=low, maxs=high)
     scales, sh0 = fit_codebook(columns.log_scales), fit_codebook(columns.sh0)
-    add("scales", {"scales.webp": _texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales))
+    add(
+        "scales", {"scales.webp": _encode_texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales)
+    )
     largest, smallest = arrays.smallest_three(columns.quats)
     quats = np.concatenate([arrays.to_bytes(255 * (smallest / np.sqrt(2.0) + 0.5)), FIRST_MODE + largest[:, None]], 1)
-    add("quats", {"quats.webp": _texture(quats)})
+    add("quats", {"quats.webp": _encode_texture(quats)})
     colors = np.concatenate([nearest_codes(sh0, columns.sh0), arrays.to_bytes(255 * columns.opacities)[:, None]], 1)
-    add("sh0", {"sh0.webp": _texture(colors)}, codebook=_shorten(sh0))
+    add("sh0", {"sh0.webp": _encode_texture(colors)}, codebook=_shorten(sh0))
     if columns.harmonics.size:
         files, numbers = _encode_palette(columns.harmonics)
         add("shN", files, **numbers)
@@ -308,8 +316,8 @@ def _encode_palette(harmonics: np.ndarray) -> tuple[dict[str, bytes], dict[str, 
     centroids = np.zeros((rows * PALETTE_COLUMNS, num_higher, 3), np.uint8)
     centroids[: len(palette)] = nearest_codes(codebook, palette).reshape(-1, num_higher, 3)
     files = {
-        "shN_centroids.webp": _webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
-        "shN_labels.webp": _texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
+        "shN_centroids.webp": _encode_webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
+        "shN_labels.webp": _encode_texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
     }
     return files, {"count": len(palette), "bands": arrays.sh_degree(num_higher), "codebook": _shorten(codebook)}
 
@@ -335,20 +343,20 @@ def _decode_means(fixed: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.nd
 
 
 def _shorten(values: np.ndarray) -> list[float]:
-    """Round to as few digits as float32 needs."""
+    """Round values to eight digits, which are enough for float32, so that the text of the file is short."""
     return [float(f"{value:.8g}") for value in values]
 
 
-def _texture(values: np.ndarray) -> bytes:
+def _encode_texture(values: np.ndarray) -> bytes:
     """Encode rows of channels as a lossless, roughly square WebP image, padded with zeros."""
     width = max(4, math.ceil(math.sqrt(len(values)) / 4) * 4)
     height = max(4, math.ceil(len(values) / width / 4) * 4)
     pixels = np.zeros((height * width, values.shape[1]), np.uint8)
     pixels[: len(values)] = values
-    return _webp(pixels.reshape(height, width, -1))
+    return _encode_webp(pixels.reshape(height, width, -1))
 
 
-def _webp(image: np.ndarray) -> bytes:
+def _encode_webp(image: np.ndarray) -> bytes:
     """Encode a lossless WebP image; only the colours of pixels whose alpha is 0 may change."""
     bgra = [2, 1, 0, 3][: image.shape[2]]  # OpenCV's order of channels
     lossless = 101  # OpenCV's WebP quality
@@ -387,13 +395,13 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
 def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
     """Merge neighbouring cells until 256 are left, and return their means.
 
-    ``numbers [n]``: values in each cell. ``means [n]``: the mean of these values.
+    ``numbers [n]``: how many values each cell has. ``means [n]``: the mean of these values.
     """
     count, mean = numbers.tolist(), means.tolist()
     previous, following = list(range(-1, len(count) - 1)), list(range(1, len(count) + 1))
 
     def merger(i: int) -> tuple[float, int, int, float, float]:
-        """Return the squared error that the merger of a cell with the next one adds, both cells, and their counts."""
+        """Return the squared error that merging a cell with the next one adds, both cells, and their counts."""
         j = following[i]
         return count[i] * count[j] / (count[i] + count[j]) * (mean[i] - mean[j]) ** 2, i, j, count[i], count[j]
 
@@ -401,7 +409,7 @@ def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
     heapq.heapify(heap)
     for _ in range(len(count) - CODES):
         _, i, j, *counts = heapq.heappop(heap)
-        while following[i] != j or [count[i], count[j]] != counts:  # an earlier merger changed one of the two cells
+        while following[i] != j or [count[i], count[j]] != counts:  # one of the two cells has been merged meanwhile
             _, i, j, *counts = heapq.heappop(heap)
         mean[i] = (count[i] * mean[i] + count[j] * mean[j]) / (count[i] + count[j])
         count[i], count[j] = count[i] + count[j], 0.0

@@ -1,6 +1,7 @@
-"""Read and write ``.splat``, the format of antimatter15/splat that most viewers read: 32 bytes per Gaussian, no header.
+"""Read and write ``.splat``, the format of antimatter15/splat, which most viewers read.
 
-Quaternions wxyz are bytes 128 + 128 q. Harmonics above degree 0 cannot be stored.
+It has 32 bytes per Gaussian and no header. Quaternions wxyz are bytes 128 + 128 q. Harmonics above degree 0 cannot be
+stored.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
-from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, column_blocks, to_bytes, to_stored
+from gsmerge.io.formats.arrays import EXPORT_AGAIN, Columns, Packed, StoredRows, column_blocks, to_bytes, to_stored
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 
-MAX_DEGREE = 0  # of harmonics; the format has colours alone
+MAX_DEGREE = 0  # of harmonics, since the format has only colours
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 
@@ -37,7 +38,7 @@ def read_rows(path: Path) -> StoredRows:
     size = check_file(path)
     if size % ROW.itemsize:
         problem = f"expected a .splat of {ROW.itemsize} bytes per Gaussian, found {size} bytes"
-        raise SceneError(path, problem, "copy or export it again")
+        raise SceneError(path, problem, EXPORT_AGAIN)
     with read_errors(path):
         rows = np.fromfile(path, ROW)
     sizes = {"means": 12, "scales": 12, "sh0": 3, "opacities": 1, "quats": 4}
@@ -46,6 +47,7 @@ def read_rows(path: Path) -> StoredRows:
 
 
 def _unpack(rows: np.ndarray) -> Columns:
+    """Convert stored rows to Gaussians."""
     colors = rows["colors"] / 255
     return Columns(
         means=rows["means"],

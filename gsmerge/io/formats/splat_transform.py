@@ -1,4 +1,4 @@
-"""Run PlayCanvas' splat-transform for levels of detail that stream."""
+"""Run PlayCanvas' program splat-transform, which writes levels of detail for streaming."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io.first_bytes import CONVERTER_PACKAGE
 
 SPLAT_TRANSFORM_PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
-TIME_LIMIT = 1800  # seconds
+TIME_LIMIT = 1800  # seconds after which the program is stopped
 
 
 def find_program() -> str:
@@ -27,28 +27,28 @@ def find_program() -> str:
     return program
 
 
-def run_program(*words: object) -> None:
-    """Run the program on the CPU with arguments ``words``; the last argument is the file that it writes.
+def run_program(*arguments: object) -> None:
+    """Run the program on the CPU with ``arguments``, the last of which is the file that it writes.
 
     GsmergeError if it fails or takes longer than ``TIME_LIMIT``, UsageError if it is not installed.
     """
     program = find_program()
-    command = [program, "-q", "-w", "-g", "cpu", *map(str, words)]
+    command = [program, "-q", "-w", "-g", "cpu", *map(str, arguments)]
     try:
         ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=TIME_LIMIT, check=False)
     except subprocess.TimeoutExpired as error:
         raise GsmergeError(f"{program}: expected it to end within {TIME_LIMIT} seconds, it was stopped") from error
-    if ended.returncode or not Path(str(words[-1])).exists():
+    if ended.returncode or not Path(str(arguments[-1])).exists():
         lines = (ended.stderr or ended.stdout).decode(errors="replace").strip().splitlines() or ["without output"]
         reason = next((line for line in lines if "Error: " in line), lines[-1]).rpartition("Error: ")[2]
-        problem = f"expected {Path(str(words[-1])).name}, it ended with code {ended.returncode}"
-        max_output = 300  # characters of the program's own output in an error
+        problem = f"expected {Path(str(arguments[-1])).name}, it ended with code {ended.returncode}"
+        max_output = 300  # most characters of the program's output in an error
         raise GsmergeError(f"{program}: {problem}: {' '.join(reason.split())[:max_output]}")
 
 
 @contextmanager
 def name_file(path: Path) -> Iterator[None]:
-    """Replace the program's temporary file by the user's file ``path`` in errors."""
+    """Name the user's file ``path`` in errors of the block, instead of the program's temporary file."""
     try:
         yield
     except SceneError as error:

@@ -1,4 +1,4 @@
-"""Read and write ``.spz``: quantised columns (github.com/nianticlabs/spz, README and load-spz.cc).
+"""Read and write ``.spz``, a format of quantised columns (github.com/nianticlabs/spz, README and load-spz.cc).
 
 Positions are fixed-point numbers of 24 bits. Log scales are steps of 1/16 from -10 on. Opacities and colours are bytes.
 Rotations are their three smaller components, each with a sign and 9 bits. Harmonics are bytes of which 5 bits (degree
@@ -33,30 +33,33 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.types import SH_C0, Gaussians, StrPath
 from gsmerge.values.arrays import as_array, to_float32
 
-VERSION, MAX_DEGREE = 3, 3  # of written files; Spark 2.2 does not read version 4, and old readers only read 2
-MAGIC = 0x5053474E  # "NGSP", the first bytes of the content
+# Default version, and largest degree of harmonics, of written files. Spark 2.2 does not read version 4, and old readers
+# read only version 2
+VERSION, MAX_DEGREE = 3, 3
+MAGIC = 0x5053474E  # "NGSP", the first bytes of the header
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, number of streams or zero
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
-MIP_FLAG = 1  # render the Gaussians antialiased
+MIP_FLAG = 1  # flag of Gaussians that are rendered antialiased
 EXTENSION_RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
+# Directions of x, y and z, such as left, down and back. The extension states the number of one of these, counted from 1
 AXIS_SYSTEMS = (
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
 )  # fmt: skip
 PLY_AXES = "RDF"
-_REVERSED = {"LFD", "RFD", "LBU", "RBU"}  # Niantic's library writes and reads their y and z with the wrong sign
+_REVERSED = {"LFD", "RFD", "LBU", "RBU"}  # axes whose y and z Niantic's library writes and reads with the wrong sign
 _OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
-_MAX_EXTENSIONS = 1 << 20  # bytes of all extension records
+_MAX_EXTENSIONS = 1 << 20  # most bytes of all extension records
 GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # first bytes of versions 1 to 3, and of 4
-SYSTEM, UNIX = 9, b"\3"  # byte of a gzip header that names the operating system, and the value that is always written
-FINE = 14  # bits of a position within the scene: a sixteenth of a pixel if the scene fills 1,000 pixels
+SYSTEM, UNIX = 9, b"\3"  # position of the operating system in a gzip header, and the value that is always written
+FINE = 14  # bits of a position within the scene: steps of a sixteenth of a pixel if the scene fills 1,000 pixels
 LARGEST_POSITION = 2**23 - 1
-_SHIFTS = (20, 10, 0)  # of the three smaller components of a rotation in its word
+_SHIFTS = (20, 10, 0)  # lowest bits of the three smaller components of a rotation in its word
 COLOR_SCALE = 0.15  # factor of sh0, so that colours slightly outside [0, 1] can be stored
-ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
+# Attributes in the order of the file
+ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
-AGAIN = "copy or export it again"
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class Header:
     degree: int  # of harmonics
     fraction: int  # bits of a position after the binary point
     flags: int
-    num_streams: int  # of version 4
+    num_streams: int  # number of compressed streams in version 4; 0 in older versions
 
     @property
     def num_higher(self) -> int:
@@ -96,16 +99,19 @@ def read_rows(path: Path) -> arrays.StoredRows:
 
 
 def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, dict[str, int], tuple[str, ...]]:
-    """Read the bytes of a ``.spz`` that ``path`` holds: header, Gaussians, bytes of each attribute and notes."""
+    """Read the bytes ``packed`` of a ``.spz``; return its header, Gaussians, bytes of each attribute, and notes.
+
+    ``path``: the file that holds the bytes, for errors.
+    """
     read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
     header, parts, extensions, num_left = read(ReadBudget(path, len(packed)), packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     # Records of extensions are before the table in version 4, and after the columns in older versions
     extensions_flag = 2
     axes = _stored_axes(path, extensions) if header.flags & extensions_flag else PLY_AXES
-    # from these axes to those of a .ply; it mirrors if the handedness differs
+    # The rotation from these axes to those of a .ply. It mirrors if one system is left-handed and the other is not
     rotation = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
-    rotate = arrays.turner(rotation * (1, -1, -1) if axes in _REVERSED else rotation, header.num_higher)
+    rotate = arrays.rotator(rotation * (1, -1, -1) if axes in _REVERSED else rotation, header.num_higher)
     rows = arrays.Packed(
         header.count, header.num_higher, lambda block: rotate(_unpack([part[block] for part in parts], header))
     )
@@ -134,10 +140,10 @@ def _stored_axes(path: StrPath, extensions: bytes) -> str:
 
 
 def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int]) -> Header:
-    """Read the header; SceneError if it is invalid, or if the file is too small for its Gaussians."""
+    """Read a header at the ``start`` of the unpacked bytes; SceneError if it is invalid, or its count is too large."""
     path = budget.path
     if len(start) < HEADER.size:
-        raise SceneError(path, FOUND_EARLY_END, AGAIN)
+        raise SceneError(path, FOUND_EARLY_END, arrays.EXPORT_AGAIN)
     magic, *numbers = HEADER.unpack(start)
     header = Header(*numbers)
     max_read_degree = 4  # some programs write degree 4 in version 3
@@ -146,32 +152,36 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
         problem = f"expected .spz of version 1 to 4 and SH degree 0 to {max_read_degree}, found {found}"
         raise SceneError(path, problem, "export it again")
     if header.count == 0:
-        raise SceneError(path, f"expected at least one Gaussian in {len(packed)} bytes, found a count of 0", AGAIN)
+        raise SceneError(
+            path, f"expected at least one Gaussian in {len(packed)} bytes, found a count of 0", arrays.EXPORT_AGAIN
+        )
     arrays.check_gaussian_count(budget, header.count, header.num_higher, sum(header.widths))
     return header
 
 
 def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
-    """Read versions 1 to 3: header, columns ``[n,width]`` uint8, extensions, and number of bytes after the stream."""
+    """Read version 1 to 3; return header, columns ``[n,width]`` uint8, extensions, and number of bytes after them."""
     path = budget.path
     stream = zlib.decompressobj(wbits=31)
     try:
         header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
-        # This also checks the checksum; at the end, what is left would count twice as unused
+        # This also checks the checksum. At the end of the stream it gets no bytes, which would count twice as unused
         extensions = stream.decompress(b"" if stream.eof else stream.unconsumed_tail, _MAX_EXTENSIONS)
     except zlib.error as error:
-        raise SceneError(path, "expected a gzip stream of .spz, found another or damaged file", AGAIN) from error
+        raise SceneError(
+            path, "expected a gzip stream of .spz, found another or damaged file", arrays.EXPORT_AGAIN
+        ) from error
     ends = np.cumsum([0, *header.widths]) * header.count
     if len(data) < ends[-1] or not stream.eof:
         problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(data)}"
-        raise SceneError(path, f"{problem}{'' if stream.eof else ' and no end of the stream'}", AGAIN)
+        raise SceneError(path, f"{problem}{'' if stream.eof else ' and no end of the stream'}", arrays.EXPORT_AGAIN)
     parts = [np.frombuffer(data, np.uint8, end - at, at).reshape(header.count, -1) for at, end in pairwise(ends)]
     return header, parts, extensions, len(stream.unused_data)
 
 
 def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
-    """Read version 4: header, columns ``[n,width]`` uint8, extensions, and number of bytes after the streams."""
+    """Read version 4; return header, columns ``[n,width]`` uint8, extensions, and number of bytes after them."""
     import zstandard  # few files need it
 
     path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,))
@@ -193,7 +203,7 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np
         raise SceneError(
             path,
             "truncated or damaged: expected whole Zstandard streams with the sizes of its table, found others",
-            AGAIN,
+            arrays.EXPORT_AGAIN,
         ) from error
     columns += [b""] * (len(header.widths) - len(columns))
     parts = [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
@@ -210,20 +220,20 @@ def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) 
         (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
         table = [TABLE_ROW.unpack_from(packed, table_start + i * TABLE_ROW.size) for i in range(header.num_streams)]
     except struct.error as error:
-        raise SceneError(path, FOUND_EARLY_END, AGAIN) from error
+        raise SceneError(path, FOUND_EARLY_END, arrays.EXPORT_AGAIN) from error
     if [unpacked_size for _, unpacked_size in table] != sizes:
         problem = f"damaged: expected columns of {sizes} bytes for {header.count} Gaussians, found others"
-        raise SceneError(path, problem, AGAIN)
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN)
     streams_start = table_start + len(table) * TABLE_ROW.size
     ends = streams_start + np.cumsum([0, *(packed_size for packed_size, _ in table)], dtype=object)
     if ends[-1] > len(packed):
         problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(packed)}"
-        raise SceneError(path, problem, AGAIN)
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN)
     return table_start, ends
 
 
 def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
-    """Convert a block of stored columns to Gaussians."""
+    """Convert a block of each stored column to Gaussians."""
     version, fraction = header.version, header.fraction
     means, opacities, colors, scales, rotations, harmonics = parts
     words = np.zeros((len(means), 3, 4), np.uint8)  # signed numbers of three little-endian bytes
@@ -240,7 +250,7 @@ def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
 
 
 def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
-    """Restore quaternions ``[n,4]`` wxyz, from xyz as bytes before version 3, from packed words since then."""
+    """Restore quaternions ``[n,4]`` wxyz from xyz as bytes before version 3, or from packed words since then."""
     if version < 3:
         xyz = stored / 127.5 - 1
         w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
@@ -263,21 +273,21 @@ def round_means(means: np.ndarray) -> np.ndarray:
 
 
 def choose_fraction(means: np.ndarray, fine: int) -> int:
-    """Choose the bits after the binary point of quantised means, by the scene's size and its farthest Gaussian.
+    """Choose how many bits of quantised means follow the binary point, by the scene's size and its farthest Gaussian.
 
     ``fine``: number of bits of a position within the scene.
     """
     if not len(means):
         return 0
     size = np.median(reduce(np.maximum, (np.abs(axis - np.median(axis)) for axis in means.T)))
-    fine_enough = fine - _octave(max(size, 1e-6))
-    no_overflow = _octave(LARGEST_POSITION / max(np.abs(means).max(), 1e-6))
+    wanted_bits = fine - _octave(max(size, 1e-6))
+    bits_without_overflow = _octave(LARGEST_POSITION / max(np.abs(means).max(), 1e-6))
     max_fraction = 23  # bits; a position has 24, one of them for its sign
-    return int(np.clip(min(fine_enough, no_overflow), 0, max_fraction))
+    return int(np.clip(min(wanted_bits, bits_without_overflow), 0, max_fraction))
 
 
 def fix_means(means: np.ndarray, fraction: int) -> np.ndarray:
-    """Quantise means to ``fraction`` bits after the binary point."""
+    """Quantise means to whole numbers int32, of which ``fraction`` bits follow the binary point."""
     return np.clip(np.round(means * 2.0**fraction), -LARGEST_POSITION, LARGEST_POSITION).astype("<i4")
 
 
@@ -289,7 +299,8 @@ def spz_columns(
     ``version``: 2 or 3. ValueError if there is NaN or inf.
     """
     means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
-    fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], FINE)  # others are refused below
+    # Means that are not finite are refused below
+    fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], FINE)
     header = Header(version, count, degree, fraction, MIP_FLAG * mip, 0)
     parts = tuple(np.empty((count, width), np.uint8) for width in header.widths)
     for start, columns in arrays.column_blocks(gaussians, max_degree):
@@ -302,7 +313,7 @@ def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]
     """Quantise a block of Gaussians to columns of bytes."""
     fixed = fix_means(columns.means, header.fraction)
     return (
-        fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes a coordinate
+        fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes for each coordinate
         arrays.to_bytes(255 * columns.opacities)[:, None],
         arrays.to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
         arrays.to_bytes(16 * (columns.log_scales + 10)),
@@ -322,8 +333,8 @@ def _quantise_harmonics(harmonics: np.ndarray) -> np.ndarray:
 def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
     """Pack unit quaternions ``[n,4]`` wxyz to bytes, which :func:`_read_rotations` unpacks.
 
-    Version 2 has xyz of the quaternion with w above 0, a byte each. In version 3 a word
-    has, from its highest bit, the index of the largest of xyzw, then sign and magnitude of the other components.
+    Version 2 has a byte for each of x, y and z of the quaternion whose w is positive. Version 3 has a word. From its
+    highest bit on, it has the index of the largest of xyzw, then sign and magnitude of each other component.
     """
     if version < 3:
         return arrays.to_bytes(127.5 * (np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] + 1))
@@ -345,24 +356,24 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 
 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
-    """Encode a ``.spz`` file as :func:`spz_bytes` does, of the version that the options name.
+    """Encode a ``.spz`` file of the version that the options of the contents name; ValueError if there is NaN or inf.
 
-    It has no extensions: three 0.187 and mkkellogg's viewer refuse bytes after the columns.
+    The file has no extensions, since three 0.187 and mkkellogg's viewer refuse bytes after the columns.
     """
     mip, version = arrays.render_mode(contents.comments) == arrays.MIP, contents.options.spz_version
     header, parts = spz_columns(gaussians, MAX_DEGREE, mip=mip, version=version)
     columns = deque(parts)
-    del parts  # each column is freed when the next one is compressed
+    del parts  # so that each column is freed as soon as it is compressed
     return gzip_bytes(chain([header], (columns.popleft().data for _ in range(len(columns)))))
 
 
 def gzip_bytes(
     parts: Iterable[bytes | memoryview], *, level: int = 6, strategy: int = zlib.Z_DEFAULT_STRATEGY
 ) -> bytes:
-    """Compress parts to a gzip stream with equal bytes at any time, on every system and in every version of Python."""
-    packer, packed = zlib.compressobj(level, wbits=31, strategy=strategy), bytearray()  # without a time
+    """Compress parts to a gzip stream, whose bytes are equal at any time, on any system and in any Python version."""
+    packer, packed = zlib.compressobj(level, wbits=31, strategy=strategy), bytearray()  # writes no time into the header
     for part in parts:
         packed += packer.compress(part)
     packed += packer.flush()
     packed[SYSTEM : SYSTEM + 1] = UNIX
-    return cast(bytes, packed)  # as good as bytes where it is written, without a copy
+    return cast(bytes, packed)  # a bytearray is written like bytes, and a copy would take memory

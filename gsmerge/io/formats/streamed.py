@@ -1,4 +1,4 @@
-"""Read and write Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format"): levels of detail.
+"""Read and write levels of detail as Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format").
 
 The index ``lod-meta.json`` is a tree of boxes. A leaf names, for each level, a run of rows in a chunk. A chunk is an
 unzipped ``.sog`` in a folder of its own. A viewer loads the visible chunks at the level that suits their distance, and
@@ -32,12 +32,12 @@ from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
-VERSION = 1  # of the index
+VERSION = 1  # of the format, as the index states it
 MAX_DEGREE = sog.MAX_DEGREE
 # Thousands of Gaussians in a region for which a viewer chooses one level. A room of a few hundred thousand Gaussians
 # has about twenty regions.
 CHUNK_THOUSANDS = 16
-_CHUNK = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # name of a chunk's folder: level, number, hash
+_CHUNK_NAME = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # name of a chunk's folder: level, number, hash
 
 
 @check_arguments
@@ -79,13 +79,13 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
     The path of a coarser level is the ``meta.json`` of its first chunk.
     """
     with TemporaryDirectory(prefix="gsmerge-") as folder:
-        words: list[object] = []
+        arguments: list[object] = []
         for level, gaussians in enumerate(contents.levels):
-            words += [ply := Path(folder) / f"{level}.ply", "-l", level]
+            arguments += [ply := Path(folder) / f"{level}.ply", "-l", level]
             write_ply(ply, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=contents.comments)
         program_index = Path(folder) / "made" / INDEX
-        iterations = 1  # for the program's palettes; ten take four times as long, and renders are not better
-        run_program(*words, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", iterations, program_index)
+        iterations = 1  # of the program's fit of palettes; ten take four times as long, and renders are not better
+        run_program(*arguments, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", iterations, program_index)
         with name_file(path):
             _name_by_content(program_index)
             levels = read_index(program_index).levels
@@ -105,7 +105,10 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
 
 
 def _name_by_content(path: Path) -> None:
-    """Add a hash of its content to the name of each chunk's folder, so that caches never mix chunks of two results."""
+    """Append a hash of the content to the name of each chunk's folder, also in the index ``path``.
+
+    Caches thus never mix chunks of two results.
+    """
     document = read_json(path)
     for number, name in enumerate(document["filenames"]):
         folder, digest = (path.parent / name).parent, hashlib.sha256()
@@ -148,7 +151,7 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
     levels = _list_levels(path, document)
     if len({chunk for level in levels for chunk in level}) != sum(map(len, levels)):
         raise ValueError("a chunk belongs to two levels")
-    environment = None if document.get("environment") is None else _inside(path, document["environment"])
+    environment = None if document.get("environment") is None else _chunk_path(path, document["environment"])
     if any(environment in level for level in levels):
         raise ValueError("the environment is also a chunk of a level")
     index = StreamedIndex(levels, environment)
@@ -166,7 +169,7 @@ def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int],
     num_levels = check_whole(document["lodLevels"], "lodLevels", 1, max_levels)
     if not isinstance(names, list) or not names:
         raise ValueError("filenames: expected a list of paths")
-    chunks = [_inside(path, name) for name in names]
+    chunks = [_chunk_path(path, name) for name in names]
     runs: list[list[tuple[int, int, int]]] = [[] for _ in range(num_levels)]
     for level, run in _walk_runs(document["tree"]):
         file = check_whole(run["file"], "file", 0, len(chunks) - 1)
@@ -176,8 +179,8 @@ def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int],
     return tuple(_count_by_chunk(chunks, level_runs) for level_runs in runs)
 
 
-def _inside(index: Path, name: Any) -> Path:
-    """Return the path of a chunk; ValueError if it is outside the folder of the index."""
+def _chunk_path(index: Path, name: Any) -> Path:
+    """Return the path of a chunk that the ``index`` names; ValueError if it is outside the folder of the index."""
     chunk = PurePosixPath(str(name))
     is_outside = chunk.is_absolute() or ".." in chunk.parts or "\\" in str(name) or "\0" in str(name)
     if is_outside or chunk.name != sog.META:
@@ -186,7 +189,7 @@ def _inside(index: Path, name: Any) -> Path:
 
 
 def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield level and run of all leaves in order; ValueError for an invalid node."""
+    """Yield the level of each run of rows, and the run, leaf by leaf; ValueError for an invalid node."""
     nodes = [tree]
     while nodes:
         node = nodes.pop()
@@ -202,7 +205,10 @@ def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _count_by_chunk(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
-    """Return the number of Gaussians of each chunk; ValueError if runs (file, offset, count) overlap or have gaps."""
+    """Return the number of Gaussians of each chunk of a level; ValueError if its runs overlap or have gaps.
+
+    A run is a tuple of the index of its chunk, its first row, and its number of rows.
+    """
     counts: dict[Path, int] = {}
     for file, offset, count in sorted(runs):
         end = counts.get(chunks[file], 0)
@@ -243,7 +249,7 @@ def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> Ga
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
     """Read chunks; SceneError if they take more memory than a file of all their bytes may take.
 
-    ``chunks``: path of each chunk -> its number of Gaussians in the index; None if the index has none.
+    ``chunks``: path of each chunk -> its number of Gaussians by the index; None if the index does not say.
     """
     root, real_paths = os.path.realpath(path.parent), set[Path]()
     contents: list[sog.SogContent] = []
@@ -266,13 +272,18 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
 
 
 def remove_unused_chunks(path: Path) -> None:
-    """Remove chunks beside an index that it does not name; they belong to the index that it replaced.
+    """Remove the chunks beside an index that it does not name, since they belong to an index that it replaced.
 
     Other files in their folders stay. Chunks that cannot be removed are ignored.
     """
     used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
     for folder in path.parent.iterdir():
-        if _CHUNK.fullmatch(folder.name) and folder.name not in used and folder.is_dir() and not folder.is_symlink():
+        if (
+            _CHUNK_NAME.fullmatch(folder.name)
+            and folder.name not in used
+            and folder.is_dir()
+            and not folder.is_symlink()
+        ):
             with suppress(OSError):
                 for name in sog.SOG_FILES:
                     (folder / name).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""The table of formats of Gaussians, by which files are read and written (docs/reference/formats.md)."""
+"""The table of formats in which files of Gaussians are read and written (docs/reference/formats.md)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsmerge.settings.setting import join_words
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath
 from gsmerge.values.arrays import to_float32
 
-STATE_ENDING = ".gsm"  # of states, as gsmerge extend writes them
+STATE_ENDING = ".gsm"  # ending of states, which gsmerge extend writes
 INDEX = "lod-meta.json"  # name of a Streamed SOG, by which viewers recognise it
 
 
@@ -31,19 +31,19 @@ WRITE_APART = _lazy("write.write_apart")
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """The content of an output; a format leaves out parts that it cannot store."""
+    """The content of an output, of which a format leaves out what it cannot store."""
 
-    levels: Sequence[Gaussians]  # the finest first
+    levels: Sequence[Gaussians]  # the finest level of detail first
     comments: Sequence[str] = ()  # lines for the header
     cameras: Cameras = NO_CAMERAS
-    names: Sequence[str] = ()  # of the cameras
+    names: Sequence[str] = ()  # names of the cameras
     title: str = ""
     options: FileOptions = field(default_factory=FileOptions)
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
 # A function that writes an output. Its arguments are the function of :func:`gsmerge.io.atomic_outputs` that adds a
-# file, the path of the output, its existing temporary file, and the content. It returns the path of each level, in
+# file, the path of the output, its temporary file, which exists, and the content. It returns the path of each level, in
 # order, with the temporary files of that level.
 WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]]
 
@@ -52,41 +52,46 @@ WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]
 class Format:
     """A format of files of Gaussians: its ending, and how to read and write it.
 
-    All properties of a format that a run needs are here, so that a new format is one module and one row. Writers that
-    draw the scene are in higher layers; rows name them lazily, as entry points name commands.
+    All properties of a format that a run needs are here, so that a new format is one module and one row. Rows name most
+    functions by text, and these are imported at their first use. Writers that draw the scene are in higher layers.
     """
 
     ending: str  # of names, in lower case; without a leading dot, it is the whole name of a folder's main file
     about: str  # description for people
     read: Callable[[Path], StoredRows] | None  # None: the format is only written
-    # Encodes one file of Gaussians with comments; None: :func:`gsmerge.io.write_ply` or ``write`` writes the file
+    # Returns the bytes of one file of Gaussians with comments; None: :func:`gsmerge.io.write_ply` or ``write`` writes
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
-    max_degree: int  # of the harmonics that are written; -1: the format is only read
-    # Encodes one file by the views and options of the content; None: ``encode`` does without them
+    max_degree: int  # largest degree of harmonics that is written; -1: the format is only read
+    # Returns the bytes of one file that also depends on the content's views and options; None: ``encode`` is used
     encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
-    first_view: bool = False  # Viewers look from its first camera, so one is placed if there is none
-    beside: str = ""  # name of a file that is written beside it; "": none
-    settings: str = ""  # name of a file beside it that tells viewers where to look first; "": none
+    first_view: bool = False  # True: viewers look from its first camera, so one is placed if there is none
+    beside: str = ""  # name of a file that is written beside an output; "": none
+    # Name of a file beside an output that tells viewers where to look first, with the output's {stem}; "": none
+    settings: str = ""
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
-    finish: Callable[[Path], object] = lambda _: None  # called with the path after all files were renamed
-    holds: Callable[[Path], bool] | None = None  # whether a file with this ending has Gaussians; None: always
+    finish: Callable[[Path], object] = lambda _: None  # is called with the output's path after all files were renamed
+    holds: Callable[[Path], bool] | None = None  # returns whether a file with this ending has Gaussians; None: it has
 
     # Content of its files
-    # Levels of detail: a single one, one file for each, or all in one output
+    # Levels of detail: "" for a single one, "apart" for a file for each, "inside" for all in one output
     levels: Literal["", "apart", "inside"] = "apart"
-    has_cameras: bool = False  # Cameras of views are inside it, not in a file beside it
-    round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as the format does
-    columns: bool = False  # whether the user can choose which of INRIA's columns it has
-    marks: Sequence[str] | None = ()  # comments of the input that it keeps; None: all of ``copied_comments``
-    most: float = math.inf  # Gaussians that its public readers take
+    has_cameras: bool = False  # True: the cameras of views are inside the output, not in a file beside it
+    round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as a file of the format does
+    columns: bool = False  # whether the user can choose which of INRIA's columns a file has
+    marks: Sequence[str] | None = ()  # comments of the input that a copy keeps; None: all of ``copied_comments``
+    most: float = math.inf  # most Gaussians that its public readers read
+    # Note on harmonics that the format leaves out
     lost: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
 
-    # Bytes of a Gaussian by degree; of a .sog or .spz, as measured for results; empty if budgets cannot count them
+    # Bytes of a Gaussian for each degree of harmonics; those of packed formats are measured. Empty: budgets in bytes
+    # are refused
     each: Sequence[float] = ()
-    rest: Callable[[], int] = lambda: 0  # least bytes besides those of Gaussians
-    count: Callable[[int, int], int] | None = None  # bytes, degree -> number of Gaussians; None if content matters
-    measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None  # bytes; None: those of ``encode``
+    rest: Callable[[], int] = lambda: 0  # returns the bytes of an output besides those of its Gaussians
+    # Returns the number of Gaussians for a number of bytes and a degree; None if the size depends on the content
+    count: Callable[[int, int], int] | None = None
+    # Returns the bytes of an output of Gaussians, cameras and comments; None: those that ``encode`` returns
+    measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None
 
     def names(self, path: StrPath) -> bool:
         """Return whether the name of a path has the ending of this format."""
@@ -104,7 +109,7 @@ class Format:
 
 
 _page = lazy_functions("gsmerge.pages")
-# Bytes of a Gaussian, for harmonics of degree 0 to 3
+# Bytes of a Gaussian with harmonics of degree 0 to 3
 _SPZ = 17.0, 18.5, 18.9, 19.2
 _SOG = 13.0, 22.0, 36.5, 56.5
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
@@ -122,8 +127,8 @@ LEVELS = Format(
 TILESET = Format(
     "tileset.json", "3D Tiles for Cesium: a .spz in a .glb beside it", _lazy("tileset.read_rows"), None, 3,
     holds=Path.is_file, write=_lazy("tileset.write_output"), levels="",
-    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), most=10_000_000, beside="{stem}.glb",
-    each=_SPZ, rest=_lazy("tileset.least_bytes"), measure=_lazy("tileset.measure"),
+    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), most=10_000_000, beside="tileset.glb",
+    each=_SPZ, rest=_lazy("tileset.most_other_bytes"), measure=_lazy("tileset.most_bytes"),
 )  # fmt: skip
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
@@ -156,13 +161,14 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
 STATE = Format(
     STATE_ENDING, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
 )
-META = "meta.json"  # of a .sog that is a folder
+META = "meta.json"  # name of the main file of a .sog that is a folder
 SOG_FOLDER = Format(
     META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_folder"),
 )  # fmt: skip
 FORMATS = (*FILES, HTML, LEVELS, TILESET, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
-VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
+# Endings of results that a page shows
+VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)
 # Endings of files that may hold no Gaussians; models write cameras and depth maps into .npz
 SEVERAL_USES = (".npz", *(row.ending for row in FORMATS if row.holds))
 READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
@@ -170,7 +176,7 @@ SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FI
 
 
 def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
-    """Return how many Gaussians fit into a file of at most ``max_bytes``; UsageError if none fits.
+    """Return how many Gaussians fit into an output of at most ``max_bytes``; UsageError if none fits.
 
     The number is exact for a ``.ply``. It is approximate for other formats, since their size depends on the content.
     """
@@ -185,20 +191,20 @@ def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
 
 
 def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
-    """Estimate the number of Gaussians in all files, and the largest number of harmonics columns in any file.
+    """Estimate the number of Gaussians in all files, and the largest number of columns ``f_rest_*`` in any file.
 
-    Columns of degree 0 are not counted. A ``.ply`` is counted exactly by its header if it has the bytes for that, other
-    formats by their size in bytes, whatever they state; zeros for files that cannot be read.
+    The header of a ``.ply`` states both exactly; if the file is too short for that, it counts as empty. A file of
+    another format is judged by its size alone, and a file that cannot be read counts as empty.
     """
     counts = [
-        ply.header_counts(path, held=True) if find_format(path).read is ply.read_rows else _by_bytes(path)
+        ply.header_counts(path, check_size=True) if find_format(path).read is ply.read_rows else _by_bytes(path)
         for path in paths
     ]
     return sum(count for count, _ in counts), max((rest for _, rest in counts), default=0)
 
 
 def _by_bytes(path: Path) -> tuple[int, int]:
-    """Estimate the number of Gaussians of a file by its size, assuming degree 0; the second number is 0."""
+    """Estimate the number of Gaussians of a file by its size, as if they had degree 0; the second number is 0."""
     try:
         return int(path.stat().st_size / (find_format(path).each or (math.inf,))[0]), 0
     except OSError:
@@ -206,12 +212,12 @@ def _by_bytes(path: Path) -> tuple[int, int]:
 
 
 def find_format(path: StrPath) -> Format:
-    """Return the format that a path names; PLY for unknown endings."""
+    """Return the format of a path by the end of its name; PLY for unknown endings."""
     return next((row for row in FORMATS if row.names(path)), PLY)
 
 
 def may_hold_gaussians(path: Path) -> bool:
-    """Return whether a file may hold Gaussians: by its ending, and by its content if the ending has other uses."""
+    """Return whether a file may hold Gaussians, by its ending, and by its content if the ending has other uses."""
     holds = find_format(path).holds
     return (holds is None and path.suffix.lower() in SCENE_SUFFIXES) or (holds is not None and holds(path))
 

@@ -1,8 +1,8 @@
-"""Read and write 3D Tiles 1.1 for Cesium: a ``tileset.json`` with one tile, a ``.glb`` that holds a ``.spz``.
+"""Read and write 3D Tiles 1.1 for Cesium: a ``tileset.json`` with one tile, which is a ``.glb`` with a ``.spz`` inside.
 
 The ``.glb`` uses ``KHR_gaussian_splatting_compression_spz_2``, which Cesium requires. A node turns the axes of the
-``.spz`` to those of glTF, and Cesium turns y up to z up. Half a turn follows, so that x points east, z north and -y up
-on the globe.
+``.spz`` to those of glTF, and Cesium turns y up to z up. The index adds half a turn, so that x points east, z north and
+-y up on the globe.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from gsmerge.io.formats import glb
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.glb import COLOR_SPACE, COMPRESSED, HALF_TURN, HARMONICS, NAME, pack_glb
 from gsmerge.io.formats.spz import MAX_DEGREE, encode_contents
-from gsmerge.io.formats.table import Contents
+from gsmerge.io.formats.table import TILESET, Contents
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.settings.files import parse_place
 from gsmerge.types import Cameras, Gaussians
 
-REST = 3000  # most bytes of the index, and of numbers of bounds in the tile
+REST = 3000  # most bytes of the index, and of the numbers of the bounds in the tile
 PLACED = "the place on the globe is not kept: --set place=LON,LAT,HEIGHT states it again"
-_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # from y up
+_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # turns y up to z up
 
 
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write the files of a tileset, as :data:`gsmerge.io.formats.table.WriteOutput`; the ``.glb`` has its stem."""
-    tile = path.with_suffix(".glb")
-    # Percentiles of the means that the bounds include; a few far Gaussians would make a scene small
+    """Write the files of a tileset, as :data:`gsmerge.io.formats.table.WriteOutput`."""
+    tile = path.with_name(TILESET.beside)
+    # The bounds include the means between these percentiles, since a few far Gaussians would make the scene look small
     percentiles = 1, 99
     file, low, high = add(tile), *np.percentile(contents.levels[0].means.astype(np.float64), percentiles, axis=0)
     file.write_bytes(_tile_bytes(contents, low, high))
@@ -45,7 +45,8 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
     box = [*matmul(turn, (low + high)[:, None] / 2)[:, 0].tolist(), *halves.reshape(-1).tolist()]
     place = contents.options.place
     root = {"boundingVolume": {"box": box}, "geometricError": 0, "refine": "REPLACE", "content": {"uri": tile.name}}
-    on_globe = matmul(np.eye(4) if place is None else globe_matrix(place), HALF_TURN)  # so that photos look north
+    # The half turn lets photos look north
+    on_globe = matmul(np.eye(4) if place is None else globe_matrix(place), HALF_TURN)
     root["transform"] = on_globe.T.reshape(-1).tolist()
     extensions = {"extensionsUsed": [NAME, COMPRESSED], "extensionsRequired": [NAME, COMPRESSED]}
     document = {
@@ -60,7 +61,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a tileset with one tile; SceneError for any other."""
+    """Read the Gaussians of a tileset with one tile; SceneError for any other tileset."""
     document = read_json(path)
     try:
         root = document["root"]
@@ -75,15 +76,14 @@ def read_rows(path: Path) -> StoredRows:
     return replace(rows, bytes_beside=path.with_name(name.name).stat().st_size, notes=(*rows.notes, *placed))
 
 
-def least_bytes() -> int:
-    """Return the most bytes of a tileset besides those of its ``.spz``."""
+def most_other_bytes() -> int:
+    """Return the largest number of bytes that a tileset has besides those of its ``.spz``."""
     return REST
 
 
-def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
-    """Return the largest number of bytes of a tileset with these Gaussians, whatever its place."""
-    contents = Contents([gaussians], comments, cameras)
-    return len(_tile_bytes(contents, np.zeros(3), np.zeros(3))) + REST
+def most_bytes(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
+    """Return the largest number of bytes that a tileset of these Gaussians has at any place on the globe."""
+    return len(_tile_bytes(Contents([gaussians], comments, cameras), np.zeros(3), np.zeros(3))) + REST
 
 
 def _tile_bytes(contents: Contents, low: np.ndarray, high: np.ndarray) -> bytes:

@@ -1,4 +1,4 @@
-"""Write Gaussians in the format that the name of a file chooses."""
+"""Write Gaussians in the format that the ending of a file's name chooses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ from gsmerge.values.arguments import check_arguments
 
 
 def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
-    """Note which harmonics a format leaves out, and more Gaussians than readers take; UsageError for its ending."""
+    """Note if the format of a path leaves out harmonics, or if its readers do not read so many Gaussians.
+
+    UsageError if no format has the ending.
+    """
     format_, notes = output_format(path), list[str]()
     if sh_degree > format_.max_degree:
         notes.append(format_.lost.format(ending=format_.ending, degree=format_.max_degree))
@@ -144,7 +147,7 @@ def _write_ply(
     normals: bool,
     extra_columns: np.ndarray | None = None,
 ) -> None:
-    """Write a ``.ply`` to a file of any name."""
+    """Write a ``.ply`` as :func:`write_ply` does, but to a file of any name, and with ``extra_columns``."""
     check_readable(gaussians, comments)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:
@@ -154,7 +157,7 @@ def _write_ply(
 
 
 def check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
-    """Raise ValueError for a file that readers would refuse: without Gaussians, or with invalid comments."""
+    """Raise ValueError for content that readers would refuse: no Gaussians, or invalid comments."""
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none")
     length = sum(len(f"comment {comment}\n") for comment in comments)

@@ -154,7 +154,7 @@ def test_a_header_counts_for_what_its_bytes_hold(
     kind = b"ascii" if text else b"binary_little_endian"
     head = [b"ply", b"format " + kind + b" 1.0", b"element vertex " + stated, *properties, b"end_header", b""]
     (tmp_path / "a.ply").write_bytes(LINES(head) + bytes(rows))
-    assert header_counts(tmp_path / "a.ply", held=True) == held
+    assert header_counts(tmp_path / "a.ply", check_size=True) == held
     assert estimate_counts([tmp_path / "a.ply"] * 2) == (2 * held[0], held[1])
 
 

@@ -16,7 +16,7 @@ from gsmerge.compaction.convert import ConvertOptions, convert_files
 from gsmerge.compaction.outputs import Outputs, frame_notes, plan_outputs
 from gsmerge.errors import SceneError
 from gsmerge.io.formats.spz import spz_bytes
-from gsmerge.io.formats.tileset import globe_matrix, measure
+from gsmerge.io.formats.tileset import globe_matrix, most_bytes
 from gsmerge.settings.files import FileOptions
 from gsmerge.types import NO_CAMERAS
 
@@ -91,7 +91,7 @@ def test_what_viewers_see_on_its_side_is_noted(room: Gaussians, tmp_path: Path) 
 
 def test_its_size_is_at_most_what_a_budget_counts(room: Gaussians, tmp_path: Path) -> None:
     out = convert(room, tmp_path, "-179.123456,-89.123456,1234567.891")
-    assert out.stat().st_size + out.with_name("tileset.glb").stat().st_size <= measure(room, NO_CAMERAS, ())
+    assert out.stat().st_size + out.with_name("tileset.glb").stat().st_size <= most_bytes(room, NO_CAMERAS, ())
 
 
 @pytest.mark.parametrize(
