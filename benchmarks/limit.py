@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from captures import export, make_parser, make_table, scene_folders
+from captures import export_capture, make_parser, make_table, scene_folders
 
 from gsmerge.kernels import signature
 from gsmerge.kernels.build import compiler, find_platform
@@ -455,7 +455,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         counter = compile_counter(target, Path(name))
         machine = measure_machine(counter, target)
-        records = [measure_scene(export(folder, args.cache).parent, counter) for folder in folders]
+        records = [measure_scene(export_capture(folder, args.cache).parent, counter) for folder in folders]
     tables = {
         f"machine {target}": machine_table(machine),
         f"pairs {target}": pairs_table(records),
