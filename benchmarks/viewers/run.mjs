@@ -12,7 +12,7 @@ const HERE = import.meta.dirname;
 const SECONDS = 60; // longest time for each picture
 const PAUSE = 1500; // milliseconds between two pictures that have to be the same
 
-// Each viewer: its name, its page, its package, a variant of the page, and the formats to open for each `look` (page.js).
+// Each viewer: its name, page, package and variant of the page, and the formats to open for each `look` (see page.js).
 const SPLATS = ['ply', 'spz', 'splat'];
 const VIEWERS = [
   ['Spark', 'spark', '@sparkjsdev/spark', 'default', { photo: [...SPLATS, 'sog'], default: ['ply'], box: ['ply'] }],
@@ -154,8 +154,8 @@ async function openPage(browser, address, { width, height }, picture) {
   return { ...result, refused: [...refused], messages: [...messages].slice(0, 5), seconds };
 }
 
-// Write the picture of a page to a file; return true if it does not change any more. Viewers still sort and stream after
-// they have opened a file, so pictures are taken until two are equal.
+// Write the picture of a page to a file; return true if it does not change any more. Viewers still sort and stream
+// after they have opened a file, so pictures are taken until two are equal.
 async function takePicture(page, file, deadline) {
   let [before, now] = [new Uint8Array(), await page.screenshot()];
   while (Date.now() < deadline && !Buffer.from(now).equals(before)) {

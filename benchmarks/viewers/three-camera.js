@@ -10,7 +10,7 @@ export function lookFrom(camera, view) {
   camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
 }
 
-/** Place a camera on the +z side of a box, as viewers of glTF do, so that the sphere around the box fills the picture. */
+/** Place a camera on the +z side of a box, as viewers of glTF do. The sphere around the box fills its picture. */
 export function frameBox(camera, box) {
   const centre = box.getCenter(new Vector3());
   const radius = box.getSize(new Vector3()).length() / 2;
