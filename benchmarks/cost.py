@@ -152,6 +152,7 @@ def growth_table(records: Records, cache: Path) -> str:
 
 
 def main() -> None:
+    """Measure what has no record yet, print the tables, and draw the chart."""
     parser = make_parser(__doc__, "apples,fern,fox,lightfield")
     parser.add_argument("--tree", type=Path, nargs="*", default=[], help="checkouts to run in place of this one")
     parser.add_argument("--chart", type=Path, help="file to draw the chart to")

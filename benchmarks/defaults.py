@@ -122,6 +122,7 @@ def draw_shares(runs: Mapping[str, Sequence[Record]], out: Path) -> None:
 
 
 def main() -> None:
+    """Measure what has no record yet, and print a table or draw the chart."""
     parser = make_parser(__doc__)
     parser.add_argument("--new-views", action="store_true", help="print the table of gains instead")
     parser.add_argument("--shares", type=Path, help="draw scores over shares to this file instead")

@@ -210,12 +210,15 @@ def measure_machine(path: Path, target: str) -> Machine:
     outs = np.ones((max(THREADS), 16), np.float32)
 
     def measure_chains(name: str, rounds: int, threads: int) -> float:
+        """Measure the operations per second of a loop of limit.c on all threads."""
+
         def call(i: int) -> int:
             return getattr(library, name)(ctypes.c_int64(rounds), ctypes.c_void_p(outs[i].ctypes.data))
 
         return best_rate(call, threads)
 
     def measure_stream(size: int, threads: int) -> float:
+        """Measure the bytes per second of streams over memory of ``size`` bytes."""
         count = size // 8
         arrays = np.ones((threads, 2, count), np.float32)
         rounds = max(1, 2**28 // size)
@@ -272,6 +275,7 @@ class Fields:
         self.values = (ctypes.c_int64 * len(STEP.fields)).from_address(address)
 
     def __getitem__(self, key: str) -> int:
+        """Return a number of the table."""
         return self.values[STEP.fields[key]]
 
     def array(self, key: str) -> np.ndarray:
@@ -338,6 +342,7 @@ def record_run(out: str) -> None:
     find_entry = signature._entry
 
     def find_timed(library: Any, name: str, *rest: Any) -> Callable[..., Any]:
+        """Return the entry of a function of the library; the entry of the fit's phases also records times."""
         entry = find_entry(library, name, *rest)
         return (lambda *values: recorder.time_phase(entry, *values)) if name == "fit_phase" else entry
 
@@ -471,6 +476,7 @@ def write_page(path: Path, tables: dict[str, str]) -> None:
 
 
 def main() -> None:
+    """Measure the machine and all scenes, and print the tables, and perhaps put them into the page."""
     parser = make_parser(__doc__, "fox,fern")
     parser.add_argument("--page", type=Path, help="page whose tables of this target are replaced")
     args = parser.parse_args()

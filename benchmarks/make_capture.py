@@ -138,6 +138,7 @@ def load_network(checkout: Path, checkpoint: Path) -> Predict:
     network.eval().load_state_dict({name.removeprefix("module."): value for name, value in weights.items()})
 
     def predict(views: list[View], near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
+        """Predict depth and confidence of the first view; see ``Predict``."""
         photos = np.stack([view.image[..., ::-1] for view in views]).astype(np.float32) / 127.5 - 1
         images = torch.from_numpy(photos.transpose(0, 3, 1, 2).copy())[None]
         matrices = {}
@@ -191,6 +192,7 @@ def make_capture(folder: Path, out: Path, predict: Predict, views: int) -> None:
 
 
 def main() -> None:
+    """Make the capture that the command line describes."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="photos with their cameras: transforms.json or a COLMAP model")
     parser.add_argument("out", type=Path, help="below GSMERGE_DATA: scenes/eval/NAME, or train")

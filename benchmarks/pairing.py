@@ -167,6 +167,7 @@ def judge(folder: Path, views: list[View], present: set[int]) -> Counter[str]:
 
 
 def main() -> None:
+    """Try all draws; print those with faults, and the totals."""
     parser = make_parser(__doc__, "train,eval")
     parser.add_argument("--draws", type=int, default=200, help="number of draws")
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")

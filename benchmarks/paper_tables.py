@@ -316,6 +316,7 @@ TABLES: dict[str, Callable[[Bench], str]] = {
 
 
 def main() -> None:
+    """Measure what has no record yet, and print the tables."""
     parser = make_parser(__doc__)
     parser.add_argument("--only", nargs="*", default=list(TABLES), choices=list(TABLES))
     args = parser.parse_args()

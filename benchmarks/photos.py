@@ -278,6 +278,7 @@ def print_row(scene: str, name: str, values: dict[str, float], notes: Sequence[s
 
 
 def main() -> None:
+    """Print the scores of every case on every capture."""
     parser = make_parser(__doc__)
     parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
     parser.add_argument("--shrink", type=int, default=3, help="factor by which photos are made smaller")

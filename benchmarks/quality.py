@@ -30,6 +30,7 @@ def score_outside(scene: Scene, result: Gaussians) -> tuple[float, ...]:
 
 
 def main() -> None:
+    """Print a line of JSON for each capture, and the means of its scores."""
     parser = make_parser(__doc__)
     parser.add_argument("--set", nargs="*", default=[], type=parse_setting, help="settings, as name=value")
     parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, invisible pixels taken from the photo")

@@ -81,6 +81,7 @@ def results_table(records: Sequence[RunRecord]) -> str:
 
 
 def main() -> None:
+    """Run what is not done yet, and print the table."""
     parser = make_parser(__doc__)
     args = parser.parse_args()
     folders, out = scene_folders(args.scenes), args.cache / "results"

@@ -73,6 +73,7 @@ def measure(folder: Path, plys: Sequence[Path], args: Any) -> dict[str, Any]:
 
 
 def main() -> None:
+    """Print a line of JSON for each capture and size of batches."""
     parser = make_parser(__doc__)
     parser.add_argument("--size", type=int, nargs="+", default=[2], help="views of a batch")
     parser.add_argument("--share", type=float, default=0.03, help="share of the input's Gaussians that results keep")

@@ -79,6 +79,7 @@ def measure(path: Path, share: str, *, walk: bool, ours_only: bool) -> tuple[lis
 
 
 def main() -> None:
+    """Print the table of all files and shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", type=Path, nargs="+")
     parser.add_argument("--walk", action="store_true", help="also from cameras on a line inside")

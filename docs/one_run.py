@@ -148,6 +148,7 @@ def watch_run() -> Run:
         """Return a function that also records its first call."""
 
         def call(*args: Any, **kwargs: Any) -> Any:
+            """Call the function, and keep the arguments and the result of its first call."""
             result = function(*args, **kwargs)
             if name not in made:  # later calls belong to the trial that estimates new views
                 arguments[name], made[name] = args, result

@@ -32,10 +32,10 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
     """
-    gaussians = _get_field("prediction", prediction, "gaussians")
+    gaussians = _get("prediction", prediction, "gaussians")
     rotations = _unbatch("rotations", gaussians.rotations, 2)
-    photos = as_array(_get_field("prediction", prediction, "processed_images"))
-    viewmats = as_array(_get_field("prediction", prediction, "extrinsics")).astype(np.float64)
+    photos = as_array(_get("prediction", prediction, "processed_images"))
+    viewmats = as_array(_get("prediction", prediction, "extrinsics")).astype(np.float64)
     scale = getattr(prediction, "scale_factor", None)
     if scale is not None and getattr(prediction, "is_metric", False):
         viewmats[..., :3, 3] /= float(scale)
@@ -46,7 +46,7 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
         "quats": rotations * (1 - 2 * (rotations[:, :1] < 0)),
         "images": _as_floats(photos),
         "viewmats": viewmats,
-        "Ks": _in_pixels_of(photos, as_array(_get_field("prediction", prediction, "intrinsics"))),
+        "Ks": _in_pixels_of(photos, as_array(_get("prediction", prediction, "intrinsics"))),
     }
 
 
@@ -92,7 +92,7 @@ def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0)
         SceneError: If a field is missing, or it holds several scenes.
     """
     gaussians = output["gaussians"] if isinstance(output, Mapping) else output
-    covariances = _unbatch("covariances", _get_field("gaussians", gaussians, "covariances"), 3)
+    covariances = _unbatch("covariances", _get("gaussians", gaussians, "covariances"), 3)
     scales, quats = _split_covariances(as_array(covariances).astype(np.float64))
     return {
         **_convert_gaussians(gaussians, sh_degree),
@@ -116,13 +116,11 @@ def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_de
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
     """
-    gaussians = _get_field("output", output, "gaussians")
+    gaussians = _get("output", output, "gaussians")
     cameras = getattr(output, "cameras", None) if cameras is None else cameras
-    opacities = _unbatch("opacities", _get_field("gaussians", gaussians, "opacities"), 1)
+    opacities = _unbatch("opacities", _get("gaussians", gaussians, "opacities"), 1)
     used = opacities != 0  # rows with an opacity of 0 only pad the batch
-    rows = {
-        name: _unbatch(name, _get_field("gaussians", gaussians, name), 2)[used] for name in ("means", "scales", "quats")
-    }
+    rows = {name: _unbatch(name, _get("gaussians", gaussians, name), 2)[used] for name in ("means", "scales", "quats")}
     if gaussians.sh_degree is None:
         colors = {"colors": _unbatch("colors", gaussians.colors, 2)[used]}
     else:
@@ -149,15 +147,11 @@ def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]
     Raises:
         SceneError: If an entry is missing, or it holds several scenes.
     """
-    splats: Any = _get_field("predictions", predictions, "splats")
+    splats: Any = _get("predictions", predictions, "splats")
     shapes = {"means": (-1, 3), "scales": (-1, 3), "quats": (-1, 4), "opacities": (-1,), "sh": (-1, 1, 3)}
-    columns = {name: _unwrap(name, _get_field("splats", splats, name)).reshape(shape) for name, shape in shapes.items()}
-    c2w = as_array(_unbatch("camera_poses", _get_field("predictions", predictions, "camera_poses"), 3)).astype(
-        np.float64
-    )
-    Ks = as_array(_unbatch("camera_intrs", _get_field("predictions", predictions, "camera_intrs"), 3)).astype(
-        np.float64
-    )
+    columns = {name: _unwrap(name, _get("splats", splats, name)).reshape(shape) for name, shape in shapes.items()}
+    c2w = as_array(_unbatch("camera_poses", _get("predictions", predictions, "camera_poses"), 3)).astype(np.float64)
+    Ks = as_array(_unbatch("camera_intrs", _get("predictions", predictions, "camera_intrs"), 3)).astype(np.float64)
     photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)
     columns["sh0"] = columns.pop("sh")
     return {**columns, "images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks, "order": "none"}
@@ -170,7 +164,7 @@ def _unwrap(name: str, values: Any) -> Any:
     return values[0]
 
 
-def _get_field(owner_name: str, owner: Any, name: str) -> Any:
+def _get(owner_name: str, owner: Any, name: str) -> Any:
     """Return a field of an object, or an entry of a mapping; SceneError if it is missing or None."""
     value = owner.get(name) if isinstance(owner, Mapping) else getattr(owner, name, None)
     if value is None:
@@ -190,10 +184,10 @@ def _unbatch(name: str, values: Array, num_axes: int) -> Array:
 
 def _convert_gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
     """Return the arguments for means, opacities and harmonics; these models store harmonics channel-major."""
-    harmonics = _unbatch("harmonics", _get_field("gaussians", gaussians, "harmonics"), 3)
+    harmonics = _unbatch("harmonics", _get("gaussians", gaussians, "harmonics"), 3)
     rows = harmonics.swapaxes(1, 2)[:, : (sh_degree + 1) ** 2]
-    opacities = _get_field("gaussians", gaussians, "opacities")
-    means = _unbatch("means", _get_field("gaussians", gaussians, "means"), 2)
+    opacities = _get("gaussians", gaussians, "opacities")
+    means = _unbatch("means", _get("gaussians", gaussians, "means"), 2)
     return {"means": means, "opacities": opacities, "sh0": rows[:, :1], "shN": rows[:, 1:]}
 
 
@@ -205,10 +199,10 @@ def _convert_views(
     Their poses are camera to world, their intrinsics are relative to the image's size, and their images have the
     channels first.
     """
-    c2w = as_array(_unbatch(extrinsics, _get_field("poses", poses, extrinsics), 3)).astype(np.float64)
+    c2w = as_array(_unbatch(extrinsics, _get("poses", poses, extrinsics), 3)).astype(np.float64)
     photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)
     sizes = np.array([photos.shape[2], photos.shape[1], 1.0])
-    Ks = as_array(_unbatch(intrinsics, _get_field("poses", poses, intrinsics), 3)).astype(np.float64) * sizes[:, None]
+    Ks = as_array(_unbatch(intrinsics, _get("poses", poses, intrinsics), 3)).astype(np.float64) * sizes[:, None]
     return {"images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks}
 
 

@@ -138,6 +138,7 @@ def _without_run(name: str, data: bytes) -> bytes:
 
 
 def _without_times(document: dict[str, Any]) -> dict[str, Any]:
+    """Return an object of a report without the keys that differ from run to run."""
     return {key: value for key, value in document.items() if key not in OF_THE_RUN}
 
 

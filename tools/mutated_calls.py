@@ -41,6 +41,7 @@ def declare(name: str, returns: signature.Argument | None = None, /, **arguments
     call = _declare(name, returns, **arguments)
 
     def recorded(*values: Any, **named: Any) -> Any:
+        """Call the function, and repeat its first small calls with changed arguments."""
         row = (*values, *(named[key] for key in list(arguments)[len(values) :]))
         with _lock:
             small = sum(value.nbytes for value in row if isinstance(value, np.ndarray)) < BYTES

@@ -128,6 +128,7 @@ def collect_page_data(
     stills: Stills = {}
 
     def add_still(result: str, split: str, view: int, image: np.ndarray) -> None:
+        """Keep a rendered view as an encoded still."""
         stills[result, split, view] = encode_still(to_picture(image))
 
     options = EvaluateOptions((LPIPS,) if lpips_available(LPIPS) else (), None, fog=False)

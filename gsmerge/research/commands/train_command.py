@@ -55,6 +55,7 @@ def train(args: opt.Args) -> None:
         )
 
         def show_step(step: int, steps: int, loss: float) -> None:
+            """Show a step of the training as progress."""
             progress(f"train: loss {loss:.4f}", step, steps)
 
         trained = train_networks(shards, validation, out, options, progress=show_step)

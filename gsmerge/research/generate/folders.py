@@ -86,6 +86,7 @@ def generate(
     todo = [i for i, scene in enumerate(planned) if not scene.kept]
 
     def work(index: int) -> None:
+        """Generate the scene of one folder."""
         generate_scene(planned[index].folder, options, seed=seed, index=index)
 
     with use_threads(threads) as workers:

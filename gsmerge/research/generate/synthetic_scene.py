@@ -70,6 +70,7 @@ def draw_path(room: Room, rng: np.random.Generator, num_views: int) -> CameraPat
     phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
 
     def pose(s: float) -> Array:
+        """Return the camera-to-world matrix at a position along the path, 0 to 1."""
         angle, radius = np.deg2rad(start + span * s), distance * (1 + closer * s)
         x, _, z = room.focus
         eye = np.array([x + radius * sin(angle), -(height + sway * sin(6 * s + phase)), z - radius * cos(angle)])
@@ -169,6 +170,7 @@ def make_synthetic_scene(seed: int, index: int, options: GenerateOptions) -> Syn
     errors = {place: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for place in views}
 
     def take_view(place: int) -> tuple[Float, Array, Gaussians | None]:
+        """Return the photo, the pose and the Gaussians of a place; held-out views have no Gaussians."""
         photo = session.take_photo(place, photo_seeds[place])
         if place not in errors:
             return photo, session.exported_pose(place), None

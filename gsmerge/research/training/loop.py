@@ -61,6 +61,7 @@ def _score_shard(networks: Networks, shard: Shard, number: int, options: TrainOp
     ]
 
     def score_window(window: Window) -> tuple[float, float, float]:
+        """Return the PSNR (dB) without and with networks, and the share of merged Feature Gaussians."""
         plain, _ = render_window(window, None, options)
         image, matched = render_window(window, networks, options)
         return window_psnr(window, plain), window_psnr(window, image), matched

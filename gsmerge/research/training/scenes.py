@@ -71,6 +71,7 @@ def measure_covered(training: TrainingScene, level: float = 1) -> np.ndarray:
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
 
     def measure_view(view: int) -> np.ndarray:
+        """Measure the coverage ``[p,h,w]`` of all photos by the Gaussians of one view."""
         part = subset(scene, [view])
         splats = make_splats(part.gaussians, np.zeros(3))
         views = (tile_view(splats, **photos.camera(photo), near=NEAR_PLANE) for photo in range(len(photos)))

@@ -70,6 +70,7 @@ class Window:
         return torch.from_numpy(self._part(self.crop.example.mask(self.photo)))
 
     def _part(self, picture: np.ndarray) -> np.ndarray:
+        """Return the box's part of a picture ``[h,w,...]``."""
         box = self.box
         return np.ascontiguousarray(picture[box.top : box.top + box.height, box.left : box.left + box.width])
 
