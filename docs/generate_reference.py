@@ -165,9 +165,9 @@ def _settings_page() -> str:
     lines = [NOTICE, "", SETTINGS_HEAD]
     for title, settings in tables.items():
         rest = [setting for setting in settings if setting.name not in options]
-        lines += ["", f"## {title}", "", *_list(rest)] if rest else []
+        lines += ["", f"## {title}", "", *_setting_lines(rest)] if rest else []
     lines += ["", "## Hints", "", "`--hint NAME=VALUE` says how to read a file that is recognised wrongly.", ""]
-    return "\n".join([*lines, *_list(flat_settings(FileHints).values()), ""])
+    return "\n".join([*lines, *_setting_lines(flat_settings(FileHints).values()), ""])
 
 
 def _exporters_page(page: str) -> str:
@@ -215,7 +215,7 @@ def _renew(page: str, name: str, lines: Sequence[str]) -> str:
     return before + start + "\n".join(["", *lines, ""]) + end + after
 
 
-def _list(settings: Iterable[Any]) -> list[str]:
+def _setting_lines(settings: Iterable[Any]) -> list[str]:
     """Return a line for each setting: its name, default, possible values and description."""
     lines = []
     for setting in settings:

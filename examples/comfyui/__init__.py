@@ -36,10 +36,7 @@ def make_progress() -> Any:
 
 
 def place_camera(camera: dict[str, Any], width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Convert a camera of ComfyUI, as Render Splat uses it.
-
-    Returns the view matrix in the world of the splat, with OpenCV axes, and K.
-    """
+    """Return view matrix (OpenCV axes, world of the splat) and K of a camera of ComfyUI, as Render Splat uses it."""
     if str(camera.get("cameraType", "")).lower().startswith("ortho"):
         raise ValueError("camera_info: expected perspective cameras, found an orthographic one")
     eye, target = (np.array([float(camera[name].get(axis, 0)) for axis in "xyz"]) for name in ("position", "target"))
@@ -61,10 +58,7 @@ def place_camera(camera: dict[str, Any], width: int, height: int) -> tuple[np.nd
 
 
 def place_views(images: list[torch.Tensor], cameras: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the views of batches of images ``[b,h,w,3]``, as arguments of :func:`gsmerge.compact_tensors`.
-
-    ``cameras`` has the camera of each image. Raises ValueError if images and cameras do not fit each other.
-    """
+    """Return batches of images ``[b,h,w,3]`` and their cameras as arguments; ValueError if they do not fit."""
     if len({image.shape[1:3] for image in images}) > 1:
         raise ValueError("images: expected one size")
     photos = torch.cat([image[..., :3] for image in images])
@@ -91,8 +85,6 @@ def join_batch(items: list[gsmerge.Gaussians]) -> Types.SPLAT:
 
 
 class CompactGaussians(IO.ComfyNode):
-    """Node that compacts the splats of the graph."""
-
     @classmethod
     def define_schema(cls) -> IO.Schema:
         return IO.Schema(
@@ -122,8 +114,6 @@ class CompactGaussians(IO.ComfyNode):
 
 
 class CompactFile(IO.ComfyNode):
-    """Node that compacts a file or a scene's folder on the server."""
-
     @classmethod
     def define_schema(cls) -> IO.Schema:
         return IO.Schema(
@@ -151,8 +141,6 @@ class CompactFile(IO.ComfyNode):
 
 
 class Nodes(ComfyExtension):
-    """The nodes of this folder, as ComfyUI loads them."""
-
     async def get_node_list(self) -> list[type[IO.ComfyNode]]:
         return [CompactGaussians, CompactFile]
 

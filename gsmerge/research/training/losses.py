@@ -212,7 +212,10 @@ def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tens
 
 
 def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows of both children of all pairs with the same parent; the first row is the lower one."""
+    """Return the rows of both children of all pairs with the same parent; the first row is the lower one.
+
+    ``parents`` are ascending, so siblings are next to each other. Pairs are found by the gap between their rows.
+    """
     count = int(torch.bincount(parents).max()) if len(parents) else 0
     rows = torch.arange(len(parents))
     firsts = [rows[: len(rows) - gap][parents[: len(rows) - gap] == parents[gap:]] for gap in range(1, count)]

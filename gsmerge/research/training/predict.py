@@ -153,17 +153,17 @@ def differentiate_tokens(
 
 
 def _log_scales(scales: Tensor, pixels: Tensor) -> Tensor:
-    """Return inputs for scales ``[n,3]``: their logarithms in units of ``pixels [n]``, clipped and reduced."""
+    """Return inputs for scales ``[n,3]``: their logarithms in units of ``pixels [n]``, clipped and scaled down."""
     return torch.log(scales.clamp_min(TINY) / pixels[:, None]).clamp(-12, 12) / 4
 
 
 def _logits(opacities: Tensor) -> Tensor:
-    """Return inputs for opacities ``[n]``: their logits, clipped and reduced."""
+    """Return inputs for opacities ``[n]``: their logits, clipped and scaled down."""
     return torch.logit(opacities.clamp(1e-4, 1 - 1e-4)) / 3
 
 
 def _log_ratio(values: Tensor, units: Tensor) -> Tensor:
-    """Return inputs for masses or extinctions ``[g]``: their logarithms in ``units [g]``, clipped and reduced."""
+    """Return inputs for masses or extinctions ``[g]``: their logarithms in ``units [g]``, clipped and scaled down."""
     return (torch.log(values.clamp_min(1e-30)) - torch.log(units)).clamp(-30, 30) / 10
 
 
