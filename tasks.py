@@ -1,8 +1,8 @@
-"""The tasks of this project, one word each: python3 tasks.py TASK... (CONTRIBUTING.md says when each is needed).
+"""Run tasks of this project by their names: python3 tasks.py TASK... (CONTRIBUTING.md says when each is needed).
 
-``demo`` and ``setup`` install the package into ``.venv``, and the tasks after them use what is installed there. Without
-them the tools of this Python's own environment are used. The first failure stops. Options, and what follows them, are
-passed to the last task: python tasks.py fuzz --minutes 30.
+``demo`` and ``setup`` install the package into ``.venv``, and the tasks after them use the tools there. Without them
+the tools of this Python's own environment are used. The first task that fails ends the run. Options, and all words
+after them, are passed to the last task: python tasks.py fuzz --minutes 30.
 """
 
 from __future__ import annotations
@@ -13,13 +13,11 @@ import sys
 from pathlib import Path
 
 ROOT, TOOLS = Path(__file__).resolve().parent, Path(sys.executable).parent
-INSTALLED = (
-    ROOT / ".venv" / ("Scripts" if os.name == "nt" else "bin")
-)  # programs of what ``demo`` and ``setup`` install
+INSTALLED = ROOT / ".venv" / ("Scripts" if os.name == "nt" else "bin")  # tools that ``demo`` and ``setup`` install
 MAKE_VENV = ("python", "-m", "venv", ".venv")
 INSTALL = ("pip", "install", "-q", "-c", "constraints.txt", "-e")
-ROOM = ("demo", "--width", "480", "--height", "320", "--seed", "20")
-TASKS: dict[str, tuple[tuple[str, ...], ...]] = {
+ROOM = ("demo", "--width", "480", "--height", "320", "--seed", "20")  # folder and options of the demo's scene
+TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "demo": (
         MAKE_VENV,
         (*INSTALL, "."),
@@ -42,11 +40,11 @@ TASKS: dict[str, tuple[tuple[str, ...], ...]] = {
     "kills": (("python", "tools/kills.py"),),
     "preview": (("python", "tools/make_preview.py"),),
 }
-CHECKS = ("lint", "types", "imports", "docs", "tests", "sweeps")
+CHECKS = ("lint", "types", "imports", "docs", "tests", "sweeps")  # tasks that ``check`` stands for
 
 
 def main(names: list[str]) -> int:
-    """Run tasks one after the other; ``check`` stands for all checks."""
+    """Run tasks one after the other; return the exit code of the first that fails, otherwise 0; 2 for a wrong name."""
     options = next((names[i:] for i, name in enumerate(names) if name.startswith("-")), [])
     names = names[: len(names) - len(options)]
     names = [task for name in names for task in (CHECKS if name == "check" else (name,))]

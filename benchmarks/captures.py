@@ -1,12 +1,12 @@
-"""Captures of docs/internals/captures.md: exports as feed-forward backbones write them, held-out views, scores, tables.
+"""Export captures as feed-forward backbones would, and read and score their held-out views, for all benchmarks.
 
 python benchmarks/captures.py SCENE OUT                    # plain: a Gaussian for each pixel, view by view
 python benchmarks/captures.py SCENE OUT --style anysplat   # or da3, depthsplat
 
-Captures are in ``scenes/train`` and ``scenes/eval`` below ``GSMERGE_DATA``, or else below ``../shared``. Depth,
-confidence and colour of an export are the capture's; scales, rotations, opacities and offsets, which its depth network
-does not predict, follow from them with jitter. A seed gives the same bytes every time. The other benchmarks import this
-file.
+Captures (docs/internals/captures.md) are in ``scenes/train`` and ``scenes/eval`` below ``GSMERGE_DATA``, or else below
+``../shared``. An export has the capture's depth, confidence and colour. Its scales, rotations, opacities and offsets,
+which the depth network does not predict, follow from these with jitter. The bytes are the same every time. The other
+benchmarks import this file.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from gsmerge.types import Cameras, Gaussians
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
 BORDER = 8  # pixels that da3 (of 256) and depthsplat leave out
-LPIPS_VIEWS = 4  # at most this many target views of a scene, every second, third, ...
+LPIPS_VIEWS = 4  # most target views of a scene on which LPIPS is measured, at equal intervals
 CAPTURES = "docs/internals/captures.md says how captures are made, and which files are not public"
-Rows = dict[str, np.ndarray]  # of Gaussians: means, quats, scales, opacities, sh0, of the same length
+Rows = dict[str, np.ndarray]  # columns of Gaussians by name: means, quats, scales, opacities, sh0
 Record = dict[str, Any]
 
 
 def make_parser(text: str, scenes: str = "eval") -> argparse.ArgumentParser:
-    """A parser with the captures to measure, and the folder of their exports and of finished runs."""
+    """Make a parser with arguments for the captures to measure, and for the folder of exports and finished runs."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="?", default=scenes, help="train, eval, or names, with commas between")
     cache = Path(tempfile.gettempdir()) / "gsmerge-benchmarks"
@@ -51,22 +51,22 @@ def make_parser(text: str, scenes: str = "eval") -> argparse.ArgumentParser:
 
 
 def scene_folders(text: str) -> list[Path]:
-    """The folders of captures: of ``train``, of ``eval``, or by name; those that are not there are left out."""
+    """Find the folders of captures, which are named by ``train``, ``eval`` or their names; leave out missing ones."""
     root = Path(os.environ.get("GSMERGE_DATA", Path(__file__).parents[2] / "shared"))
     known = {path.name: path for path in sorted(root.glob("scenes/*/*")) if path.is_dir()}
-    found: list[Path] = []
+    folders: list[Path] = []
     for name in text.split(","):
-        asked = [path for path in known.values() if name in (path.name, path.parent.name)]
-        found += asked
-        if not asked:
-            print(f"left out, as not below {root}: {name}; {CAPTURES}", file=sys.stderr)
-    if not found:
+        matches = [path for path in known.values() if name in (path.name, path.parent.name)]
+        folders += matches
+        if not matches:
+            print(f"{name} is left out, because it is not below {root}; {CAPTURES}", file=sys.stderr)
+    if not folders:
         raise SystemExit(f"expected captures below GSMERGE_DATA, found none; {CAPTURES}")
-    return found
+    return folders
 
 
-def export(scene: Path, cache: Path, style: str = "plain") -> Path:
-    """The ``.ply`` of a capture, written once into ``cache``."""
+def export_capture(scene: Path, cache: Path, style: str = "plain") -> Path:
+    """Return the ``.ply`` of a capture in a style; it is written into ``cache`` unless it is there."""
     out = cache / f"{scene.name}-{style}"
     if not (out / "done").exists():
         write_export(scene, out, style)
@@ -84,25 +84,27 @@ class Targets:
 
 
 def read_held_out(scene: Path) -> Targets:
-    """The target views of a capture; a pixel is visible if a context depth sample falls on it or on a neighbour."""
+    """Read the target views of a capture; a pixel is visible if a point of a context view falls on it or next to it."""
     frames = [f for f in json.loads((scene / "transforms.json").read_text())["frames"] if f["role"] == "target"]
     images = [cv2.imread(str(scene / f["file_path"]))[..., ::-1].astype(np.float32) / 255 for f in frames]
     viewmats = np.stack([np.linalg.inv(np.array(f["transform_matrix"]) @ FLIP) for f in frames])
     Ks = np.array([[[f["fl_x"], 0, f["cx"]], [0, f["fl_y"], f["cy"]], [0, 0, 1]] for f in frames])
-    points = np.concatenate([_points(view) for view in read_context(scene)])
+    points = np.concatenate([_context_points(view) for view in read_context(scene)])
     height, width = images[0].shape[:2]
-    masks = np.stack([_visible(points, w2c, K, height, width) for w2c, K in zip(viewmats, Ks, strict=True)])
+    masks = np.stack([_visible_mask(points, w2c, K, height, width) for w2c, K in zip(viewmats, Ks, strict=True)])
     return Targets(np.stack(images), Cameras(viewmats, Ks, width, height), masks)
 
 
-def _points(view: dict[str, Any]) -> np.ndarray:
+def _context_points(view: dict[str, Any]) -> np.ndarray:
+    """Return the world point ``[n,3]`` of each pixel of a view by its depth."""
     height, width = view["depth"].shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view["K"]).T
     return (rays * view["depth"][..., None]).reshape(-1, 3) @ view["c2w"][:3, :3].T + view["c2w"][:3, 3]
 
 
-def _visible(points: np.ndarray, w2c: np.ndarray, K: np.ndarray, height: int, width: int) -> np.ndarray:
+def _visible_mask(points: np.ndarray, w2c: np.ndarray, K: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return the mask ``[h,w]`` of a camera's pixels on which points fall, and of their neighbours."""
     camera = points @ w2c[:3, :3].T + w2c[:3, 3]
     image = camera[camera[:, 2] > 1e-6] @ K.T
     x, y = np.floor(image[:, :2] / image[:, 2:]).astype(int).T
@@ -113,12 +115,13 @@ def _visible(points: np.ndarray, w2c: np.ndarray, K: np.ndarray, height: int, wi
 
 
 def score(gaussians: Gaussians, targets: Targets, perceptual: bool = False) -> tuple[float, ...]:
-    """Mean PSNR (dB) and SSIM over the visible pixels of all target views; LPIPS-VGG of some of them if asked."""
+    """Return the mean PSNR (dB) and SSIM over the visible pixels of all target views.
+
+    With ``perceptual``, LPIPS (VGG) over some of the views is the third score.
+    """
     images = gsmerge.render(gaussians, targets.cameras).images.clip(0, 1)
-    values = [
-        (psnr(a, b, mask), ssim(a, b, mask)) for a, b, mask in zip(images, targets.images, targets.masks, strict=True)
-    ]
-    means = tuple(float(v) for v in np.mean(values, 0))
+    triples = zip(images, targets.images, targets.masks, strict=True)
+    means = tuple(map(float, np.mean([(psnr(a, b, mask), ssim(a, b, mask)) for a, b, mask in triples], 0)))
     if not perceptual:
         return means
     chosen = range(0, len(images), math.ceil(len(images) / LPIPS_VIEWS))
@@ -132,7 +135,7 @@ def require_lpips() -> None:
 
 
 class Records:
-    """Finished measurements in a file, one JSON line each, so that an interrupted benchmark goes on."""
+    """Finished measurements in a file, one JSON line each, so that an interrupted benchmark can continue."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -140,7 +143,7 @@ class Records:
         self.rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
     def get(self, key: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> Record:
-        """The record with a key: a finished one, or that key with what is measured now."""
+        """Return the record with a key; if there is none, measure now, and store the key with the measurement."""
         for row in self.rows:
             if key.items() <= row.items():
                 return row
@@ -152,13 +155,13 @@ class Records:
         return self.rows[-1]
 
 
-def mean(records: Sequence[Mapping[str, Any]], name: str) -> float:
-    """The mean of a number over the records that have it; NaN for none."""
+def mean_of(records: Sequence[Mapping[str, Any]], name: str) -> float:
+    """Average a number over the records that have it; NaN if none has it."""
     return float(np.mean([record[name] for record in records if name in record] or [np.nan]))
 
 
 def run_command(call: Sequence[str], tree: Path | None = None, threads: int | None = None) -> tuple[float, bytes]:
-    """Run a command, with the package of another checkout if asked; return its processor seconds and its output."""
+    """Run a command; return its processor seconds and its output. ``tree`` is the checkout whose package it uses."""
     env = dict(os.environ)
     env |= {"PYTHONPATH": str(tree.resolve())} if tree else {}
     env |= {"GSMERGE_THREADS": str(threads)} if threads else {}
@@ -169,13 +172,13 @@ def run_command(call: Sequence[str], tree: Path | None = None, threads: int | No
 
 
 def make_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of Markdown."""
+    """Format a table in Markdown."""
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
     return "\n".join(f"|{'|'.join(line)}|" for line in lines)
 
 
-def setting(text: str) -> tuple[str, object]:
-    """A setting of compact, NAME=VALUE with the value as JSON or text, as an item of a dictionary."""
+def parse_setting(text: str) -> tuple[str, object]:
+    """Parse a setting NAME=VALUE of compact, whose value is JSON or text, and return name and value."""
     name, value = text.split("=", 1)
     try:
         return name, json.loads(value)
@@ -184,14 +187,19 @@ def setting(text: str) -> tuple[str, object]:
 
 
 def read_context(folder: Path, max_views: int | None = None) -> list[dict[str, Any]]:
-    """Context views: image ``[h,w,3]`` 0 to 1, depth along z and conf ``[h,w]``, K ``[3,3]``, c2w ``[4,4]`` OpenCV."""
+    """Read a capture's context views, at most ``max_views`` of them.
+
+    A view has ``name``, ``image [h,w,3]`` in [0, 1], ``depth [h,w]`` along z, ``conf [h,w]`` (confidence), ``K [3,3]``
+    and ``c2w [4,4]`` with OpenCV axes.
+    """
     frames = [f for f in json.loads((folder / "transforms.json").read_text())["frames"] if f["role"] == "context"]
     if max_views and max_views < len(frames):
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, max_views).round().astype(int)]
-    return [_read_view(folder, frame) for frame in frames]
+    return [_read_context_view(folder, frame) for frame in frames]
 
 
-def _read_view(folder: Path, frame: dict[str, Any]) -> dict[str, Any]:
+def _read_context_view(folder: Path, frame: dict[str, Any]) -> dict[str, Any]:
+    """Read one context view; its depth is stored as a share of the range of inverse depths."""
     steps = cv2.imread(str(folder / frame["depth_path"]), cv2.IMREAD_UNCHANGED) / 65535
     near, far = frame["depth_near"], frame["depth_far"]
     return {
@@ -205,7 +213,7 @@ def _read_view(folder: Path, frame: dict[str, Any]) -> dict[str, Any]:
 
 
 def view_gaussians(view: dict[str, Any], rng: np.random.Generator) -> Rows:
-    """A view's Gaussians, row by row of its pixels: thin discs in the surface, in the world's frame."""
+    """Make a Gaussian for each pixel of a view, in row-major order: thin discs on the surface, in the world's frame."""
     (height, width), K, c2w = view["depth"].shape, view["K"], view["c2w"]
     count = height * width
     z = view["depth"] * np.exp(rng.normal(0, 0.002, (height, width)))
@@ -215,7 +223,7 @@ def view_gaussians(view: dict[str, Any], rng: np.random.Generator) -> Rows:
     axes = (c2w[:3, :3] @ _surface_frames(points)).reshape(-1, 3, 3)
     jitter = np.exp(rng.normal(0, 0.25, (count, 3)))
     scales = (z / K[0, 0]).reshape(-1, 1) * np.array([0.75, 0.75, 0.25]) * jitter
-    oversized = rng.random(count) < 0.003  # every backbone makes a few far too large ones
+    oversized = rng.random(count) < 0.003  # every backbone makes a few Gaussians that are far too large
     scales[oversized] *= rng.uniform(3, 10, (oversized.sum(), 1))
     opacities = 0.25 + 0.7 * view["conf"].reshape(-1) + rng.normal(0, 0.05, count)
     rgb = (view["image"].reshape(-1, 3) + rng.normal(0, 0.01, (count, 3))).clip(0, 1)
@@ -231,7 +239,7 @@ def view_gaussians(view: dict[str, Any], rng: np.random.Generator) -> Rows:
 
 
 def _surface_frames(points: np.ndarray) -> np.ndarray:
-    """Axes ``[h,w,3,3]`` as columns, the last normal to the smoothed surface, or along the ray where steep."""
+    """Compute axes ``[h,w,3,3]`` as columns; the last one is the surface's normal, or the ray on steep surfaces."""
     smooth = cv2.GaussianBlur(points, (0, 0), 1.5)
     normals = _normalized(np.cross(np.gradient(smooth, axis=1), np.gradient(smooth, axis=0)))
     rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
@@ -242,28 +250,33 @@ def _surface_frames(points: np.ndarray) -> np.ndarray:
 
 
 def _normalized(vectors: np.ndarray) -> np.ndarray:
+    """Scale vectors to unit length."""
     return vectors / (np.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-12)
 
 
 def _positive_first(quats: np.ndarray) -> np.ndarray:
+    """Change signs of quaternions so that their first number is not negative."""
     return quats * np.where(quats[:, :1] < 0, -1, 1)
 
 
-def take(rows: Rows, index: np.ndarray) -> Rows:
+def take_rows(rows: Rows, index: np.ndarray) -> Rows:
+    """Select rows of all columns."""
     return {name: values[index] for name, values in rows.items()}
 
 
-def concat(parts: Sequence[Rows]) -> Rows:
+def concat_rows(parts: Sequence[Rows]) -> Rows:
+    """Join the rows of several parts."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def rotate_world(rows: Rows, rotation: np.ndarray) -> Rows:
+    """Rotate Gaussians about the origin of the world."""
     quats = _positive_first(rotmat_to_quat(rotation @ quat_to_rotmat(rows["quats"])))
     return {**rows, "means": rows["means"] @ rotation.T, "quats": quats}
 
 
-def voxel_merge(rows: Rows, size: float) -> Rows:
-    """The means of each voxel by opacity, in the order of voxels."""
+def merge_voxels(rows: Rows, size: float) -> Rows:
+    """Average the Gaussians of each voxel, weighted by opacity; voxels are in ascending order."""
     keys = np.floor(rows["means"] / size).astype(np.int64)
     _, firsts, voxels = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     voxels, weights = voxels.reshape(-1), rows["opacities"]
@@ -279,7 +292,7 @@ def voxel_merge(rows: Rows, size: float) -> Rows:
 
 
 def write_ply(path: Path, rows: Rows, *, logits: bool = True) -> Path:
-    """Write rows; opacities as logits, or as they are."""
+    """Write rows to a ``.ply``, with opacities as logits or as they are; return its path."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows['means'])}"]
@@ -293,17 +306,17 @@ def write_ply(path: Path, rows: Rows, *, logits: bool = True) -> Path:
 
 
 def write_views(out: Path, views: Sequence[dict[str, Any]]) -> None:
-    """Photos and ``transforms.json`` of views."""
+    """Write the photos and the ``transforms.json`` of views."""
     (out / "images").mkdir(parents=True, exist_ok=True)
     for view in views:
         photo = np.round(view["image"][..., ::-1] * 255).astype(np.uint8)
         cv2.imwrite(str(out / "images" / view["name"]), photo, [cv2.IMWRITE_JPEG_QUALITY, 97])
-    frames = [frame_of(f"images/{v['name']}", v["K"], v["c2w"], v["depth"].shape) for v in views]
+    frames = [make_frame(f"images/{v['name']}", v["K"], v["c2w"], v["depth"].shape) for v in views]
     (out / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1))
 
 
-def frame_of(path: str, K: np.ndarray, c2w: np.ndarray, shape: Sequence[int]) -> dict[str, Any]:
-    """A frame of ``transforms.json`` of an OpenCV pose ``[4,4]`` and a shape (height, width)."""
+def make_frame(path: str, K: np.ndarray, c2w: np.ndarray, shape: Sequence[int]) -> dict[str, Any]:
+    """Make a frame of ``transforms.json`` from an OpenCV pose ``[4,4]`` and a shape (height, width)."""
     head = {"file_path": path, "w": shape[1], "h": shape[0]}
     values = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     return {**head, **{name: float(v) for name, v in values.items()}, "transform_matrix": (c2w @ FLIP).tolist()}
@@ -312,25 +325,29 @@ def frame_of(path: str, K: np.ndarray, c2w: np.ndarray, shape: Sequence[int]) ->
 def write_export(
     scene: Path, out: Path, style: str = "plain", max_views: int | None = None, nested: float = 1.0
 ) -> Path:
-    """Write a capture in a backbone's style, and return its ``.ply``; ``nested``: da3's cameras are so much larger."""
+    """Export a capture in a backbone's style, and return its ``.ply``.
+
+    ``nested`` is the factor on the cameras' positions and the depths of da3, as nested models write them.
+    """
     rng, views = np.random.default_rng(0), read_context(scene, max_views)
     parts = [view_gaussians(view, rng) for view in views]
     return STYLES[style](out, views, parts, nested)
 
 
-def _plain(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested: float) -> Path:
+def _write_plain(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested: float) -> Path:
+    """Write all Gaussians, view by view."""
     write_views(out, views)
-    return write_ply(out / "scene.ply", concat(parts))
+    return write_ply(out / "scene.ply", concat_rows(parts))
 
 
-def _da3(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested: float) -> Path:
-    """Without borders and the farthest tenth; cameras and depth as arrays."""
+def _write_da3(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested: float) -> Path:
+    """Leave out borders and the farthest tenth of each view; write cameras and depth as arrays."""
     kept, (height, width) = [], views[0]["depth"].shape
     top, left = int(BORDER / 256 * height), int(BORDER / 256 * width)
     for view, rows in zip(views, parts, strict=True):
         mask = np.zeros((height, width), bool)
         mask[top : height - top, left : width - left] = True
-        kept.append(take(rows, (mask & (view["depth"] <= np.quantile(view["depth"], 0.9))).reshape(-1)))
+        kept.append(take_rows(rows, (mask & (view["depth"] <= np.quantile(view["depth"], 0.9))).reshape(-1)))
     poses = np.stack([np.linalg.inv(view["c2w"])[:3] for view in views]).astype(np.float32)
     poses[:, :, 3] *= nested
     depth = np.stack([view["depth"] * nested for view in views]).astype(np.float32).round(6)
@@ -339,25 +356,27 @@ def _da3(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested: floa
     place = out / "exports" / "npz"
     place.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(place / "results.npz", extrinsics=poses, intrinsics=Ks, depth=depth, conf=conf, image=images)
-    return write_ply(out / "gs_ply" / "0000.ply", concat(kept))
+    return write_ply(out / "gs_ply" / "0000.ply", concat_rows(kept))
 
 
-def _depthsplat(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested: float) -> Path:
-    """Without borders, the view running fastest, turned by the first camera."""
+def _write_depthsplat(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested: float) -> Path:
+    """Leave out borders, let the view run fastest in the order of rows, and rotate the world by the first camera."""
     inner = np.arange(views[0]["depth"].size).reshape(views[0]["depth"].shape)[BORDER:-BORDER, BORDER:-BORDER]
     order = (np.arange(len(parts)) * views[0]["depth"].size + inner.reshape(-1, 1)).reshape(-1)
     write_views(out, views)
-    return write_ply(out / "gaussians.ply", rotate_world(take(concat(parts), order), views[0]["c2w"][:3, :3].T))
+    return write_ply(
+        out / "gaussians.ply", rotate_world(take_rows(concat_rows(parts), order), views[0]["c2w"][:3, :3].T)
+    )
 
 
-def _anysplat(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested: float) -> Path:
-    """In voxels of the median pixel's size, opacities as they are."""
+def _write_anysplat(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested: float) -> Path:
+    """Merge Gaussians in voxels of the median pixel's size, and write opacities as they are."""
     size = np.median([np.median(view["depth"]) / view["K"][0, 0] for view in views])
     write_views(out, views)
-    return write_ply(out / "gaussians.ply", voxel_merge(concat(parts), size), logits=False)
+    return write_ply(out / "gaussians.ply", merge_voxels(concat_rows(parts), size), logits=False)
 
 
-STYLES = {"plain": _plain, "da3": _da3, "depthsplat": _depthsplat, "anysplat": _anysplat}
+STYLES = {"plain": _write_plain, "da3": _write_da3, "depthsplat": _write_depthsplat, "anysplat": _write_anysplat}
 
 
 if __name__ == "__main__":

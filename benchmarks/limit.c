@@ -1,25 +1,28 @@
-/* Counts the pairs of a pixel and a Gaussian in tile lists, and measures what a processor can do at most.
+/* Counts the pairs of a pixel and a Gaussian in tile lists, and measures the highest rates of a processor.
 
-Compiled by limit.py for the target of the kernels and with the walk.h of the tree that is measured. Needed pairs are
-counted on their own. Visited pairs follow the kernels, so `visit` changes with them. */
+limit.py compiles this file for the target of the kernels, with the walk.h of the checkout that is measured. Needed
+pairs do not depend on the kernels. Visited pairs do, so `visit` has to change with the kernels. */
 #include <math.h>
 #include "walk.h"
 #ifndef PARTS  // older checkouts walk eight pixels at a time on all processors
 #define PARTS 2
 #endif
 
-// Numbers of a list of tiles; the fields of kernel_times.py.
+// Counts over a list of tiles, in the order of COUNTS in limit.py: pixels, entries of tile lists, entries that were
+// read before all pixels of the tile were opaque, entries that reach the tile, visited and needed pairs, and vectors of
+// eight pixels, all and those with a needed pair.
 typedef struct {
   int64_t pixels, listed, walked, shown, visited, needed, vectors, useful;
 } Counts;
 
-// Lanes of a row that blend.c and blend_backward.c work on for Gaussian j of a batch: the one place that knows.
+// Return how many pixels of a row blend.c and blend_backward.c work on for Gaussian j of a batch; x0 is the first one.
 static int32_t lanes_of(const Batch *b, int64_t j, int32_t *x0) {
   *x0 = b->x0[j] == WIDE ? 0 : b->x0[j];
   return b->x0[j] == WIDE ? TILE : HALF;
 }
 
-// Add the pairs of Gaussian j of a batch that change the picture, and where they lie: one bit for each pixel of a row.
+// Return the number of pairs of Gaussian j of a batch that change the picture, and draw it into `light`. `bits` has a
+// row of the tile in each number, with a bit for each pixel that it changes.
 static int64_t need(float *light, const Batch *b, int64_t j, int32_t bits[TILE]) {
   int64_t count = 0;
   for (int32_t y = 0; y < TILE; y++) {
@@ -38,7 +41,7 @@ static int64_t need(float *light, const Batch *b, int64_t j, int32_t bits[TILE])
   return count;
 }
 
-// Add the pairs of Gaussian j of a batch that the kernels work on, and the vectors of eight among them.
+// Count the pairs of Gaussian j of a batch that the kernels work on, and their vectors of eight pixels.
 static void visit(Counts *c, const Tile *t, const Batch *b, int64_t j, const int32_t bits[TILE]) {
   int32_t x0, lanes = lanes_of(b, j, &x0), y0 = first_row(t, b, j), y1 = last_row(t, b, j);
   int32_t extra = PARTS == 1 && y0 <= y1 && lanes == HALF && (y1 - y0) % 2 == 0;  // rows of eight come in pairs
@@ -53,6 +56,7 @@ static void visit(Counts *c, const Tile *t, const Batch *b, int64_t j, const int
     }
 }
 
+// Add the counts of tiles `first` to `last` to c; return 0, or OUTSIDE if an index is outside its array.
 API int32_t count_pairs(const float *conics, const int32_t *flatten_ids, const int64_t *offsets, int64_t tile_width,
                         int64_t first, int64_t last, int64_t h, int64_t w, int64_t m, int64_t n, int64_t ends,
                         Counts *c) {
@@ -88,8 +92,7 @@ typedef v8f wide;
 #endif
 enum { CHAINS = 12, WIDTH = sizeof(wide) / sizeof(float) };
 
-// Independent chains of multiply-adds, or of divisions, in registers of the target; returns the operations, one for each
-// lane.
+// Compute independent chains of multiply-adds in registers of the target; return their number, one for each lane.
 API int64_t add_products(int64_t rounds, float *out) {
   wide x[CHAINS], a, b;
   for (int i = 0; i < WIDTH; i++) a[i] = 0.999f + 1e-5f * out[i], b[i] = 1e-3f * out[i];
@@ -101,6 +104,7 @@ API int64_t add_products(int64_t rounds, float *out) {
   return rounds * CHAINS * WIDTH;
 }
 
+// Compute independent chains of divisions; return their number, one for each lane.
 API int64_t divide(int64_t rounds, float *out) {
   wide x[CHAINS], a;
   for (int i = 0; i < WIDTH; i++) a[i] = 1.5f + 1e-5f * out[i];
@@ -112,7 +116,7 @@ API int64_t divide(int64_t rounds, float *out) {
   return rounds * CHAINS * WIDTH;
 }
 
-// Read one array and write another, so many times; returns the bytes read and written.
+// Read one array and write another `rounds` times; return the bytes read and written.
 API int64_t stream(const float *from, float *to, int64_t count, int64_t rounds) {
   for (int64_t i = 0; i < rounds; i++) {
     float add = (float)i;

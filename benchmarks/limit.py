@@ -1,20 +1,20 @@
-"""How near the kernels come to what a machine can do: docs/results/limit.md.
+"""Measure how near the kernels come to the limits of a machine, for docs/results/limit.md.
 
 python benchmarks/limit.py                                    # fox and fern
-python benchmarks/limit.py fern --page docs/results/limit.md  # its tables into the page
+python benchmarks/limit.py fern --page docs/results/limit.md  # put the tables into the page
 GSMERGE_TARGET=v3 python benchmarks/limit.py                  # kernels of another target
 
-Each step of a real fit is timed, and its pairs of a pixel and a Gaussian are counted in a run of their own. Needed
-pairs change the picture. Visited pairs are those on which the kernels work. The limit of a kernel is the time that its
-operations take at the peak of the processor, or its bytes at the bandwidth of the memory that holds them, whichever is
-longer. Times are the least of several runs, since other programs disturb them.
+Each step of a real fit is timed. Another run counts the step's pairs of a pixel and a Gaussian. Needed pairs change the
+picture. Visited pairs are those on which the kernels work. The limit of a kernel is a time: the longer one of the time
+that its operations take at the peak of the processor, and the time that its bytes take at the bandwidth of the memory
+that holds them. Measured times are the least of several runs, since other programs disturb them.
 
 Operations and bytes (``COSTS``) are counted in the source of each kernel. A slot is one instruction in one lane of a
 vector: an add, a multiplication, a comparison, a selection, a minimum, a rounding or a bitwise operation, or a
 multiply-add, which is two operations in one slot. A division or a square root takes as many slots as the machine makes
-multiply-adds in its time. Loads, stores, shuffles, addresses and loops are not counted: an ideal processor does them
-beside. Bytes are those that have to come or go once for each call: a tile's planes and a block's planes stay in the
-first cache.
+multiply-adds in the same time. Loads, stores, shuffles, addresses and loops are not counted, because an ideal processor
+does them at the same time. Bytes are those that each call has to read or write once. The planes of a tile or block are
+not counted, because they stay in the first cache.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from captures import export, make_parser, make_table, scene_folders
+from captures import export_capture, make_parser, make_table, scene_folders
 
 from gsmerge.kernels import signature
 from gsmerge.kernels.build import compiler, find_platform
@@ -50,21 +50,22 @@ from gsmerge.kernels.raster.project import project, project_backward
 from gsmerge.kernels.raster.step import PHASES, STEP
 
 HERE = Path(__file__).parent
-RECORD, COUNTER = "LIMIT_RECORD", "LIMIT_COUNTER"  # environment of a run that is recorded: its file, and the counter
+# Environment variables of a recorded run: the file of its record, and the library that counts pairs
+RECORD, COUNTER = "LIMIT_RECORD", "LIMIT_COUNTER"
 REPEATS = 5  # runs of each command
-SIZES = {"L2": 2**19, "L3": 2**24, "memory": 2**28}  # bytes of a stream that is read and written
-THREADS = 1, 2
-TRIES = {1: 40, 2: 160}  # of a peak, by threads; the best counts
-# Kernels in the phases of a step; those with several parts are divided by separate calls
+SIZES = {"L2": 2**19, "L3": 2**24, "memory": 2**28}  # bytes that a stream reads and writes, to measure a memory
+THREADS = 1, 2  # numbers of threads that are measured
+TRIES = {1: 40, 2: 160}  # measurements of a peak by number of threads, of which the best counts
+# Kernels of each phase of a step. The time of a phase with several kernels is divided by timing them separately
 KERNELS_OF = {
     "cull": ("cull",), "project": ("project", "sort"), "count": ("bin",), "count_open": ("bin",), "deal": ("bin",),
     "deal_open": ("bin",), "blend": ("blend",), "loss": ("loss",), "backward": ("backward",),
     "update": ("gather_slots", "project_backward", "adam"),
 }  # fmt: skip
-COUNTS = ("pixels", "listed", "walked", "shown", "visited", "needed", "vectors", "useful")  # of limit.c
-OF_COUNTS = ("num_visible", "n", *COUNTS)
-OF_STEPS = ("n", "height", "width", "num_visible", "num_intersections")
-WRITTEN = ("x", "m", "v", "means", "quats", "scales", "opacities", "colors")  # by adam
+COUNTS = ("pixels", "listed", "walked", "shown", "visited", "needed", "vectors", "useful")  # fields of limit.c's Counts
+OF_COUNTS = ("num_visible", "n", *COUNTS)  # counts of a step, which are averaged
+OF_STEPS = ("n", "height", "width", "num_visible", "num_intersections")  # numbers of a step that are recorded
+WRITTEN = ("x", "m", "v", "means", "quats", "scales", "opacities", "colors")  # arrays that adam changes
 FLOAT, ROW = 4, 14 * 4  # bytes of a number, and of a row of the optimiser's state
 # Bytes of a Gaussian's mean, quaternion, scales and opacity; of its conic with its colour; and of a row of slots
 SPLAT, CONIC, SLOT = 11 * FLOAT, (8 + 3) * FLOAT, 9 * FLOAT
@@ -72,20 +73,22 @@ SPLAT, CONIC, SLOT = 11 * FLOAT, (8 + 3) * FLOAT, 9 * FLOAT
 
 @dataclass(frozen=True)
 class Cost:
-    """What a kernel does for each unit of a count."""
+    """The work of a kernel for each unit of a count."""
 
     kernel: str
-    unit: str  # A count of a step; "pair" is a visited or a needed pair
-    plain: float  # Slots with one operation
-    fused: float  # Multiply-adds
-    divisions: float  # Divisions and square roots
-    bytes: float
-    why: str
+    unit: str  # a count of a step; "pair" is a visited or a needed pair
+    plain: float  # number of slots with one operation
+    fused: float  # number of multiply-adds
+    divisions: float  # number of divisions and square roots
+    bytes: float  # bytes read or written
+    why: str  # what the work is for
 
     def slots(self, division: float) -> float:
+        """Return the number of slots, if a division takes as long as ``division`` slots."""
         return self.plain + self.fused + division * self.divisions
 
     def operations(self, division: float) -> float:
+        """Return the number of operations, if a division takes as long as ``division`` slots."""
         return self.plain + 2 * self.fused + 2 * division * self.divisions
 
 
@@ -123,20 +126,23 @@ COSTS = (
          "a row is sixteen lanes: moments and step 27 each with root and division, box 24; four exponentials 80"),
 )  # fmt: skip
 KERNELS = tuple(dict.fromkeys(cost.kernel for cost in COSTS))
-OF_LISTS = "walked", "shown", "listed"  # units of tile lists, which the task itself does not ask for
+OF_LISTS = "walked", "shown", "listed"  # units of work on tile lists, which another algorithm might not need
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What a processor does at most, with one and two threads: rates a second."""
+    """The highest rates of a processor per second, each by number of threads."""
 
-    target: str  # Of the kernels
-    slots: dict[int, float]  # Multiply-adds, one for each lane
+    target: str  # target of the kernels
+    slots: dict[int, float]  # multiply-adds, one for each lane
     divisions: dict[int, float]
-    bandwidths: dict[str, dict[int, float]]  # Bytes read and written, by the memory that holds them
+    bandwidths: dict[str, dict[int, float]]  # bytes read and written, by the memory that holds them
 
     def work(self, kernel: str, counts: dict[str, float], *, needed: bool) -> np.ndarray:
-        """Return the slots, operations and bytes of a kernel: of the task alone (``needed``), or of this algorithm."""
+        """Return the slots, operations and bytes of a kernel ``[3]``.
+
+        If ``needed``, only the work that the task itself needs is counted, otherwise all work of our algorithm.
+        """
         division, total = self.slots[1] / self.divisions[1], np.zeros(3)
         for cost in COSTS:
             if cost.kernel == kernel and not (needed and cost.unit in OF_LISTS):
@@ -145,7 +151,7 @@ class Machine:
         return total
 
     def bandwidth(self, num_bytes: float) -> float:
-        """Return the bandwidth, for one thread, of memory that holds so many bytes; between streams on a power law."""
+        """Return the bandwidth for one thread of the memory that holds so many bytes, interpolated by a power law."""
         rates = [self.bandwidths[name][1] for name in SIZES]
         return float(np.exp(np.interp(np.log(max(num_bytes, 1)), np.log(list(SIZES.values())), np.log(rates))))
 
@@ -173,7 +179,10 @@ def compile_counter(target: str, folder: Path) -> Path:
 
 
 def best_rate(call: Callable[[int], int], threads: int) -> float:
-    """Return the most that calls on so many threads at a time do in a second; each returns what it has done."""
+    """Return the highest rate per second of calls on several threads at the same time.
+
+    ``call`` gets the number of its thread, and returns the amount of work that it has done.
+    """
     best = 0.0
     for _ in range(TRIES[threads]):
         done, barrier = [0] * threads, threading.Barrier(threads + 1)
@@ -194,19 +203,22 @@ def best_rate(call: Callable[[int], int], threads: int) -> float:
 
 
 def measure_machine(path: Path, target: str) -> Machine:
-    """Measure multiply-adds, divisions and streams by the loops of limit.c; each call takes about 10 ms."""
+    """Measure the rates of multiply-adds, divisions and streams with the loops of limit.c, in calls of about 10 ms."""
     library = ctypes.CDLL(str(path))
     for name in ("add_products", "divide", "stream"):
         getattr(library, name).restype = ctypes.c_int64
     outs = np.ones((max(THREADS), 16), np.float32)
 
-    def chains(name: str, rounds: int, threads: int) -> float:
+    def measure_chains(name: str, rounds: int, threads: int) -> float:
+        """Measure the operations per second of a loop of limit.c on all threads."""
+
         def call(i: int) -> int:
             return getattr(library, name)(ctypes.c_int64(rounds), ctypes.c_void_p(outs[i].ctypes.data))
 
         return best_rate(call, threads)
 
-    def stream(size: int, threads: int) -> float:
+    def measure_stream(size: int, threads: int) -> float:
+        """Measure the bytes per second of streams over memory of ``size`` bytes."""
         count = size // 8
         arrays = np.ones((threads, 2, count), np.float32)
         rounds = max(1, 2**28 // size)
@@ -219,23 +231,25 @@ def measure_machine(path: Path, target: str) -> Machine:
 
     return Machine(
         target,
-        {threads: chains("add_products", 5_000_000, threads) for threads in THREADS},
-        {threads: chains("divide", 1_000_000, threads) for threads in THREADS},
-        {name: {threads: stream(size, threads) for threads in THREADS} for name, size in SIZES.items()},
+        {threads: measure_chains("add_products", 5_000_000, threads) for threads in THREADS},
+        {threads: measure_chains("divide", 1_000_000, threads) for threads in THREADS},
+        {name: {threads: measure_stream(size, threads) for threads in THREADS} for name, size in SIZES.items()},
     )
 
 
 class Recorder:
-    """Times of the phases of each step of a fit."""
+    """Recorder of the times of all phases of each step of a fit, and of pairs if there is a counter."""
 
     def __init__(self, counter: ctypes.CDLL | None) -> None:
         self.counter, self.lock = counter, threading.Lock()
-        self.steps: list[dict[str, Any]] = []
-        self.phases: dict[str, list[float]] = {}  # of the step that runs: processor seconds and calls
-        self.separate: dict[str, Any] = {}  # times of parts and counts of pairs of that step
+        self.steps: list[dict[str, Any]] = []  # records of finished steps
+        self.phases: dict[
+            str, list[float]
+        ] = {}  # processor seconds and number of calls of each phase of the current step
+        self.separate: dict[str, Any] = {}  # times of separate kernels and counts of pairs of the current step
 
     def time_phase(self, entry: Callable[..., Any], address: int, phase: int, fields: int) -> Any:
-        """Time one call of a phase; each thread of a step makes one."""
+        """Time one call of a phase, and return its result; each thread of a step makes one call."""
         table, name = Fields(address), PHASES[phase]
         if name == "update" and self.counter is not None:
             self.separate = {"parts": time_parts(table), **count_pairs(self.counter, table)}
@@ -243,11 +257,11 @@ class Recorder:
         result = entry(address, phase, fields)
         seconds = time.thread_time() - start
         with self.lock:
-            one = self.phases.setdefault(name, [0.0, 0])
-            if one[1] == table["threads"]:  # the phase begins anew, with more room
-                one[:] = [0.0, 0]
-            one[:] = [one[0] + seconds, one[1] + 1]
-            if name == "update" and one[1] == table["threads"]:
+            entries = self.phases.setdefault(name, [0.0, 0])
+            if entries[1] == table["threads"]:  # the phase is repeated, with more memory
+                entries[:] = [0.0, 0]
+            entries[:] = [entries[0] + seconds, entries[1] + 1]
+            if name == "update" and entries[1] == table["threads"]:
                 cpu = {phase: spent for phase, (spent, _) in self.phases.items()}
                 self.steps.append({**{key: table[key] for key in OF_STEPS}, "cpu": cpu, **self.separate})
                 self.phases = {}
@@ -255,12 +269,13 @@ class Recorder:
 
 
 class Fields:
-    """Numbers and arrays of a step's table, by name, at its address."""
+    """The numbers and arrays of the table of a step, which lies at an address, by name."""
 
     def __init__(self, address: int) -> None:
         self.values = (ctypes.c_int64 * len(STEP.fields)).from_address(address)
 
     def __getitem__(self, key: str) -> int:
+        """Return a number of the table."""
         return self.values[STEP.fields[key]]
 
     def array(self, key: str) -> np.ndarray:
@@ -285,18 +300,21 @@ def count_pairs(counter: ctypes.CDLL, table: Fields) -> dict[str, int]:
 
 
 def time_parts(table: Fields) -> dict[str, float]:
-    """Time what the phases "project" and "update" consist of by separate calls; adam works on copies."""
+    """Time each kernel of the phases "project" and "update" by a separate call; return processor seconds by kernel.
+
+    adam works on copies, so that the fit goes on unchanged.
+    """
     m, count = table["num_visible"], table["num_intersections"]
     arrays = {key: table.array(key) for key in STEP.arrays}
-    of_view = (
+    view_arrays = (
         "sums", "ids", "g_means", "g_quats", "g_scales", "g_opacities", "g_colors", "conics", "depths", "boxes",
         "order", "keys", "spare",
     )  # fmt: skip
-    arrays |= {key: arrays[key][:m] for key in of_view} | {
+    arrays |= {key: arrays[key][:m] for key in view_arrays} | {
         "flatten_ids": arrays["flatten_ids"][:count], "slots": arrays["slots"][:count], "first": 0, "last": m,
         "step": table["step"], "grad_poses": None, "bits": arrays["depths"][:m].view(np.uint32),
     }  # fmt: skip
-    arrays |= {f"grad_{key[2:]}": arrays[key] for key in of_view if key.startswith("g_")}
+    arrays |= {f"grad_{key[2:]}": arrays[key] for key in view_arrays if key.startswith("g_")}
     copies = {key: arrays[key].copy() for key in WRITTEN}
     seconds = {}
     for name, function, own in (
@@ -318,12 +336,13 @@ def time_parts(table: Fields) -> dict[str, float]:
 
 
 def record_run(out: str) -> None:
-    """Run the command of this process's arguments with clocks around its kernels, and write what they say."""
+    """Run gsmerge with this process's arguments, time its kernels, and write the records of all steps to a file."""
     library = os.environ.get(COUNTER)
     recorder = Recorder(ctypes.CDLL(library) if library else None)
     find_entry = signature._entry
 
     def find_timed(library: Any, name: str, *rest: Any) -> Callable[..., Any]:
+        """Return the entry of a function of the library; the entry of the fit's phases also records times."""
         entry = find_entry(library, name, *rest)
         return (lambda *values: recorder.time_phase(entry, *values)) if name == "fit_phase" else entry
 
@@ -333,7 +352,7 @@ def record_run(out: str) -> None:
 
 
 def run_command(folder: Path, threads: int, counter: Path | None = None) -> list[dict[str, Any]]:
-    """Compact a scene in a process of its own, and return the record of its steps."""
+    """Compact a scene in a process of its own, and return the records of its steps; ``counter`` also counts pairs."""
     with tempfile.TemporaryDirectory() as place:
         environment = {**os.environ, "GSMERGE_THREADS": str(threads), RECORD: f"{place}/record.json"}
         environment |= {COUNTER: str(counter)} if counter else {}
@@ -343,7 +362,10 @@ def run_command(folder: Path, threads: int, counter: Path | None = None) -> list
 
 
 def divide_phases(phases: dict[str, float], parts: dict[str, float]) -> dict[str, float]:
-    """Divide the seconds of a step's phases among kernels; sorting by depth belongs to the lists."""
+    """Divide the seconds of a step's phases among kernels, by their separate times ``parts``.
+
+    Sorting by depth counts as part of "bin", which makes the lists.
+    """
     seconds: dict[str, float] = defaultdict(float)
     for phase, value in phases.items():
         names = KERNELS_OF[phase]
@@ -355,7 +377,11 @@ def divide_phases(phases: dict[str, float], parts: dict[str, float]) -> dict[str
 
 
 def join_steps(counted: list[dict[str, Any]], runs: dict[int, list[list[dict[str, Any]]]]) -> dict[str, Any]:
-    """Return the mean counts and the mean least processor seconds of the steps of each size, by threads and kernel."""
+    """Average the steps of each image size: their counts, and their least processor seconds over all runs.
+
+    ``counted`` are the steps of the run that counts pairs, and ``runs`` the timed runs by number of threads. Returns
+    the number of steps, the mean counts, and the mean seconds by threads and kernel, for each size.
+    """
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
     for i, step in enumerate(counted):
         groups[step["height"], step["width"]].append(i)
@@ -368,7 +394,7 @@ def join_steps(counted: list[dict[str, Any]], runs: dict[int, list[list[dict[str
             sums = dict.fromkeys(KERNELS, 0.0)
             for i, step in zip(rows, steps, strict=True):
                 times = [record[i]["cpu"] for record in records]
-                least = {phase: min(one[phase] for one in times) for phase in times[0]}
+                least = {phase: min(seconds_of[phase] for seconds_of in times) for phase in times[0]}
                 for kernel, value in divide_phases(least, step["parts"]).items():
                     sums[kernel] += value / len(rows)
             seconds[threads] = sums
@@ -377,7 +403,7 @@ def join_steps(counted: list[dict[str, Any]], runs: dict[int, list[list[dict[str
 
 
 def measure_scene(folder: Path, counter: Path) -> dict[str, Any]:
-    """The steps of a scene's default run, by size."""
+    """Measure the steps of a scene's default run; see :func:`join_steps`."""
     counted = run_command(folder, 1, counter)
     runs: dict[int, list[list[dict[str, Any]]]] = {threads: [] for threads in THREADS}
     for _ in range(REPEATS):
@@ -387,6 +413,7 @@ def measure_scene(folder: Path, counter: Path) -> dict[str, Any]:
 
 
 def machine_table(machine: Machine) -> str:
+    """Make the table of the processor's rates."""
     rows = [
         (f"multiply-adds, {machine.target}, a second", *(f"{machine.slots[t] / 1e9:.0f} G" for t in THREADS)),
         ("divisions a second", *(f"{machine.divisions[t] / 1e9:.1f} G" for t in THREADS)),
@@ -399,6 +426,7 @@ def machine_table(machine: Machine) -> str:
 
 
 def pairs_table(records: list[dict[str, Any]]) -> str:
+    """Make the table of the pairs of each scene and size."""
     rows = []
     for record in records:
         for size, group in record["sizes"].items():
@@ -412,7 +440,7 @@ def pairs_table(records: list[dict[str, Any]]) -> str:
 
 
 def kernel_rows(machine: Machine, counts: dict[str, float], seconds: dict[int, dict[str, float]]) -> list[list[str]]:
-    """Return a row for each kernel: milliseconds, what bounds it, and the shares of the limits."""
+    """Make a row for each kernel: milliseconds, what bounds it, and the shares of the limits that it reaches."""
     rows = []
     for kernel in KERNELS:
         own = seconds[1][kernel]
@@ -426,7 +454,7 @@ def kernel_rows(machine: Machine, counts: dict[str, float], seconds: dict[int, d
 
 
 def steps_table(machine: Machine, records: list[dict[str, Any]]) -> str:
-    """The kernels of the two kinds of steps in which most of the time goes, for each scene."""
+    """Make the table of the kernels, for the two image sizes of each scene that take most of the time."""
     rows = []
     for record in records:
         groups = sorted(
@@ -440,7 +468,7 @@ def steps_table(machine: Machine, records: list[dict[str, Any]]) -> str:
 
 
 def write_page(path: Path, tables: dict[str, str]) -> None:
-    """Replace the tables of a page; each begins after a comment with its name."""
+    """Replace the tables of a page; a comment with its name stands before each table."""
     text = path.read_text(encoding="utf-8")
     for name, table in tables.items():
         text = re.sub(rf"(<!-- {name} -->\n)(\|.*\n)*", lambda found, table=table: f"{found[1]}{table}\n", text)
@@ -448,6 +476,7 @@ def write_page(path: Path, tables: dict[str, str]) -> None:
 
 
 def main() -> None:
+    """Measure the machine and all scenes, and print the tables, and perhaps put them into the page."""
     parser = make_parser(__doc__, "fox,fern")
     parser.add_argument("--page", type=Path, help="page whose tables of this target are replaced")
     args = parser.parse_args()
@@ -455,7 +484,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         counter = compile_counter(target, Path(name))
         machine = measure_machine(counter, target)
-        records = [measure_scene(export(folder, args.cache).parent, counter) for folder in folders]
+        records = [measure_scene(export_capture(folder, args.cache).parent, counter) for folder in folders]
     tables = {
         f"machine {target}": machine_table(machine),
         f"pairs {target}": pairs_table(records),

@@ -3,7 +3,7 @@
 python benchmarks/make_capture.py instant-ngp/data/nerf/fox captures/scenes/eval/fox --itermvs IterMVS
 GSMERGE_DATA=captures python benchmarks/quality.py fox
 
-That page says what it does. IterMVS is github.com/FangjinhuaWang/IterMVS and needs torch.
+That page says how captures are made. IterMVS is github.com/FangjinhuaWang/IterMVS and needs torch.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from typing import Any
 
 import cv2
 import numpy as np
-from captures import frame_of
+from captures import make_frame
 
 from gsmerge.geometry.transforms import project_points
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.read import find_cameras, read_cameras
 from gsmerge.io.image_names import natural_key
 
-SIDE, MULTIPLE = 480, 32  # pixels
-SOURCES = 4  # views that a depth is predicted from, besides its own
-CHECKPOINT = "checkpoints/blendedmvs/model_000015.ckpt"
-RATIO = 0.75  # Lowe's, of the best match to the second
+SIDE, MULTIPLE = 480, 32  # longer side of photos, and the divisor of both sides, pixels
+SOURCES = 4  # most other views from which a view's depth is predicted
+CHECKPOINT = "checkpoints/blendedmvs/model_000015.ckpt"  # in the checkout of IterMVS
+RATIO = 0.75  # largest ratio of the distances of the best match and the second best (Lowe)
 MOST_ERROR, LEAST_ANGLE = 1.0, 1.0  # pixels between a point and its keypoints, degrees between its rays
-LEAST_POINTS = 10  # of a view
-SHARES, MARGIN = (2, 98), (0.6, 2.0)  # range of depths: these percentiles of the points, times these
+LEAST_POINTS = 10  # least number of points of a view
+SHARES, MARGIN = (2, 98), (0.6, 2.0)  # the range of depths is given by these percentiles of points, times these factors
+# Predicts depth and confidence [h,w] of the first view, from all views and the range of depths
 Predict = Callable[["list[View]", float, float], "tuple[np.ndarray, np.ndarray]"]
 
 
@@ -45,11 +46,11 @@ class View:
     image: np.ndarray
     K: np.ndarray
     w2c: np.ndarray
-    depths: list[float] = field(default_factory=list)  # of the points that it shares with others
+    depths: list[float] = field(default_factory=list)  # depths of the points that it shares with other views
 
 
 def pick_views(count: int, views: int) -> tuple[list[int], list[int]]:
-    """Indices of the input views, evenly spread, and of the held-out views midway between them."""
+    """Choose evenly spread input views, and held-out views midway between them; return the indices of both."""
     if count < 2 * views - 1:
         raise SystemExit(f"expected at least {2 * views - 1} photos for {views} views, found {count}: lower --views")
     inputs = np.linspace(0, count - 1, views).round().astype(int).tolist()
@@ -57,24 +58,24 @@ def pick_views(count: int, views: int) -> tuple[list[int], list[int]]:
 
 
 def find_photos(folder: Path, cameras: CameraFile) -> list[tuple[int, Path]]:
-    """The cameras that have a photo in a folder, or in its images, by index, in the order of their names."""
+    """List the index and the photo of each camera that has one in a folder or its ``images``, in the order of names."""
     order = sorted(range(len(cameras)), key=lambda i: natural_key(cameras.names[i]))
     places = [(i, (folder / cameras.names[i], folder / "images" / Path(cameras.names[i]).name)) for i in order]
     return [(i, next(path for path in paths if path.is_file())) for i, paths in places if any(map(Path.is_file, paths))]
 
 
 def read_view(path: Path, cameras: CameraFile, index: int, number: int) -> View:
-    """A photo as a pinhole's, reduced and cropped; ``number``: of its name."""
+    """Read a photo, undistort, reduce and crop it, and name it by ``number``; ``index`` is that of its camera."""
     photo = cv2.imread(str(path))
     if photo is None:
         raise SystemExit(f"{path}: expected a photo, found none that can be read")
     height, width = photo.shape[:2]
-    own = np.array([cameras.widths[index] or width, cameras.heights[index] or height])
-    K = cameras.Ks[index] * np.array([width / own[0], height / own[1], 1])[:, None]
+    camera_size = np.array([cameras.widths[index] or width, cameras.heights[index] or height])
+    K = cameras.Ks[index] * np.array([width / camera_size[0], height / camera_size[1], 1])[:, None]
     lens = cameras.lenses[index] if cameras.lenses else None
     if lens is not None and lens.model == "fisheye":
         raise SystemExit(f"{path}: expected a photo of a perspective lens, found a fisheye: undistort it first")
-    if lens is not None:  # black where the lens saw nothing, as in the captures that were measured
+    if lens is not None:  # pixels that the lens did not see become black, as in the captures that were measured
         photo = cv2.undistort(photo, K, np.pad(lens.coefficients, (0, 8 - len(lens.coefficients))))
     target = np.array([width, height]) * SIDE / max(width, height)
     target = np.maximum(np.round(target).astype(int) // MULTIPLE, 1) * MULTIPLE
@@ -88,15 +89,20 @@ def read_view(path: Path, cameras: CameraFile, index: int, number: int) -> View:
 
 
 def share_points(views: list[View]) -> np.ndarray:
-    """Numbers of points that pairs of views share ``[v,v]``, and their depths in the views."""
+    """Match points between all pairs of views, and add their depths to the views.
+
+    Returns the number of points ``[v,v]`` that each pair shares.
+    """
     sift, matcher, counts = cv2.SIFT_create(), cv2.BFMatcher(), np.zeros((len(views), len(views)), int)
-    found = [sift.detectAndCompute(cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY), None) for view in views]
+    keypoints = [sift.detectAndCompute(cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY), None) for view in views]
     for i, j in combinations(range(len(views)), 2):
-        pairs = matcher.knnMatch(found[i][1], found[j][1], k=2)
+        pairs = matcher.knnMatch(keypoints[i][1], keypoints[j][1], k=2)
         best = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
         if best:
             ids = zip(*((m.queryIdx, m.trainIdx) for m in best), strict=True)
-            places = [np.array([found[v][0][k].pt for k in some]) + 0.5 for v, some in zip((i, j), ids, strict=True)]
+            places = [
+                np.array([keypoints[v][0][k].pt for k in of_v]) + 0.5 for v, of_v in zip((i, j), ids, strict=True)
+            ]
             depths = triangulate(views[i], views[j], *places)
             counts[i, j] = counts[j, i] = len(depths)
             for view, column in zip((views[i], views[j]), depths.T, strict=True):
@@ -105,7 +111,7 @@ def share_points(views: list[View]) -> np.ndarray:
 
 
 def triangulate(a: View, b: View, in_a: np.ndarray, in_b: np.ndarray) -> np.ndarray:
-    """Depths ``[n,2]`` in two views of the points at matching places ``[m,2]``, of those that are consistent."""
+    """Triangulate matching places ``[m,2]`` of two views; return the depths ``[n,2]`` of consistent points in both."""
     matrices = [view.K @ view.w2c[:3] for view in (a, b)]
     homogeneous = cv2.triangulatePoints(*matrices, in_a.T, in_b.T)
     points = (homogeneous[:3] / np.where(homogeneous[3] == 0, 1e-12, homogeneous[3])).T
@@ -121,17 +127,18 @@ def triangulate(a: View, b: View, in_a: np.ndarray, in_b: np.ndarray) -> np.ndar
 
 
 def load_network(checkout: Path, checkpoint: Path) -> Predict:
-    """IterMVS as a function of an own view, its sources and the range of depths."""
+    """Load IterMVS, and return the function that predicts with it."""
     import torch
 
     sys.path.insert(0, str(checkout))
-    from models.net import Pipeline  # of the checkout
+    from models.net import Pipeline  # a module of the checkout
 
     network = Pipeline(iteration=4, test=True)
     weights = torch.load(checkpoint, map_location="cpu", weights_only=True)["model"]
     network.eval().load_state_dict({name.removeprefix("module."): value for name, value in weights.items()})
 
     def predict(views: list[View], near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
+        """Predict depth and confidence of the first view; see ``Predict``."""
         photos = np.stack([view.image[..., ::-1] for view in views]).astype(np.float32) / 127.5 - 1
         images = torch.from_numpy(photos.transpose(0, 3, 1, 2).copy())[None]
         matrices = {}
@@ -147,7 +154,7 @@ def load_network(checkout: Path, checkpoint: Path) -> Predict:
 
 
 def write_depth(out: Path, view: View, sources: list[View], predict: Predict) -> dict[str, Any]:
-    """Predict and write the depth of a view; what its frame says of it."""
+    """Predict the depth of a view and write it; return the entries of the view's frame that describe it."""
     if len(view.depths) < LEAST_POINTS or not sources:
         raise SystemExit(f"{view.name}: expected {LEAST_POINTS} points in common with others, found {len(view.depths)}")
     near, far = np.percentile(view.depths, SHARES) * MARGIN
@@ -160,7 +167,7 @@ def write_depth(out: Path, view: View, sources: list[View], predict: Predict) ->
 
 
 def make_capture(folder: Path, out: Path, predict: Predict, views: int) -> None:
-    """Write a capture's photos, depths and ``transforms.json``."""
+    """Write a capture with ``views`` input views: its photos, depths and ``transforms.json``."""
     place = find_cameras(folder)
     if place is None:
         raise SystemExit(f"{folder}: expected cameras (transforms.json or a COLMAP model), found none")
@@ -174,7 +181,7 @@ def make_capture(folder: Path, out: Path, predict: Predict, views: int) -> None:
     for number, view in sorted(read.items()):
         cv2.imwrite(str(out / "images" / f"{view.name}.jpg"), view.image, [cv2.IMWRITE_JPEG_QUALITY, 93])
         pose, shape = np.linalg.inv(view.w2c), view.image.shape
-        frame = frame_of(f"images/{view.name}.jpg", view.K, pose, shape) | {"role": "target"}
+        frame = make_frame(f"images/{view.name}.jpg", view.K, pose, shape) | {"role": "target"}
         if number in inputs:
             row = shared[inputs.index(number)]
             best = [read[inputs[i]] for i in np.argsort(-row, kind="stable")[:SOURCES] if row[i]]
@@ -185,11 +192,12 @@ def make_capture(folder: Path, out: Path, predict: Predict, views: int) -> None:
 
 
 def main() -> None:
+    """Make the capture that the command line describes."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="photos with their cameras: transforms.json or a COLMAP model")
     parser.add_argument("out", type=Path, help="below GSMERGE_DATA: scenes/eval/NAME, or train")
     parser.add_argument("--itermvs", type=Path, required=True, help="checkout of IterMVS")
-    parser.add_argument("--checkpoint", type=Path, help=f"its weights; {CHECKPOINT} in it if not given")
+    parser.add_argument("--checkpoint", type=Path, help=f"weights of IterMVS; by default {CHECKPOINT} in the checkout")
     parser.add_argument("--views", type=int, default=12, help="input views")
     args = parser.parse_args()
     predict = load_network(args.itermvs, args.checkpoint or args.itermvs / CHECKPOINT)

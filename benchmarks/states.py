@@ -1,9 +1,9 @@
-"""Views in batches against all views at once: held-out PSNR and SSIM, and the time and memory of each batch.
+"""Compare views in batches with all views at once: held-out PSNR and SSIM, and the time and memory of each batch.
 
-python benchmarks/states.py fern,lightfield,fox,desk,redkitchen --size 1 2 4      # so many views at a time
+python benchmarks/states.py fern,lightfield,fox,desk,redkitchen --size 1 2 4      # batches of 1, 2 and 4 views
 python benchmarks/states.py fern --size 2 --without photos                        # or: cameras
 
-Both results have as many Gaussians. One batch after the other in one process; seconds are of the processor.
+Both results have the same number of Gaussians. All batches run in one process, and seconds are processor seconds.
 """
 
 from __future__ import annotations
@@ -15,14 +15,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from captures import export, make_parser, read_held_out, scene_folders, score, setting
+from captures import export_capture, make_parser, parse_setting, read_held_out, scene_folders, score
 
 import gsmerge
 from gsmerge.runtime.memory import peak_memory
 
 
 def make_batches(folder: Path, size: int, cache: Path) -> list[Path]:
-    """The exports of a capture's views, ``size`` at a time in the order of the trajectory; made once."""
+    """Export a capture's views in batches of ``size``, in the order of the trajectory; return the ``.ply`` of each.
+
+    Exports that are in the cache are not made again.
+    """
     document = json.loads((folder / "transforms.json").read_text())
     frames = [frame for frame in document["frames"] if frame["role"] == "context"]
     plys = []
@@ -33,21 +36,25 @@ def make_batches(folder: Path, size: int, cache: Path) -> list[Path]:
             if not (batch / part).exists():
                 (batch / part).symlink_to(folder / part)
         (batch / "transforms.json").write_text(json.dumps(document | {"frames": frames[first : first + size]}))
-        plys.append(export(batch, batch.parent))
+        plys.append(export_capture(batch, batch.parent))
     return plys
 
 
 def read_batch(ply: Path, without: str | None) -> gsmerge.Scene:
-    """An export, as it is or without its photos, or without cameras either."""
+    """Read an export, without photos if ``without`` is "photos", and without photos and cameras if it is "cameras"."""
     scene = gsmerge.read_scene(ply)
     if without == "photos":
         return replace(scene, images=None, large_photos=None)
-    none = scene.cameras[[]]
-    return scene if without is None else gsmerge.Scene(scene.gaussians, none, None, None, ())
+    no_cameras = scene.cameras[[]]
+    return scene if without is None else gsmerge.Scene(scene.gaussians, no_cameras, None, None, ())
 
 
 def measure(folder: Path, plys: Sequence[Path], args: Any) -> dict[str, Any]:
-    """Extend a state by each batch, and compact it and the whole scene to as many Gaussians."""
+    """Extend a state by each batch, and compact it and the whole scene to the same number of Gaussians.
+
+    Returns this number, the scores of both results, the processor seconds of the state's result and of each batch, and
+    the peak memory (GB) after each batch.
+    """
     compactor, seconds, memory = gsmerge.Compactor(**dict(args.set)), [], []
     for ply in plys:
         scene = read_batch(ply, args.without)
@@ -59,18 +66,19 @@ def measure(folder: Path, plys: Sequence[Path], args: Any) -> dict[str, Any]:
     start = time.process_time()
     result = compactor.compact(budget=count)
     spent = round(time.process_time() - start, 1)
-    at_once = gsmerge.compact(read_batch(export(folder, args.cache), args.without), budget=count)
-    targets, ways = read_held_out(folder), {"state": result, "at once": at_once}
-    scores = {name: [round(x, 3) for x in score(one.gaussians, targets)] for name, one in ways.items()}
+    at_once = gsmerge.compact(read_batch(export_capture(folder, args.cache), args.without), budget=count)
+    targets, results = read_held_out(folder), {"state": result, "at once": at_once}
+    scores = {name: [round(x, 3) for x in score(made.gaussians, targets)] for name, made in results.items()}
     return {"count": count, **scores, "result": spent, "batches": seconds, "GB": memory}
 
 
 def main() -> None:
+    """Print a line of JSON for each capture and size of batches."""
     parser = make_parser(__doc__)
     parser.add_argument("--size", type=int, nargs="+", default=[2], help="views of a batch")
-    parser.add_argument("--share", type=float, default=0.03, help="Gaussians of the results, of the input's")
+    parser.add_argument("--share", type=float, default=0.03, help="share of the input's Gaussians that results keep")
     parser.add_argument("--without", choices=("photos", "cameras"))
-    parser.add_argument("--set", nargs="*", default=[], type=setting, help="settings of extend, as name=value")
+    parser.add_argument("--set", nargs="*", default=[], type=parse_setting, help="settings of extend, as name=value")
     args = parser.parse_args()
     for folder in scene_folders(args.scenes):
         for size in args.size:

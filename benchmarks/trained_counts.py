@@ -1,11 +1,12 @@
-"""How like the input trained files stay at several counts, without photos and cameras: ours beside splat-transform.
+"""Compare trained files, which have no photos and cameras, with their results at several counts.
 
 python benchmarks/trained_counts.py biker.ply guitar.ply
-python benchmarks/trained_counts.py garden.ply --walk           # a room: from inside, too
+python benchmarks/trained_counts.py garden.ply --walk           # a scene that is also seen from inside
 python benchmarks/trained_counts.py biker.ply --ours-only
 
-Each cell has the mean PSNR of 16 views from two orbits (and 8 inside): of ours, and of both modes of splat-transform
-(on the PATH, or named by GSMERGE_SPLAT_TRANSFORM). The last column has their processor seconds at 4.4 %.
+Each cell has the mean PSNR of 16 views from two orbits (and of 8 views inside), with the input as the reference. The
+first number is gsmerge's, and the others are those of both modes of splat-transform (on the PATH, or named by
+GSMERGE_SPLAT_TRANSFORM). The last column has their processor seconds at 4.4 %.
 """
 
 from __future__ import annotations
@@ -24,14 +25,15 @@ from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Cameras, Gaussians
 
-ORBITS, AROUND, SIDE = (1.2, 2.2), 8, 512  # radii of half the extent's diagonal; cameras on each; pixels
-WALK = 0.525  # of the longest side
-MODES = ("-d", "--decimate-adaptive")
+# Radii of the orbits in halves of the extent's diagonal, cameras on each orbit, and side of their pictures in pixels
+ORBITS, AROUND, SIDE = (1.2, 2.2), 8, 512
+WALK = 0.525  # length of the line of cameras inside, in longest sides of the extent
+MODES = ("-d", "--decimate-adaptive")  # of splat-transform
 SHARES = ("1", "4.4", "10", "20")  # percent
 
 
 def look(eye: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The world-to-camera matrix of a camera."""
+    """Return the world-to-camera matrix of a camera at ``eye`` that looks in a direction."""
     right = np.cross(direction, up) / np.linalg.norm(np.cross(direction, up))
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([right, np.cross(direction, right), direction])
@@ -40,7 +42,7 @@ def look(eye: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def place_cameras(gaussians: Gaussians, walk: bool) -> Cameras:
-    """Place cameras on two circles about the middle, around the shortest axis, and if asked for on a line inside."""
+    """Place cameras on two circles around the middle and the shortest axis, and on a line inside for a ``walk``."""
     low, high = np.quantile(gaussians.means.astype(np.float64), [0.05, 0.95], axis=0)
     sides, turns = high - low, 2 * np.pi * np.arange(AROUND) / AROUND
     up = np.eye(3)[sides.argmin()]
@@ -56,27 +58,31 @@ def place_cameras(gaussians: Gaussians, walk: bool) -> Cameras:
 
 
 def measure(path: Path, share: str, *, walk: bool, ours_only: bool) -> tuple[list[float], list[float]]:
-    """PSNR from the input, and processor seconds, of ours and of the other program."""
+    """Make the results at a share; return the PSNR of each against the input, and the processor seconds of each.
+
+    The results are gsmerge's, and those of both modes of splat-transform unless ``ours_only``.
+    """
     if not path.is_file():
         raise SystemExit(f"{path}: expected a trained file, found none; {CAPTURES}")
     source = read_ply(path, opacity="logit").gaussians
     cameras, count = place_cameras(source, walk), str(round(len(source) * float(share) / 100))
-    start, bare = time.process_time(), gsmerge.Scene(source, cameras[:0], None, None, ())
-    made, seconds = [gsmerge.compact(bare, budget=int(count)).gaussians], [time.process_time() - start]
+    start, scene = time.process_time(), gsmerge.Scene(source, cameras[:0], None, None, ())
+    results, seconds = [gsmerge.compact(scene, budget=int(count)).gaussians], [time.process_time() - start]
     for mode in () if ours_only else MODES:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "out.ply"
             spent, _ = run_command([find_program(), "-q", "-g", "cpu", str(path.resolve()), mode, count, str(out)])
-            made.append(read_ply(out, opacity="logit").gaussians)
+            results.append(read_ply(out, opacity="logit").gaussians)
             seconds.append(spent)
-    expected, *images = (gsmerge.render(each, cameras).images.clip(0, 1) for each in (source, *made))
-    return [float(np.mean([psnr(a, b) for a, b in zip(each, expected, strict=True)])) for each in images], seconds
+    expected, *renders = (gsmerge.render(some, cameras).images.clip(0, 1) for some in (source, *results))
+    return [float(np.mean([psnr(a, b) for a, b in zip(images, expected, strict=True)])) for images in renders], seconds
 
 
 def main() -> None:
+    """Print the table of all files and shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", type=Path, nargs="+")
-    parser.add_argument("--walk", action="store_true", help="judge from a walk inside, too")
+    parser.add_argument("--walk", action="store_true", help="also from cameras on a line inside")
     parser.add_argument("--ours-only", action="store_true")
     args = parser.parse_args()
     rows = []

@@ -1,4 +1,4 @@
-"""The page of the Python API: every public name by topic, from its signature and docstring."""
+"""Write the page of the Python API, which has every public name by topic, with its signature and docstring."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ The examples run after `import gsmerge`, beside the scene `demo` of `examples/01
 
 
 def api_page() -> str:
-    """Write the page."""
+    """Return the page in Markdown."""
     listed = [name for names in TOPICS.values() for name in names]
     if sorted(listed) != sorted(set(gsmerge.__all__) - {"__version__"}):
         raise ValueError(f"TOPICS: expected every public name once, got {', '.join(listed)}")
@@ -55,7 +55,7 @@ def api_page() -> str:
 
 
 def _describe(name: str, value: Any) -> list[str]:
-    """Write a name's signature, text, arguments and example as lines of Markdown."""
+    """Return the signature, text, arguments and example of a public name as lines of Markdown."""
     text = re.sub(r":\w+:`~?([\w.]+?)`", r"`\1`", inspect.cleandoc(value.__doc__)).replace("``", "`")
     about, *parts = re.split(r"^(Args|Returns|Raises|Example):\n", text, flags=re.MULTILINE)
     lines = [about.strip()]
@@ -77,8 +77,8 @@ def _describe(name: str, value: Any) -> list[str]:
 
 
 def _parameters(function: Any) -> str:
-    """Write a function's parameters with their defaults, without types."""
+    """Return a function's parameters with their defaults, but without types."""
     signature = inspect.signature(function)
-    bare = [one.replace(annotation=inspect.Parameter.empty) for one in signature.parameters.values()]
-    text = str(signature.replace(parameters=bare, return_annotation=inspect.Signature.empty))
+    untyped = [parameter.replace(annotation=inspect.Parameter.empty) for parameter in signature.parameters.values()]
+    text = str(signature.replace(parameters=untyped, return_annotation=inspect.Signature.empty))
     return re.sub(r"<function \S+ at \w+>", "...", text).replace("'", '"')

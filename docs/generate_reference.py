@@ -1,7 +1,7 @@
-"""Writes the pages of docs/reference that are made from the program itself.
+"""Write the pages of docs/reference that are made from the program itself.
 
-python docs/generate_reference.py          # write the pages that differ
-python docs/generate_reference.py --check  # name them, exit code 1 if there are any; write nothing
+python docs/generate_reference.py          # write the pages that differ from the program
+python docs/generate_reference.py --check  # only name these pages; the exit code is 1 if there are any
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from api_page import api_page
 
 REFERENCE = Path(__file__).parent / "reference"
 COMMANDS, SETTINGS, API = "commands.md", "settings.md", "api.md"
-EXPORTERS, FORMATS = "exporters.md", "formats.md"  # whose prose is written by hand, and whose tables are made
+EXPORTERS, FORMATS = "exporters.md", "formats.md"  # pages whose prose is written by hand, and whose lists are made here
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
 COMMANDS_HEAD = """# Commands
 
@@ -32,8 +32,8 @@ command. In brackets: default, possible values. [Options](commands.md#gsmerge-co
 
 
 def main() -> int:
-    """Write the pages, or name those that are stale."""
-    stale = {name: text for name, text in make_pages().items() if not _same(REFERENCE / name, text)}
+    """Write the pages that are stale, or only name them with ``--check``; return the exit code."""
+    stale = {name: text for name, text in make_pages().items() if not _has_text(REFERENCE / name, text)}
     for name, text in stale.items():
         print(os.path.normpath(f"docs/reference/{name}"))
         if "--check" not in sys.argv[1:]:
@@ -41,12 +41,13 @@ def main() -> int:
     return 1 if stale and "--check" in sys.argv[1:] else 0
 
 
-def _same(path: Path, text: str) -> bool:
+def _has_text(path: Path, text: str) -> bool:
+    """Return whether a file exists and has this text."""
     return path.is_file() and path.read_text(encoding="utf-8") == text
 
 
 def make_pages() -> dict[str, str]:
-    """Every generated page by its path below docs/reference."""
+    """Return the text of every generated page by its path below docs/reference."""
     return {
         COMMANDS: _commands_page(),
         SETTINGS: _settings_page(),
@@ -57,7 +58,7 @@ def make_pages() -> dict[str, str]:
 
 
 def _all_commands() -> dict[str, Any]:
-    """Every command by its name; those of a group by both names, such as "lab chart"."""
+    """Return every command by its name; a command of a group has both names, such as "lab chart"."""
     from gsmerge.cli.app import app
 
     commands: dict[str, Any] = {}
@@ -70,54 +71,55 @@ def _all_commands() -> dict[str, Any]:
 
 
 def _commands_page() -> str:
-    """Arguments and options of every command; what an earlier command has in the same words is only named."""
-    known: dict[tuple[str, str], str] = {}
+    """Return the page of all commands, with their arguments and options.
+
+    An option that an earlier command has with the same help is only named, with a link to that command.
+    """
+    known: dict[tuple[str, str], str] = {}  # first command that has an option with some help
     lines = [NOTICE, "", COMMANDS_HEAD]
     for name, command in _all_commands().items():
         lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), ""]
-        same: dict[str, list[str]] = {}
-        for one in (*_arguments(command), *_options(command)):
-            words = "" if one.name == "set" else one.help  # --set differs only in its example
-            owner = known.setdefault((one.name, words), name)
+        shared: dict[str, list[str]] = {}  # names of options by the command that describes them
+        for param in (*_arguments(command), *_options(command)):
+            words = "" if param.name == "set" else param.help  # the help of --set differs only in its example
+            owner = known.setdefault((param.name, words), name)
             if owner == name:
-                lines.append(_entry(one))
+                lines.append(_entry(param))
             else:
-                same.setdefault(owner, []).append(f"`{_name(one)}`")
+                shared.setdefault(owner, []).append(f"`{_name(param)}`")
         lines += [
-            f"- as [{owner}](#gsmerge-{owner.replace(' ', '-')}): {', '.join(names)}" for owner, names in same.items()
+            f"- as [{owner}](#gsmerge-{owner.replace(' ', '-')}): {', '.join(names)}" for owner, names in shared.items()
         ]
     return "\n".join([*lines, ""])
 
 
 def _arguments(command: Any) -> list[Any]:
+    """List the arguments of a command."""
     return [p for p in command.params if p.param_type_name == "argument"]
 
 
 def _options(command: Any) -> list[Any]:
+    """List the options of a command except help."""
     return [p for p in command.params if p.param_type_name == "option" and p.name not in ("help", "help_all")]
 
 
 def _name(param: Any) -> str:
+    """Return the name of an argument, or the first name of an option."""
     return str(param.opts[0] if param.param_type_name == "option" else param.metavar or param.name.upper())
 
 
 def _entry(param: Any) -> str:
-    """A line for an argument, or for an option: its names, its value, its default, and its help."""
+    """Return the line of an argument, or of an option with its names, value, default and help."""
     if param.param_type_name == "argument":
         return f"- `{_name(param)}`: {_line(param.help)}"
-    named = sorted((*param.opts, *param.secondary_opts), key=lambda name: (not name.startswith("--"), name))
-    value = "" if param.is_flag else f" {_value(param)}"
+    names = sorted((*param.opts, *param.secondary_opts), key=lambda name: (not name.startswith("--"), name))
+    value = "" if param.is_flag else f" {_line(param.metavar)}"  # a word in capitals, or a list of words
     default = _line(_default(param))
-    return f"- `{', '.join(named)}{value}`{f' ({default})' if default else ''}: {_line(param.help)}"
-
-
-def _value(param: Any) -> str:
-    """What an option takes, as a word in capitals or a list of words."""
-    return _line(param.metavar)
+    return f"- `{', '.join(names)}{value}`{f' ({default})' if default else ''}: {_line(param.help)}"
 
 
 def _default(param: Any) -> str:
-    """The default as help words it; empty where there is none, or where it says nothing, as of a switch."""
+    """Return an option's default in the words of its help; empty if there is none, or for a switch that is off."""
     if isinstance(param.show_default, str):
         return str(param.show_default)
     value = param.default
@@ -127,16 +129,17 @@ def _default(param: Any) -> str:
 
 
 def _line(text: str | None) -> str:
-    """Text in one line, without markup of rich."""
+    """Return a text in one line, without the markup of rich."""
     return " ".join((text or "").split()).replace("\\[", "[")
 
 
 def _cell(text: str | None) -> str:
-    """Text for a table: one line, no column separators."""
+    """Return a text for the cell of a table: in one line, with its column separators escaped."""
     return _line(text).replace("|", "\\|")
 
 
 def _settings_page() -> str:
+    """Return the page of all settings that are not options, by topic."""
     from gsmerge.settings.compact import CompactOptions
     from gsmerge.settings.extend import ExtendOptions
     from gsmerge.settings.files import FileOptions
@@ -144,15 +147,15 @@ def _settings_page() -> str:
     from gsmerge.settings.reading import FileHints
     from gsmerge.settings.setting import flat_settings, settings_of
 
-    whole = settings_of(CompactOptions)
-    stages = {name: list(flat_settings(one.kind).values()) for name, one in whole.items() if one.is_group}
+    settings_of_run = settings_of(CompactOptions)
+    groups = {name: list(flat_settings(one.kind).values()) for name, one in settings_of_run.items() if one.is_group}
     tables = {
-        "How many Gaussians": stages["budget"] + stages["blocks"] + stages["decode"],
-        "Superpixels": stages["segment"],
-        "Merging across views": stages["match"],
-        "Fit": stages["fit"],
-        "Before and after": stages["prepare"] + stages["clean"],
-        "The whole run": [one for name, one in whole.items() if name not in stages],
+        "How many Gaussians": groups["budget"] + groups["blocks"] + groups["decode"],
+        "Superpixels": groups["segment"],
+        "Merging across views": groups["match"],
+        "Fit": groups["fit"],
+        "Before and after": groups["prepare"] + groups["clean"],
+        "The whole run": [setting for name, setting in settings_of_run.items() if name not in groups],
         "Files": list(flat_settings(FileOptions).values()),
         "gsmerge convert": list(flat_settings(PlacementOptions).values()),
         "gsmerge extend": list(flat_settings(ExtendOptions).values()),
@@ -161,27 +164,27 @@ def _settings_page() -> str:
     options = {p.name for name in ("compact", "convert") for p in _options(commands[name])}
     lines = [NOTICE, "", SETTINGS_HEAD]
     for title, settings in tables.items():
-        rest = [one for one in settings if one.name not in options]
-        lines += ["", f"## {title}", "", *_list(rest)] if rest else []
+        rest = [setting for setting in settings if setting.name not in options]
+        lines += ["", f"## {title}", "", *_setting_lines(rest)] if rest else []
     lines += ["", "## Hints", "", "`--hint NAME=VALUE` says how to read a file that is recognised wrongly.", ""]
-    return "\n".join([*lines, *_list(flat_settings(FileHints).values()), ""])
+    return "\n".join([*lines, *_setting_lines(flat_settings(FileHints).values()), ""])
 
 
 def _exporters_page(page: str) -> str:
-    """Renew the list of a page: what lies between the comment that names it and the one that ends it."""
+    """Return the page of exporters with a new list of models, by what a run does with their output."""
     from gsmerge.scene.exporters import EXPORTERS
 
     results: dict[str, list[str]] = {}
-    for one in EXPORTERS.values():
-        for model in one.models:
+    for exporter in EXPORTERS.values():
+        for model in exporter.models:
             output = model.output.partition(";")[0].replace("no cameras", "")
-            facts = "; ".join(filter(None, (f"`{one.name}`", output)))
+            facts = "; ".join(filter(None, (f"`{exporter.name}`", output)))
             results.setdefault(model.result, []).append(f"{model.title} ({facts})")
     return _renew(page, "models", [f"- *{result}*: {'; '.join(models)}" for result, models in results.items()])
 
 
 def _formats_page(page: str) -> str:
-    """Renew the tables of formats, of Gaussians and of cameras."""
+    """Return the page of formats with a new table of formats of Gaussians, and a new list of formats of cameras."""
     from gsmerge.io.cameras.table import CAMERA_FORMATS
     from gsmerge.io.formats.table import FORMATS as ROWS
 
@@ -191,18 +194,19 @@ def _formats_page(page: str) -> str:
          " / ".join(f"{row.each[i]:.0f}" for i in (0, 3) if i < len(row.each)), row.about)
         for row in ROWS
     ]  # fmt: skip
-    page = _renew(page, "formats", _rows(("name", "read", "written", "bytes", "what it is"), rows))
+    page = _renew(page, "formats", _table_lines(("name", "read", "written", "bytes", "what it is"), rows))
     cameras = (f"- {row.files}: {' '.join(row.convention)}; {row.intrinsics}" for row in CAMERA_FORMATS)
     return _renew(page, "cameras", list(cameras))
 
 
-def _rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a table."""
+def _table_lines(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table in Markdown."""
     lines = ["| " + " | ".join(map(_cell, row)) + " |" for row in (head, *rows)]
     return [lines[0], "|---" * len(head) + "|", *lines[1:]]
 
 
 def _renew(page: str, name: str, lines: Sequence[str]) -> str:
+    """Replace what lies between the comment that names a part of a page and the comment that ends it."""
     start, end = f"<!-- {name}: made by docs/generate_reference.py from the program -->\n", "\n<!-- end -->"
     before, _, rest = page.partition(start)
     _, found, after = rest.partition(end)
@@ -211,19 +215,19 @@ def _renew(page: str, name: str, lines: Sequence[str]) -> str:
     return before + start + "\n".join(["", *lines, ""]) + end + after
 
 
-def _list(settings: Iterable[Any]) -> list[str]:
-    """A line for each setting: name, default, values, and what it is."""
+def _setting_lines(settings: Iterable[Any]) -> list[str]:
+    """Return a line for each setting: its name, default, possible values and description."""
     lines = []
-    for one in settings:
-        default = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
-        facts = "; ".join(filter(None, (default, _line(one.values()) if one.words else "")))
-        text = _line(one.text)
-        lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {text}")
+    for setting in settings:
+        default = "" if setting.default is None or setting.is_group else f"`{_plain(setting.default)}`"
+        facts = "; ".join(filter(None, (default, _line(setting.values()) if setting.words else "")))
+        text = _line(setting.text)
+        lines.append(f"- `{setting.name}`{f' ({facts})' if facts else ''}: {text}")
     return lines
 
 
 def _plain(value: Any) -> Any:
-    """A value as TOML or JSON has it."""
+    """Return a value as it is written in TOML or JSON."""
     if isinstance(value, bool):
         return str(value).lower()
     return list(value) if isinstance(value, tuple) else f"{value:.3g}" if isinstance(value, float) else value

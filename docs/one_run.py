@@ -1,11 +1,11 @@
-"""Writes docs/internals/one-run.md and its picture: a small scene, step by step through a run.
+"""Write docs/internals/one-run.md and its picture, which follow a small scene step by step through a run.
 
-python docs/one_run.py          # write the page and the picture where they differ from the program
-python docs/one_run.py --check  # name them, exit code 1 if there are any; write nothing
+python docs/one_run.py          # write the page and the picture if they differ from the program
+python docs/one_run.py --check  # only name the files that differ; the exit code is 1 if there are any
 
-Functions of the package are watched while `gsmerge.compact` works, so all values are those of one true run. There is
-one function for each section of the page, which has its prose beside its values. A sentence that not every run makes
-true goes through :func:`say` with its condition: where that no longer holds, the script stops and names the sentence.
+The script records what functions of the package return while `gsmerge.compact` works, so all values are those of a real
+run. Each section of the page has its function, with its prose and its values. A sentence that may become untrue goes
+through :func:`say` with its condition. If the condition does not hold, the script stops and names the sentence.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ PAGE, PICTURE = DOCS / "internals" / "one-run.md", DOCS / "images" / "one-run.jp
 NOTICE = "<!-- Made by docs/one_run.py from a run: change the text there and run it again. -->"
 VIEWS, WIDTH, HEIGHT, SEED = 4, 96, 64, 2
 VIEW, X, Y = 1, 38, 28  # the pixel that the page follows
-ROW = (VIEW * HEIGHT + Y) * WIDTH + X
-LINE = 120  # characters of a line of the page
-WATCHED = {
+ROW = (VIEW * HEIGHT + Y) * WIDTH + X  # row of this pixel's Gaussian
+LINE = 120  # most characters of a line of the page
+WATCHED = {  # functions that are recorded, by the module that calls them
     "gsmerge.scene.read": ("align",),
     "gsmerge.compaction.compact": ("make_plan", "make_result"),
     "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene", "prune_and_fill"),
 }
-ZOOM, STRIP, GAP = 4, 22, 6  # of the picture: its pixels for each of a photo, for a title, between panels
-DARK, BORDER = 0.45, (255, 255, 255)  # how much of the photo is left under ellipses; colours are RGB
-ALONE, SEVERAL, FOLLOWED = (255, 210, 60), (90, 230, 255), (255, 70, 200)
+ZOOM, STRIP, GAP = 4, 22, 6  # enlargement of photos, height of a title, and gap between panels, pixels
+DARK, BORDER = 0.45, (255, 255, 255)  # brightness of the photo under ellipses, and RGB colour of superpixel borders
+ALONE, SEVERAL, FOLLOWED = (255, 210, 60), (90, 230, 255), (255, 70, 200)  # RGB colours of ellipses
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 85]
-SAME = 1.0  # mean difference of two pictures, of 255, that versions of OpenCV may draw
+SAME = 1.0  # largest mean difference, of 255, between pictures that versions of OpenCV draw
 
 
 class UntrueError(Exception):
-    """A sentence of this script that the run does not make true."""
+    """A sentence of this script is not true for the run."""
 
 
 def main() -> int:
-    """Write the page and the picture, or name what is stale."""
+    """Write the page and the picture if they are stale, or only name them with ``--check``; return the exit code."""
     check = "--check" in sys.argv[1:]
     try:
         run = watch_run()
@@ -76,14 +76,17 @@ def main() -> int:
 
 
 def is_same(picture: bytes) -> bool:
-    """Return whether the stored picture shows the same below its titles, up to what versions of OpenCV differ in."""
+    """Return whether the stored picture shows the same as this one, apart from titles and small differences.
+
+    Versions of OpenCV draw letters and ellipses differently.
+    """
     if not PICTURE.is_file():
         return False
     new, stored = (cv2.imdecode(np.frombuffer(data, np.uint8), 1) for data in (picture, PICTURE.read_bytes()))
     if stored is None or stored.shape != new.shape:
         return False
-    drawn = np.arange(GAP, len(new) + GAP) % (STRIP + GAP + HEIGHT * ZOOM) >= STRIP + GAP
-    return float(np.abs(stored.astype(float) - new)[drawn].mean()) < SAME
+    is_panel = np.arange(GAP, len(new) + GAP) % (STRIP + GAP + HEIGHT * ZOOM) >= STRIP + GAP  # of each row of pixels
+    return float(np.abs(stored.astype(float) - new)[is_panel].mean()) < SAME
 
 
 # The run
@@ -91,78 +94,81 @@ def is_same(picture: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Run:
-    """Arguments and results of the first call of each watched function, by its name, and what `compact` returned."""
+    """The record of a run."""
 
-    given: dict[str, tuple[Any, ...]]
-    made: dict[str, Any]
+    arguments: dict[str, tuple[Any, ...]]  # of the first call of each watched function, by its name
+    made: dict[str, Any]  # results of these calls
     result: gsmerge.CompactResult
 
     @property
     def prepared(self) -> Any:
-        """What `prepare` made, as the plan gets it."""
-        return self.given["make_plan"][0]
+        """The prepared scene, which `make_plan` gets."""
+        return self.arguments["make_plan"][0]
 
     @property
     def label(self) -> int:
-        """The superpixel of the pixel that the page follows."""
+        """Number of the superpixel of the pixel that the page follows."""
         return int(self.made["segment_scene"].groups.labels[VIEW, Y, X])
 
     @property
     def feature(self) -> int:
-        """The Feature Gaussian of that pixel."""
-        return holder(self.made["correct"])
+        """Row of the Feature Gaussian of that pixel."""
+        return find_holder(self.made["correct"])
 
     @property
     def merged(self) -> int:
-        """The same after merging across views."""
-        return holder(self.made["merge"])
+        """Row of the Feature Gaussian that has that pixel after merging across views."""
+        return find_holder(self.made["merge"])
 
     @property
     def fitted(self) -> np.ndarray:
-        """The Gaussians of the result that come from it."""
+        """Rows of the fitted Gaussians that come from the merged Feature Gaussian."""
         return np.flatnonzero(self.made["fit_scene"].report.origins == self.merged)
 
     @property
     def written(self) -> int:
-        """The first of these in the result: others are left out."""
+        """Row in the result of the first of the fitted Gaussians that the result has."""
         means = self.made["fit_scene"].gaussians.means[self.fitted]
         of_result = [mean.tobytes() for mean in self.made["prune_and_fill"].gaussians.means]
         return next(of_result.index(mean.tobytes()) for mean in means if mean.tobytes() in of_result)
 
 
-def holder(features: Any) -> int:
-    """Return the Feature Gaussian that has the followed row as a member."""
+def find_holder(features: Any) -> int:
+    """Return the row of the Feature Gaussian that has the followed Gaussian as a member."""
     at = int(np.flatnonzero(features.members == ROW)[0])
     return int(np.searchsorted(features.starts, at, side="right")) - 1
 
 
 def watch_run() -> Run:
-    """Make the scene, compact it with the defaults, and keep what the watched functions got and returned."""
-    given: dict[str, tuple[Any, ...]] = {}
+    """Make the scene, compact it with the defaults, and return the record of the run."""
+    arguments: dict[str, tuple[Any, ...]] = {}
     made: dict[str, Any] = {}
 
-    def watched(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def watch(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that also records its first call."""
+
         def call(*args: Any, **kwargs: Any) -> Any:
+            """Call the function, and keep the arguments and the result of its first call."""
             result = function(*args, **kwargs)
-            if name not in made:  # later calls are those of the trial that estimates new views
-                given[name], made[name] = args, result
+            if name not in made:  # later calls belong to the trial that estimates new views
+                arguments[name], made[name] = args, result
             return result
 
         return call
 
     with ExitStack() as stack:
-        folder = stack.enter_context(made_scene())
+        folder = stack.enter_context(temporary_scene())
         for module, names in WATCHED.items():
             for name in names:
                 place = import_module(module)
-                stack.enter_context(mock.patch.object(place, name, watched(name, getattr(place, name))))
+                stack.enter_context(mock.patch.object(place, name, watch(name, getattr(place, name))))
         result = gsmerge.compact(folder)
-    return Run(given, made, result)
+    return Run(arguments, made, result)
 
 
 @contextmanager
-def made_scene() -> Iterator[Path]:
-    """Write the scene into a folder that is removed in the end."""
+def temporary_scene() -> Iterator[Path]:
+    """Write the scene into a temporary folder, which is removed at the end."""
     export = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))  # a usual export, in metres
     options = GenerateOptions(views=VIEWS, width=WIDTH, height=HEIGHT, ranges=export)
     with tempfile.TemporaryDirectory() as folder:
@@ -173,19 +179,19 @@ def made_scene() -> Iterator[Path]:
 
 
 def say(sentence: str, holds: bool) -> str:
-    """Return a sentence that the run makes true; UntrueError where it does not."""
+    """Return a sentence if its condition holds; raise UntrueError otherwise."""
     if not holds:
         raise UntrueError(sentence)
     return sentence
 
 
 def text(*sentences: str) -> str:
-    """Join sentences to a paragraph, in lines of the page's length."""
+    """Join sentences or parts of sentences to a paragraph, in lines of the page's length."""
     return textwrap.fill(" ".join(sentences), LINE, break_long_words=False, break_on_hyphens=False)
 
 
 def entry(name: str, values: Any, row: Any = None, digits: int = 2) -> str:
-    """Return a line for an array, with its shape and one row of it; or for a value alone."""
+    """Return a line for an array, with its shape, its type and the values of one row; or for another value."""
     if not isinstance(values, np.ndarray):
         return f"- `{name}`: {values}"
     shape = ", ".join(map(str, values.shape))
@@ -202,7 +208,7 @@ def make_page(run: Run) -> str:
 
 
 def head(run: Run) -> str:
-    """Say which scene it is and what the picture shows."""
+    """Write the beginning of the page: which scene is compacted, and what the picture shows."""
     count = run.prepared.input_scene.num_gaussians
     return "\n\n".join([
         f"{NOTICE}\n\n# One run",
@@ -226,8 +232,8 @@ def head(run: Run) -> str:
 
 
 def align_section(run: Run) -> str:
-    """Say which row is which pixel."""
-    ply, camera_file = run.given["align"][:2]
+    """Write the section on which row is which pixel."""
+    ply, camera_file = run.arguments["align"][:2]
     made = run.made["align"]
     recovery = made.recovery
     return "\n\n".join([
@@ -264,7 +270,7 @@ def align_section(run: Run) -> str:
 
 
 def prepare_section(run: Run) -> str:
-    """Say what is known before the first choice."""
+    """Write the section on the facts that are known before the first choice."""
     prepared = run.prepared
     agreement, frame = prepared.agreement, prepared.frame
     return "\n\n".join([
@@ -297,7 +303,7 @@ def prepare_section(run: Run) -> str:
 
 
 def plan_section(run: Run) -> str:
-    """Say what is decided before anything is built."""
+    """Write the section on the decisions before anything is built."""
     plan, pixels = run.made["make_plan"], WIDTH * HEIGHT
     limits, first = plan.limits, int(plan.limits.per_view * plan.superpixels.start_share)
     return "\n\n".join([
@@ -336,7 +342,7 @@ def plan_section(run: Run) -> str:
 
 
 def build_section(run: Run) -> str:
-    """Say what each arrow makes."""
+    """Write the section on the steps that build the Gaussians, the arrows of the pipeline."""
     made, at = run.made, run.feature
     groups, features, matches = made["segment_scene"].groups, made["correct"], made["match"]
     merged, decoded, fitted = made["merge"], made["decode_merged"], made["fit_scene"]
@@ -407,7 +413,7 @@ def build_section(run: Run) -> str:
 
 
 def result_section(run: Run) -> str:
-    """Say what comes out, and how good it is."""
+    """Write the section on the result and its quality."""
     result, new = run.result, run.result.report.new_views
     gaussians, report, child = result.gaussians, result.report, run.written
     return "\n\n".join([
@@ -483,7 +489,7 @@ def draw_picture(run: Run) -> bytes:
 
 
 def has_members(features: Any) -> np.ndarray:
-    """Return which Feature Gaussians have a pixel of the view among their members, ``[g]`` bool."""
+    """Return a mask ``[g]``: True for Feature Gaussians that have a pixel of the view among their members."""
     of_view = features.members // (WIDTH * HEIGHT) == VIEW
     return np.logical_or.reduceat(of_view, features.starts[:-1])
 
@@ -494,34 +500,35 @@ def enlarge(image: np.ndarray) -> np.ndarray:
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
-    """Return an image in [0, 1] as bytes."""
+    """Convert an image in [0, 1] to uint8."""
     return np.ascontiguousarray(np.round(image.clip(0, 1) * 255).astype(np.uint8))
 
 
 def draw_ellipses(
     picture: np.ndarray, means: np.ndarray, covars: np.ndarray, cameras: Any, followed: np.ndarray, shared: np.ndarray
 ) -> np.ndarray:
-    """Draw the contours at one standard deviation of Gaussians, far ones first and ``followed [g]`` ones last.
+    """Draw the contours of Gaussians at one standard deviation, far ones first.
 
-    ``shared [g]``: those of several views.
+    ``followed [g]`` is True for Gaussians of the followed pixel, which are drawn last, and ``shared [g]`` for Gaussians
+    of several views.
     """
     picture, rotation, K = picture.copy(), cameras.viewmats[0, :3, :3].astype(float), cameras.Ks[0].astype(float)
     (places,), (depths,) = project(means, cameras)
     for i in np.lexsort((-depths, followed)).tolist():
-        x, y = (places[i] - K[:2, 2]) / (K[0, 0], K[1, 1])  # slopes of the ray
-        lens = np.array([[K[0, 0], 0, -K[0, 0] * x], [0, K[1, 1], -K[1, 1] * y]]) / depths[i]
-        flat = lens @ rotation @ covars[i].astype(float) @ rotation.T @ lens.T
-        variances, axes = np.linalg.eigh(flat)
+        slope_x, slope_y = (places[i] - K[:2, 2]) / (K[0, 0], K[1, 1])  # of the ray
+        jacobian = np.array([[K[0, 0], 0, -K[0, 0] * slope_x], [0, K[1, 1], -K[1, 1] * slope_y]]) / depths[i]
+        projected = jacobian @ rotation @ covars[i].astype(float) @ rotation.T @ jacobian.T
+        variances, axes = np.linalg.eigh(projected)
         angle = float(np.degrees(np.arctan2(axes[1, 1], axes[0, 1])))  # of the longer axis
         sides = np.sqrt(variances[::-1].clip(0)) * ZOOM
         numbers = (np.round(16 * values).astype(int).tolist() for values in (places[i] * ZOOM - 0.5, sides))
         color = FOLLOWED if followed[i] else SEVERAL if shared[i] else ALONE
-        cv2.ellipse(picture, *numbers, angle, 0, 360, color, 1, cv2.LINE_AA, 4)  # in sixteenths of a pixel
+        cv2.ellipse(picture, *numbers, angle, 0, 360, color, 1, cv2.LINE_AA, 4)  # numbers are sixteenths of a pixel
     return picture
 
 
 def add_title(title: str, panel: np.ndarray) -> np.ndarray:
-    """Put a title above a panel, and white around both."""
+    """Put a title above a panel, and a white border around both."""
     framed = np.pad(panel, ((STRIP + GAP, 0), (GAP, 0), (0, 0)), constant_values=255)
     cv2.putText(framed, title, (GAP, STRIP), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
     return framed

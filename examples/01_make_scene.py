@@ -3,13 +3,13 @@
     python examples/01_make_scene.py made
 
 A furnished room is photographed from an arc of views, and every pixel becomes one Gaussian with the errors of a
-predicted depth (docs: "generator"). `gsmerge lab generate` makes many such scenes. The folder gets
+predicted depth (docs/internals/lab.md). `gsmerge lab generate` makes many such scenes. The folder contains:
 
     scene.ply          one Gaussian per pixel, 17 columns, view-major and row-major
     transforms.json    the cameras (nerfstudio: camera to world, OpenGL axes)
     images/            the photos
-    targets/           photos and cameras half-way between the views, for measuring
-    generated.json     what the scene was made with
+    targets/           photos and cameras half-way between the views, to measure on
+    generated.json     the settings with which the scene was made
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
-# A usual export: colours without view dependence, opacities that vary, metres.
+# The scene is like a usual export: colours do not depend on the view, opacities vary, and lengths are in metres.
 EXPORT = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))
 
 
@@ -27,11 +27,11 @@ def make_scene(out: str | Path, *, num_views: int = 6, width: int = 240, height:
     """Write the scene folder and return it.
 
     Args:
-        out: Folder of the scene, new or empty; one with the same scene stays.
-        num_views: Views with Gaussians, at least 2; the targets are one fewer.
+        out: Folder of the scene, new or empty. A folder that has the same scene is not changed.
+        num_views: Number of views with Gaussians, at least 2. There is one target fewer.
         width: Image width, pixels.
         height: Image height, pixels.
-        seed: Seeds the room and every error; the same seed writes the same bytes.
+        seed: Seed of the room and of all errors. The same seed gives the same bytes.
     """
     options = GenerateOptions(views=num_views, width=width, height=height, ranges=EXPORT)
     return generate_scene(Path(out), options, seed=seed)

@@ -12,7 +12,7 @@ import gsmerge
 
 
 def compact_scene(scene: Path, output: Path, k: int) -> gsmerge.CompactReport:
-    """Read, compact, write; the report says what happened."""
+    """Read a scene, compact it with K = ``k``, write the result, and return the report of the run."""
     result = gsmerge.compact(gsmerge.read_scene(scene), k=k)
     gsmerge.write_ply(output, result.gaussians, overwrite=True)
     return result.report

@@ -15,7 +15,7 @@ import gsmerge
 
 
 def target_psnr(targets: Path, ply: Path) -> float:
-    """Mean PSNR (dB) over the target views.
+    """Return the mean PSNR (dB) of a scene over the target views.
 
     Args:
         targets: Folder with a camera file and the photos that it names.

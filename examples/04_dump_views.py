@@ -1,33 +1,33 @@
-"""Cameras for models that save none: a few lines to paste next to the model's own inference, and what they write.
+"""Save the cameras of models that save none, by a few lines to paste next to the model's own inference.
 
     python examples/04_dump_views.py demo
 
-``dump_views`` needs numpy alone. Put ``views.npz`` next to the ``.ply``; every command then finds it:
+``dump_views`` needs only numpy. Put its file ``views.npz`` next to the ``.ply``, where every command finds it:
 
     gsmerge compact gaussians.ply
 
-Where the values come from:
+Call it as follows:
 
 * AnySplat: after ``gaussians, poses = model.inference(images)`` (``inference.py``)
 
       dump_views("views.npz", c2w=poses["extrinsic"][0].cpu().numpy(), K=poses["intrinsic"][0].cpu().numpy(),
                  images=(images[0].cpu().numpy() + 1) / 2, order="none")
 
-* NoPoSplat: the Gaussians of its encoder, saved by ``export_ply``, are in the frame of the first camera
+* NoPoSplat: the Gaussians that ``export_ply`` saves are in the frame of the first camera
 
       context = batch["context"]
       dump_views("views.npz", c2w=c2w_of_first_camera(context["extrinsics"][0].cpu().numpy()),
                  K=context["intrinsics"][0].cpu().numpy(), images=(context["image"][0].cpu().numpy() + 1) / 2)
 
-* Splatt3R: the poses and the focal length that its aligner finds (``demo.py``); rotations need
+* Splatt3R: with the poses and the focal length that its aligner finds (``demo.py``). Rotations are read correctly with
   ``--hint exporter=splatt3r``
 
       dump_views("views.npz", c2w=scene.get_im_poses().cpu().numpy(), K=scene.get_intrinsics().cpu().numpy(),
                  images=numpy.stack(scene.imgs))
 
-* Depth Anything 3 writes all there is to know by itself: ``export_format="npz-gs_ply"``. No dump is needed.
+* Depth Anything 3 needs no dump: with ``export_format="npz-gs_ply"`` it writes its cameras itself.
 
-Run as a script it dumps the cameras and photos of a synthetic scene, and reads them back.
+As a script, this file dumps the cameras and photos of a synthetic scene, and reads them back.
 """
 
 from __future__ import annotations
@@ -39,14 +39,15 @@ import numpy as np
 
 
 def dump_views(path: str, c2w: np.ndarray, K: np.ndarray, images: np.ndarray, order: str = "auto") -> None:
-    """Write what a reader needs to know of the views.
+    """Write cameras and photos of the views to a file that gsmerge reads.
 
     Args:
         path: The ``.npz``.
         c2w: ``[v,4,4]`` or ``[v,3,4]`` camera to world, OpenCV axes, in the world of the Gaussians.
         K: ``[v,3,3]`` in pixels of the images, or divided by their width and height.
         images: ``[v,h,w,3]`` or ``[v,3,h,w]`` as the network saw them; uint8, or float in [0, 1].
-        order: "view-major", "view-fastest", ...; "none" where the Gaussians belong to no pixels; "auto" to find out.
+        order: Order of the rows: "view-major", "view-fastest", ...; "none" if Gaussians belong to no pixels; "auto" if
+            gsmerge should find out.
     """
     if images.dtype != np.uint8:
         images = np.round(np.clip(images, 0, 1) * 255).astype(np.uint8)
@@ -54,12 +55,12 @@ def dump_views(path: str, c2w: np.ndarray, K: np.ndarray, images: np.ndarray, or
 
 
 def c2w_of_first_camera(c2w: np.ndarray) -> np.ndarray:
-    """``[v,4,4]`` poses in the frame of the first camera, for models whose Gaussians are."""
+    """Return poses ``[v,4,4]`` in the frame of the first camera, for models whose Gaussians are in this frame."""
     return np.linalg.inv(c2w[0]) @ c2w
 
 
 def main() -> None:
-    """Dump the views of a scene folder and read the scene with them alone."""
+    """Dump the views of a scene's folder, and read the scene with the dumped views alone."""
     import gsmerge
 
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")

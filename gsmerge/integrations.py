@@ -40,7 +40,7 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     if scale is not None and getattr(prediction, "is_metric", False):
         viewmats[..., :3, 3] /= float(scale)
     return {
-        **_gaussians(gaussians, sh_degree),
+        **_convert_gaussians(gaussians, sh_degree),
         "scales": _unbatch("scales", gaussians.scales, 2),
         # The same rotations with other signs. The model writes z >= 0, as if the last number were w
         "quats": rotations * (1 - 2 * (rotations[:, :1] < 0)),
@@ -66,10 +66,10 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
         SceneError: If a field is missing, or it holds several scenes.
     """
     return {
-        **_gaussians(gaussians, sh_degree),
+        **_convert_gaussians(gaussians, sh_degree),
         "scales": _unbatch("scales", gaussians.scales, 2),
         "quats": _unbatch("rotations", gaussians.rotations, 2)[:, [3, 0, 1, 2]],
-        **_family_views(poses, "extrinsic", "intrinsic", images),
+        **_convert_views(poses, "extrinsic", "intrinsic", images),
         "order": "none",
     }
 
@@ -93,12 +93,12 @@ def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0)
     """
     gaussians = output["gaussians"] if isinstance(output, Mapping) else output
     covariances = _unbatch("covariances", _get("gaussians", gaussians, "covariances"), 3)
-    scales, quats = _axes(as_array(covariances).astype(np.float64))
+    scales, quats = _split_covariances(as_array(covariances).astype(np.float64))
     return {
-        **_gaussians(gaussians, sh_degree),
+        **_convert_gaussians(gaussians, sh_degree),
         "scales": like(scales, covariances),
         "quats": like(quats, covariances),
-        **_family_views(context, "extrinsics", "intrinsics", context["image"]),
+        **_convert_views(context, "extrinsics", "intrinsics", context["image"]),
     }
 
 
@@ -149,7 +149,7 @@ def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]
     """
     splats: Any = _get("predictions", predictions, "splats")
     shapes = {"means": (-1, 3), "scales": (-1, 3), "quats": (-1, 4), "opacities": (-1,), "sh": (-1, 1, 3)}
-    columns = {name: _only(name, _get("splats", splats, name)).reshape(shape) for name, shape in shapes.items()}
+    columns = {name: _unwrap(name, _get("splats", splats, name)).reshape(shape) for name, shape in shapes.items()}
     c2w = as_array(_unbatch("camera_poses", _get("predictions", predictions, "camera_poses"), 3)).astype(np.float64)
     Ks = as_array(_unbatch("camera_intrs", _get("predictions", predictions, "camera_intrs"), 3)).astype(np.float64)
     photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)
@@ -157,8 +157,8 @@ def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]
     return {**columns, "images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks, "order": "none"}
 
 
-def _only(name: str, values: Any) -> Any:
-    """Return the only element of a list or of the first axis; SceneError for any other number of elements."""
+def _unwrap(name: str, values: Any) -> Any:
+    """Return the only element of a list, or of an array's first axis; SceneError for any other number of elements."""
     if len(values) != 1:
         raise SceneError(name, f"expected a batch of one scene, found {len(values)}", "pass one scene")
     return values[0]
@@ -174,7 +174,7 @@ def _get(owner_name: str, owner: Any, name: str) -> Any:
 
 
 def _unbatch(name: str, values: Array, num_axes: int) -> Array:
-    """Remove the axis of a batch of one scene; SceneError if the batch has another size."""
+    """Return an array without the axis of its batch, with ``num_axes`` axes; SceneError for several scenes."""
     if values.ndim == num_axes:
         return values
     if values.ndim != num_axes + 1 or values.shape[0] != 1:
@@ -182,8 +182,8 @@ def _unbatch(name: str, values: Array, num_axes: int) -> Array:
     return values[0]
 
 
-def _gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
-    """Return means, opacities and harmonics, which these models store channel-major."""
+def _convert_gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
+    """Return the arguments for means, opacities and harmonics; these models store harmonics channel-major."""
     harmonics = _unbatch("harmonics", _get("gaussians", gaussians, "harmonics"), 3)
     rows = harmonics.swapaxes(1, 2)[:, : (sh_degree + 1) ** 2]
     opacities = _get("gaussians", gaussians, "opacities")
@@ -191,8 +191,14 @@ def _gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
     return {"means": means, "opacities": opacities, "sh0": rows[:, :1], "shN": rows[:, 1:]}
 
 
-def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, images: Array) -> dict[str, np.ndarray]:
-    """Convert views of the pixelSplat family: camera to world, intrinsics relative to image size, channels first."""
+def _convert_views(
+    poses: Mapping[str, Array], extrinsics: str, intrinsics: str, images: Array
+) -> dict[str, np.ndarray]:
+    """Return the arguments for the views of pixelSplat and its successors.
+
+    Their poses are camera to world, their intrinsics are relative to the image's size, and their images have the
+    channels first.
+    """
     c2w = as_array(_unbatch(extrinsics, _get("poses", poses, extrinsics), 3)).astype(np.float64)
     photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)
     sizes = np.array([photos.shape[2], photos.shape[1], 1.0])
@@ -210,17 +216,17 @@ def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
     """Scale intrinsics to the size of the photos.
 
     After Depth Anything 3 has written COLMAP files, its intrinsics belong to the original size of the photos. The
-    principal point is in the middle at both sizes.
+    principal point is in the middle at both sizes, so it tells the size that intrinsics belong to.
     """
     factors = np.array([photos.shape[-2], photos.shape[-3]]) / (2 * Ks[:, (0, 1), 2])
-    min_difference = 0.1  # intrinsics are of another image size if all principal points differ by more than this share
+    min_difference = 0.1  # sizes differ if they do in all views and along both axes, by more than this share
     is_other_size = np.abs(factors - 1).min() > min_difference
     return Ks * np.concatenate([factors, np.ones((len(Ks), 1))], 1)[:, :, None] if is_other_size else Ks
 
 
-def _axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _split_covariances(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split covariances ``[n,3,3]`` into standard deviations ``[n,3]`` and rotations ``[n,4]`` wxyz."""
-    finite = np.isfinite(covariances).all((1, 2))
+    finite = np.isfinite(covariances).all((1, 2))  # the others get NaN as standard deviations
     squares, axes = eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
     axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])  # a rotation, not a reflection
     scales = np.sqrt(np.maximum(squares, 0))

@@ -1,7 +1,8 @@
-/* Counts the calls of a process and its children that change a folder, and ends the process before one of them.
+/* Counts the calls of a process and its children that change a folder, and kills the process before one of them.
 
-Preloaded by kills.py. Idle unless the environment has KILLS_FOLDER; then KILLS_COUNT names a shared counter, KILLS_AT
-the call to end before, KILLS_LOG gets a line for each call that succeeded, and KILLS_KEEP a link to what is replaced. */
+kills.py preloads this library, which does nothing unless the environment has KILLS_FOLDER. Then KILLS_COUNT is the file
+of a counter that all processes share, and the process is killed before call number KILLS_AT. The file KILLS_LOG gets a
+line for each call that succeeded. The folder KILLS_KEEP gets a link to each file that is replaced or removed. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -21,6 +22,7 @@ the call to end before, KILLS_LOG gets a line for each call that succeeded, and 
 static long *count;
 static int log_file;
 
+// Write the absolute path to `out`; return 1 if it is KILLS_FOLDER or below it.
 static int absolute(int folder, const char *path, char *out) {
     char link[64], base[PATH_MAX] = "";
     const char *root = getenv("KILLS_FOLDER");
@@ -39,6 +41,7 @@ static int absolute(int folder, const char *path, char *out) {
     return !strncmp(out, root, strlen(root)) && (out[strlen(root)] == '/' || !out[strlen(root)]);
 }
 
+// Write the path of an open file to `out`; return 1 if it is KILLS_FOLDER or below it.
 static int opened(int file, char *out) {
     char link[64], path[PATH_MAX] = "";
     if (!getenv("KILLS_FOLDER")) return 0;
@@ -46,6 +49,7 @@ static int opened(int file, char *out) {
     return readlink(link, path, sizeof path - 1) > 0 && *path == '/' && absolute(AT_FDCWD, path, out);
 }
 
+// Count a call; kill the process if it is call number KILLS_AT.
 static void before(const char *kind) {
     long number = __atomic_add_fetch(count, 1, __ATOMIC_SEQ_CST);
     if (number != atol(getenv("KILLS_AT"))) return;
@@ -53,11 +57,13 @@ static void before(const char *kind) {
     kill(getpid(), SIGKILL);
 }
 
+// Return the inode of a path; 0 if there is none.
 static ino_t number_of(const char *path) {
     struct stat status;
     return lstat(path, &status) ? 0 : status.st_ino;
 }
 
+// Link a file that will be replaced or removed into KILLS_KEEP, under its inode.
 static void keep(const char *path) {
     char copy[PATH_MAX];
     struct stat status;
@@ -66,6 +72,7 @@ static void keep(const char *path) {
     link(path, copy);
 }
 
+// Write a line for a call that succeeded: its kind, inode, size, path, and new path.
 static void note(const char *kind, ino_t number, long size, const char *path, const char *target) {
     int error = errno;
     dprintf(log_file, "%s\t%lu\t%ld\t%s\t%s\n", kind, (unsigned long)number, size, path, target);

@@ -1,14 +1,15 @@
-"""Commands that end before each call that changes their folder, on a disk that keeps all or drops what was not synced.
+"""Kill commands before each call that changes their folder, and check what they leave, also after a loss of power.
 
-python tools/kills.py                                       # every call of six commands; Linux and gcc
+python tools/kills.py                                       # every call of the commands; needs Linux and gcc
 python tools/kills.py --calls 6 --commands compact extend   # six calls of each, at equal distances
 python tools/kills.py --plant copies --commands extend      # with a fault, which must be reported
 
 A preloaded library (kills.c) counts the calls (opens for writing, writes, syncs, renames, removals, new folders) and
-ends the process by SIGKILL before one of them. Then every file must be what it was or what the command makes, no index
-may name a missing chunk, and the next run must make all and leave nothing beside it. The same must hold of the disks
-that a loss of power may leave: files are as long as at their last sync, and of the names that changed since their
-folder's last sync, all are lost, none, any single one, or all but one.
+ends the process by SIGKILL before one of them. Then every file must have its old content or the content that the
+command makes, and no index may name a missing chunk. The next run must make all files and leave no other.
+
+The same must hold for the disks that a loss of power may leave. There, files are as long as at their last sync. Names
+that changed since the last sync of their folder may be lost: all of them, none, any single one, or all but one.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FAST = "--effort draft --set fit=none --threads 1"
 COMPACT = f"compact {{scene}} -o {{out}}/a.ply --levels 2 --overwrite {FAST}"
 LOD = f"compact {{scene}} -o {{out}}/lod/lod-meta.json --levels 2 --overwrite {FAST}"
-# What is run, with the scene of {scene}, and what is run before for the earlier files
+# Each command that is killed, and the command that is run before it, so that there are earlier files
 COMMANDS = {
     "compact": (COMPACT.format(scene="{a}", out="{out}"), COMPACT.format(scene="{b}", out="{out}")),
     "extend": ("extend {out}/a.gsm {b} --set effort=draft", "extend {out}/a.gsm {a} --set effort=draft"),
@@ -42,41 +43,41 @@ COMMANDS = {
     "lod": (LOD.format(scene="{a}", out="{out}"), LOD.format(scene="{b}", out="{out}")),
     "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite" for x in "ab"),
 }
-# Imported before the commands are run, which would each do it anew
+# Modules that are imported once, before the commands are run in child processes
 MODULES = ("gsmerge.cli.app", "gsmerge.compaction.files", "gsmerge.networks.apply", "gsmerge.states.files")
 OF_THE_RUN = ("seconds", "total_seconds", "peak_memory_bytes")  # keys of reports that differ from run to run
-RECORDS, LOCK = "batch.jsonl", ".gsmerge-lock"  # of batches, for the next run; there while a folder is in use
-# Faults to show that they would be reported: functions of ``os`` to replace
+RECORDS, LOCK = "batch.jsonl", ".gsmerge-lock"  # records of a batch, and the file that exists while a folder is in use
+# Faults on purpose, to show that they are reported: functions that replace those of ``os``
 PLANTS: dict[str, dict[str, Callable[..., object]]] = {
     "none": {},
     "copies": {"replace": shutil.copyfile},
     "no syncs": {"fsync": lambda descriptor: None},
 }
 
-Contents = dict[str, str]  # name in a folder -> SHA-256
+Contents = dict[str, str]  # SHA-256 by name in a folder
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended."""
+    """The end of a run."""
 
-    code: int  # -9: by SIGKILL
-    text: str  # what it printed
-    calls: list[list[str]]  # kind, number of the file, its size, path, target
+    code: int  # exit code; -9 after SIGKILL
+    text: str  # printed text
+    calls: list[list[str]]  # each call's kind, inode of the file, its size, path, and new path
 
 
 @dataclass(frozen=True)
 class Place:
     """The folders of one command's runs."""
 
-    scenes: Path
-    out: Path
+    scenes: Path  # the inputs
+    out: Path  # the output folder
     keep: Path  # links to files that were replaced or removed
-    notes: Path  # counter, list of calls, and what was printed
-    plant: str = "none"  # fault of the commands
+    notes: Path  # counter, list of calls, and printed text
+    plant: str = "none"  # fault on purpose, a key of ``PLANTS``
 
     def run(self, words: str, at: int = 0) -> Ended:
-        """Run a command in a child with all modules loaded, which ends before one of its calls."""
+        """Run a command in a child process, which is killed before its call number ``at``; 0: it runs to its end."""
         shutil.rmtree(self.keep, ignore_errors=True)
         shutil.rmtree(self.notes, ignore_errors=True)
         self.keep.mkdir()
@@ -95,13 +96,13 @@ class Place:
         return Ended(code, printed.read_text(), [line.split("\t") for line in log.read_text().splitlines()])
 
     def set_up(self, earlier: Path) -> None:
-        """Make the output folder what it is before a run."""
+        """Replace the output folder by a copy of ``earlier``, the folder before a run."""
         shutil.rmtree(self.out, ignore_errors=True)
         shutil.copytree(earlier, self.out)
 
 
 def _main(call: list[str], printed: Path, plant: str) -> int:
-    """Run a command with its output in a file -> exit code."""
+    """Run a command with its output in a file, and with a fault; return the exit code."""
     from gsmerge.cli import main
 
     for name, function in PLANTS[plant].items():
@@ -116,17 +117,18 @@ def _main(call: list[str], printed: Path, plant: str) -> int:
 
 
 def read_files(folder: Path) -> dict[str, bytes]:
-    """Return the bytes of every file below a folder by its name, but for the empty file of a lock."""
+    """Read the bytes of every file below a folder except the lock, by name."""
     files = (x for x in sorted(folder.rglob("*")) if x.is_file() and x.name != LOCK)
     return {str(x.relative_to(folder)): x.read_bytes() for x in files}
 
 
 def contents(files: dict[str, bytes]) -> Contents:
-    """Hash files; reports without what differs from run to run, batches without their records."""
-    return {name: hashlib.sha256(_settled(name, x)).hexdigest() for name, x in files.items() if name != RECORDS}
+    """Hash files, but not the records of batches; what differs from run to run is left out of reports."""
+    return {name: hashlib.sha256(_without_run(name, x)).hexdigest() for name, x in files.items() if name != RECORDS}
 
 
-def _settled(name: str, data: bytes) -> bytes:
+def _without_run(name: str, data: bytes) -> bytes:
+    """Return a file's bytes; a report loses the keys that differ from run to run."""
     if not name.endswith(".json"):
         return data
     try:
@@ -136,11 +138,15 @@ def _settled(name: str, data: bytes) -> bytes:
 
 
 def _without_times(document: dict[str, Any]) -> dict[str, Any]:
+    """Return an object of a report without the keys that differ from run to run."""
     return {key: value for key, value in document.items() if key not in OF_THE_RUN}
 
 
 def faults_of(files: dict[str, bytes], old: Contents, new: Contents) -> Iterator[str]:
-    """Yield what is wrong with files that a command left unfinished."""
+    """Yield the faults of the files that a command has left.
+
+    ``old`` are the contents before the command, and ``new`` those that it makes.
+    """
     actual = contents(files)
     for name in sorted({*old, *new}):
         if actual.get(name) not in (old.get(name), new.get(name)):
@@ -158,7 +164,10 @@ def faults_of(files: dict[str, bytes], old: Contents, new: Contents) -> Iterator
 
 
 def disks(place: Place, calls: list[list[str]], before: dict[str, os.stat_result]) -> Iterator[dict[str, bytes]]:
-    """Yield the files that a loss of power may leave; ``before``: the files and folders before the run."""
+    """Yield the files of each disk that a loss of power may leave, by name.
+
+    ``calls`` are those of the run, and ``before`` has the status of all files and folders before the run, by path.
+    """
     written = {x.stat().st_ino: x for folder in (place.keep, place.out) for x in folder.rglob("*") if x.is_file()}
     synced = {status.st_ino: status.st_size for status in before.values()}
     lasting = {path: status.st_ino for path, status in before.items()}
@@ -192,7 +201,10 @@ def disks(place: Place, calls: list[list[str]], before: dict[str, os.stat_result
 
 
 def try_command(name: str, place: Place, most: int | None) -> tuple[Counter[str], int, list[str]]:
-    """End a command before its calls -> kills by kind of call, number of disks, faults."""
+    """Kill a command before each of its calls, or before ``most`` of them, and check what it leaves.
+
+    Returns the number of kills by kind of call, the number of disks that were checked, and the faults.
+    """
     words, first = COMMANDS[name]
     place.out.mkdir(parents=True)
     if first and (done := place.run(first)).code:
@@ -212,14 +224,15 @@ def try_command(name: str, place: Place, most: int | None) -> tuple[Counter[str]
         ended = place.run(words, at)
         kind = next((call[3] for call in ended.calls if call[0] == "end"), "the end")
         kinds[kind] += kind != "the end"
-        codes = (0,) if kind == "the end" else (-9, 5) if name == "batch" else (-9,)  # 5: of its process
+        # A batch ends with 5 if the killed process is that of one of its scenes
+        codes = (0,) if kind == "the end" else (-9, 5) if name == "batch" else (-9,)
         wrong = [] if ended.code in codes else [f"exit code {ended.code}: {ended.text}"]
         wrong += faults_of(left := read_files(place.out), old, new)
-        lasting = old if ended.code else old | new  # chunks of the old index may come back
+        lasting = old if ended.code else old | new  # after a whole run, chunks of the old index may come back
         for files in disks(place, ended.calls, before):
             num_disks += 1
             wrong += [f"after a loss of power, {x}" for x in faults_of(files, lasting, new)]
-        if name != "extend" or contents(left) != new:  # which would add the views once more
+        if name != "extend" or contents(left) != new:  # a finished extend would add the views once more
             again = place.run(words)
             wrong += [f"the next run ends with {again.code}: {again.text}"] if again.code else []
         if (after := contents(read_files(place.out))) != new:
@@ -240,11 +253,13 @@ def make_scenes(folder: Path) -> Path:
 
 
 def main() -> int:
-    """Try the commands, and return 1 if there are faults."""
+    """Try the commands; return 1 if there are faults, otherwise 0."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--calls", type=int, help="calls of each command, at equal distances; default: all")
     parser.add_argument("--commands", nargs="*", choices=list(COMMANDS), default=list(COMMANDS))
-    parser.add_argument("--plant", choices=list(PLANTS), default="none", help="a fault to report")
+    parser.add_argument(
+        "--plant", choices=list(PLANTS), default="none", help="a fault on purpose, which must be reported"
+    )
     args = parser.parse_args()
     if "KILLS_LIBRARY" not in os.environ:
         with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Makes docs/images/preview.jpg: the room of the README before and after, from a camera of which there was no photo.
+"""Make docs/images/preview.jpg, which shows the README's room before and after, from a held-out camera.
 
 python tools/make_preview.py
 """
@@ -21,14 +21,14 @@ from gsmerge.measure.preview import to_picture
 from gsmerge.measure.sizes import zoom_cameras
 
 ROOT = Path(__file__).parents[1]
-VIEW = 2  # of the held-out ones
-ZOOM = 1.5  # times the size of the views
-GAP, BAND, LETTERS = 8, 44, 24  # pixels
-QUALITY = 88  # of the JPEG, in percent
+VIEW = 2  # index of the held-out camera
+ZOOM = 1.5  # factor by which the view is enlarged
+GAP, BAND, LETTERS = 8, 44, 24  # gap between the halves, height of the line below them, and size of letters, pixels
+QUALITY = 88  # quality of the JPEG, percent
 
 
 def draw_half(scene: gsmerge.Gaussians, cameras: gsmerge.Cameras, path: Path, word: str) -> np.ndarray:
-    """Draw the Gaussians of a file, with their number and the bytes of the file below: ``[h,w,3]``, 8 bits."""
+    """Draw the Gaussians of a file, with a line below that has their number and the file's size; ``[h,w,3]`` uint8."""
     picture = to_picture(gsmerge.render(scene, cameras).images[0])
     half = Image.fromarray(np.pad(picture, ((0, BAND), (0, 0), (0, 0)), constant_values=255))
     text = f"{word}: {len(scene):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB"

@@ -1,8 +1,9 @@
 """Call every kernel with changed arguments: a plugin of pytest, ``python -m pytest -p mutated_calls``.
 
-While tests run, the first calls of each function are made again with copies of their arguments that are changed within
-what the declaration admits: sizes, contents of arrays, scalars. A ValueError refuses a call; all else must come to an
-end, and a sanitizer sees what it reads and writes. The run fails where a function is never called.
+While tests run, the first calls of each function are repeated with changed copies of their arguments. Sizes, contents
+of arrays and scalars change, mostly within the limits of the declaration. A function may refuse a call by a ValueError,
+and must end in any other case, while a sanitizer checks its reads and writes. The run fails if some function is never
+called.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ import pytest
 from gsmerge.kernels import signature
 from gsmerge.kernels.build import FOLDER
 
-CALLS, CHANGES = 8, 60  # calls of each function that are made again, and how often
-BYTES = 1 << 22  # calls with more arguments are left out
-BY_TABLE = {"fit_phase"}  # its argument holds addresses: tests/kernels/raster/test_step.py changes what they point to
-SECONDS = 120  # in which the changed copies of a call must come to an end
+CALLS, CHANGES = 8, 60  # number of calls of each function that are repeated, and number of repeats
+BYTES = 1 << 22  # calls with arrays of more bytes are not repeated
+BY_TABLE = {"fit_phase"}  # takes a table of addresses, whose arrays tests/kernels/raster/test_step.py changes
+SECONDS = 120  # longest time of all repeats of a call
 FLOATS = (0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, 1e30, -1e30, 3e38, np.nan, np.inf, -np.inf)
 INTEGERS = (0, 1, 2, -1, -2, 2**15, 2**31 - 1, 2**31, -(2**31), 2**32 + 1, 2**62, 2**63 - 1, -(2**63))
 
@@ -36,10 +37,11 @@ _declare = signature.declare
 
 
 def declare(name: str, returns: signature.Argument | None = None, /, **arguments: signature.Argument) -> Any:
-    """Declare a function of the library whose first calls are made again with other arguments."""
+    """Declare a function of the library whose first calls are repeated with changed arguments."""
     call = _declare(name, returns, **arguments)
 
     def recorded(*values: Any, **named: Any) -> Any:
+        """Call the function, and repeat its first small calls with changed arguments."""
         row = (*values, *(named[key] for key in list(arguments)[len(values) :]))
         with _lock:
             small = sum(value.nbytes for value in row if isinstance(value, np.ndarray)) < BYTES
@@ -55,7 +57,7 @@ def declare(name: str, returns: signature.Argument | None = None, /, **arguments
 def repeat(name: str, call: Callable[..., Any], arguments: Arguments, values: tuple[Any, ...]) -> None:
     """Call a function with changed copies of its arguments, the same in every run."""
     rng = np.random.default_rng((zlib.crc32(name.encode()), _recorded[name]))
-    faulthandler.dump_traceback_later(SECONDS, exit=True, file=sys.__stderr__)  # not what pytest captures
+    faulthandler.dump_traceback_later(SECONDS, exit=True, file=sys.__stderr__)  # pytest does not capture this stream
     for _ in range(CHANGES):
         copies = change(arguments, values, rng)
         tried[name] += 1
@@ -67,7 +69,7 @@ def repeat(name: str, call: Callable[..., Any], arguments: Arguments, values: tu
 
 
 def change(arguments: Arguments, values: tuple[Any, ...], rng: np.random.Generator) -> list[Any]:
-    """Copy the arguments of a call and change one to three sizes or arguments."""
+    """Copy the arguments of a call, change one to three sizes or arguments, and return the copies."""
     kinds = list(arguments.values())
     copies = (value.copy() if isinstance(value, np.ndarray) else value for value in values)
     named = dict(zip(arguments, copies, strict=True))
@@ -92,7 +94,7 @@ def change(arguments: Arguments, values: tuple[Any, ...], rng: np.random.Generat
 
 
 def _resize(arguments: Arguments, named: dict[str, Any], size: str, rng: np.random.Generator) -> None:
-    """Give all arrays another length along the axes of a name, and mostly the scalar of that name too."""
+    """Give all arrays another length along the axes called ``size``, and mostly also change the scalar of that name."""
     kinds = [(key, kind) for key, kind in arguments.items() if size in kind.shape and named[key] is not None]
     if not kinds:
         return
@@ -108,25 +110,25 @@ def _resize(arguments: Arguments, named: dict[str, Any], size: str, rng: np.rand
 
 
 def _spoil(array: np.ndarray[Any, Any], rng: np.random.Generator) -> None:
-    """Change an array: one value, some or all to one that is odd, small numbers everywhere, or another order."""
+    """Change an array at random: its order, all values to small numbers, or one, some or all values to an extreme."""
     if not array.size:
         return
     flat = array.reshape(-1)
-    way = rng.integers(5)
-    if way == 0:
+    kind = rng.integers(5)
+    if kind == 0:
         rng.shuffle(flat)
-    elif way == 1:
+    elif kind == 1:
         flat[:] = rng.integers(0, max(2, min(array.shape[0], 100)), flat.size).astype(array.dtype)
     else:
-        odd = FLOATS if array.dtype.kind == "f" else (*INTEGERS, len(array), len(array) - 1)
-        count = (1, max(1, flat.size // 4), flat.size)[way - 2]
+        extremes = FLOATS if array.dtype.kind == "f" else (*INTEGERS, len(array), len(array) - 1)
+        count = (1, max(1, flat.size // 4), flat.size)[kind - 2]
         with np.errstate(all="ignore"):
-            value = np.array(odd[rng.integers(len(odd))]).astype(array.dtype)
+            value = np.array(extremes[rng.integers(len(extremes))]).astype(array.dtype)
         flat[rng.choice(flat.size, count, replace=False)] = value
 
 
 def _admit(arguments: Arguments, named: dict[str, Any]) -> None:
-    """Bring values inside the rules of their declarations, as far as they can be."""
+    """Change arguments so that they keep to the limits of their declarations, as far as possible."""
     sizes = {key: value for key, value in named.items() if isinstance(value, int)}
     for key, kind in arguments.items():
         if isinstance(named[key], np.ndarray):
@@ -146,7 +148,7 @@ def _admit(arguments: Arguments, named: dict[str, Any]) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Say how many calls were made; fail where a function was not called."""
+    """Print the number of calls; let the run fail if a function was not called."""
     missing = sorted(set(signature.PROTOTYPES) - set(tried) - BY_TABLE)
     print(f"\n{len(tried)} functions, {tried.total()} changed calls, {refused.total()} of them refused")
     if missing:

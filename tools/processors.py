@@ -1,9 +1,9 @@
-"""Runs the tests as on other x86-64 processors, by the libraries' own ways to leave instructions unused.
+"""Run the tests as on other x86-64 processors, with settings of libraries that leave instructions unused.
 
-python tools/processors.py                      # as each processor, one after the other
-python tools/processors.py oldest -x tests/unit # as one; what follows is passed to pytest
+python tools/processors.py                      # as on each processor, one after the other
+python tools/processors.py oldest -x tests/unit # as on one; the words after its name are passed to pytest
 
-What a library cannot leave out on this machine (AVX-512 where there is none) is no difference: those runs are the same.
+A setting has no effect if this machine does not have the instructions anyway, such as AVX-512.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from time import perf_counter
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
+# Sets of instructions among which NumPy chooses at run time
 DISPATCHED = np._core._multiarray_umath.__cpu_dispatch__
 NUMPY, BLAS, OPENCV, GLIBC, OURS = (
     "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE", "OPENCV_CPU_DISABLE", "GLIBC_TUNABLES", "GSMERGE_TARGET",
 )  # fmt: skip
-WITHOUT_AVX2 = {
+WITHOUT_AVX2 = {  # variables of the environment by library
     NUMPY: {NUMPY: " ".join(DISPATCHED)},
     OPENCV: {OPENCV: "AVX2,FP16"},
     GLIBC: {GLIBC: "glibc.cpu.hwcaps=-AVX2,-FMA"},
 }
-# Name -> variables of the environment
+# Variables of the environment by name of a processor
 PROCESSORS: dict[str, dict[str, str]] = {
     "numpy-avx2": {NUMPY: " ".join(name for name in DISPATCHED if name == "X86_V4" or name.startswith("AVX512"))},
     "numpy-sse": WITHOUT_AVX2[NUMPY],
@@ -41,7 +42,7 @@ PROCESSORS: dict[str, dict[str, str]] = {
 
 
 def main(words: list[str]) -> int:
-    """Run the tests as the named processor, or as all; return the first exit code that is not 0."""
+    """Run the tests as on the processor that the first word names, or as on all; return the first exit code but 0."""
     names = words[:1] if words and words[0] in PROCESSORS else list(PROCESSORS)
     options = words[len(names) :] if len(names) == 1 else words
     codes = {}

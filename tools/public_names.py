@@ -1,9 +1,9 @@
-"""Writes down what is public in a release, by which a test knows whether it has changed since.
+"""Record what is public in a release, so that a test can tell if it has changed since.
 
 python tools/public_names.py  # writes tests/contract/released.json, as step 1 of a release
 
-That are the commands with their options, settings and hints, names of the library with their arguments, exit codes, and
-numbers of schemas.
+Public are the commands with their options, settings and hints, the names of the library with their arguments, exit
+codes, and numbers of schemas.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ OPTIONS = (CompactOptions, EvaluateOptions, ExtendOptions, PlacementOptions, Fil
 
 
 def public_names() -> dict[str, Any]:
-    """Collect what is public now."""
+    """Collect all that is public now, by kind."""
     commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     research = commands["lab"].commands
     every = {name: command for name, command in commands.items() if name != "lab"}
@@ -55,10 +55,12 @@ def public_names() -> dict[str, Any]:
 
 
 def _options_of(command: Any) -> list[str]:
+    """List the names of a command's options and arguments."""
     return sorted({word for parameter in command.params for word in (*parameter.opts, *parameter.secondary_opts)})
 
 
 def _functions_of(module: ModuleType) -> list[str]:
+    """List the public functions that a module defines."""
     own = [name for name, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
     return sorted(name for name in own if not name.startswith("_"))
 

@@ -1,4 +1,4 @@
-"""Installs a wheel or source archive in a fresh environment and does the README's main job with it.
+"""Install a wheel or source archive in a fresh environment, and do the README's main job with it.
 
 python tools/smoke_test.py dist/gsmerge-0.4.0-py3-none-manylinux_2_17_x86_64.whl -c constraints.txt
 
@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from readme_block import find_block
 
 ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ("scene.ply", "scene.compact.ply", "preview.png")  # of the main job, in demo/
+RESULTS = ("scene.ply", "scene.compact.ply", "preview.png")  # files that the main job writes to demo/
 
 
 def main(archive: Path, options: list[str]) -> None:

@@ -1,12 +1,12 @@
-"""Makes gsmerge/pages/vendor: Spark and three.js in one compressed file, their licences, and where they came from.
+"""Make gsmerge/pages/vendor: Spark and three.js in one compressed file, their licences, and a record of their sources.
 
 python tools/vendor_viewer.py
 
-Only who changes a version needs this; it runs on Linux x86-64 and takes npm, which fetches five packages, and Node,
+This is needed only to change a version. It runs on Linux x86-64. It needs npm, which fetches five packages, and Node,
 which runs one of them. Equal versions give equal bytes, and a test compares the content with its hash in SOURCES.json.
 
-The file holds the script, a zero byte, and Spark's WebAssembly without what our pages never call: in the script it
-would be text in base64, which compresses badly.
+The file holds the script, a zero byte, and Spark's WebAssembly without the functions that our pages never call. Spark
+has the WebAssembly as base64 text in the script, which compresses badly.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pathlib import Path
 
 VENDOR = Path(__file__).parents[1] / "gsmerge" / "pages" / "vendor"
 SCRIPT = "spark-three.js.gz"
-# npm package -> version, and its hash as the registry and `npm view PACKAGE dist.integrity` give it
+# Version and hash of each npm package; `npm view PACKAGE dist.integrity` prints the hash
 PACKAGES = {
     "@sparkjsdev/spark": (
         "2.2.0",
@@ -33,7 +33,7 @@ PACKAGES = {
         "0.187.0",
         "sha512-Qiu7R+Cmh8CstZsY1uJOSWnVlfo7ZtNLV7mF8Jltk3LB3AtDu9cRZlcnRKkAk8Y4z6KKw35z7Y7Urd7jWY8etA==",
     ),
-    "fflate": (  # which Spark contains
+    "fflate": (  # a part of Spark
         "0.8.2",
         "sha512-cPJU47OaAoCbg0pBvzsgpTPhmhqI5eJjh/JIu8tPj5q+T7iLvW/JAYUqmE7KOB4R1ZyEhzBaIQpQpardBF5z8A==",
     ),
@@ -47,7 +47,7 @@ PACKAGES = {
     ),
 }
 LICENCES = {"@sparkjsdev/spark": "LICENSE.spark", "three": "LICENSE.three", "fflate": "LICENSE.fflate"}
-# What the page's own script uses of the two
+# Names of Spark and three.js that the pages' own scripts use
 ENTRY = """
 export { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 export {
@@ -55,7 +55,7 @@ export {
   Points, Scene, ShaderMaterial, Vector3, WebGLRenderer,
 } from "three";
 """
-# Exports of Spark's WebAssembly that decoding a file and sorting it call
+# Functions of Spark's WebAssembly that are called to decode a file and to sort Gaussians
 CALLED = [
     "memory",
     "__externref_table_alloc",
@@ -79,7 +79,7 @@ MODULE = rb'\w+\("([A-Za-z0-9+/=]{100000,})"\)(?=\.buffer)'  # the bytes of the 
 
 
 def main() -> None:
-    """Fetch, check, bundle, cut, compress."""
+    """Fetch and check the packages, bundle the script, cut the WebAssembly, and write all files."""
     with tempfile.TemporaryDirectory() as work:
         modules = Path(work) / "node_modules"
         for package in PACKAGES:
@@ -100,25 +100,25 @@ def main() -> None:
     sources = {
         "made_by": f"tools/{Path(__file__).name}",
         "script": {"file": SCRIPT, "bytes": len(script), "sha256": hashlib.sha256(script).hexdigest()},
-        "packages": {name: {"version": version, "integrity": it} for name, (version, it) in PACKAGES.items()},
+        "packages": {name: {"version": version, "integrity": sha} for name, (version, sha) in PACKAGES.items()},
     }
     VENDOR.joinpath("SOURCES.json").write_text(json.dumps(sources, indent=2) + "\n", encoding="utf-8")
     print(f"{VENDOR}: {len(script):,} bytes, {VENDOR.joinpath(SCRIPT).stat().st_size:,} compressed")
 
 
 def cut_module(module: bytes, program: Path, work: Path) -> bytes:
-    """The module without the functions that none of ``CALLED`` reaches."""
-    given, graph, cut = work / "given.wasm", work / "graph.json", work / "cut.wasm"
-    given.write_bytes(module)
+    """Return a WebAssembly module without the functions that none of ``CALLED`` reaches."""
+    whole, graph, cut = work / "whole.wasm", work / "graph.json", work / "cut.wasm"
+    whole.write_bytes(module)
     root = {"name": "root", "reaches": CALLED, "root": True}
     graph.write_text(json.dumps([root, *({"name": name, "export": name} for name in CALLED)]), encoding="utf-8")
     options = ("--graph-file", graph, "-o", cut)
-    subprocess.run(["node", program, given, *options], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(["node", program, whole, *options], check=True, stdout=subprocess.DEVNULL)
     return cut.read_bytes()
 
 
 def fetch(package: str, folder: Path) -> Path:
-    """The package's tarball, its hash checked."""
+    """Fetch the tarball of a package, check its hash, and return its path."""
     version, integrity = PACKAGES[package]
     call = ["npm", "pack", "--silent", "--ignore-scripts", f"{package}@{version}"]
     name = subprocess.run(call, cwd=folder, check=True, capture_output=True, text=True).stdout.split()[-1]
@@ -129,7 +129,7 @@ def fetch(package: str, folder: Path) -> Path:
 
 
 def unpack(tarball: Path, folder: Path) -> None:
-    """The tarball's one folder, as ``folder``."""
+    """Extract the only folder of a tarball as ``folder``."""
     folder.mkdir(parents=True)
     with tarfile.open(tarball) as archive:
         for member in archive.getmembers():

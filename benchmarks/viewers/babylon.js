@@ -1,5 +1,5 @@
-// Babylon.js. By default it loads decoders from unpkg.com, which two options prevent: `spzLibraryUrl` names that of
-// .spz, and `fflate` is the module that unpacks .sog.
+// Babylon.js. By default it loads decoders from unpkg.com. Two options prevent that: `spzLibraryUrl` is the address of
+// the decoder of .spz, and `fflate` is the module that unpacks .sog.
 import * as BABYLON from '@babylonjs/core';
 import '@babylonjs/loaders/SPLAT';
 import '@babylonjs/loaders/glTF';
@@ -12,7 +12,7 @@ show(async ({ file, look, variant, view, parent }) => {
   const engine = new BABYLON.Engine(addCanvas(parent, view), false);
   const scene = new BABYLON.Scene(engine);
   scene.clearColor = BABYLON.Color4.FromHexString('#000000ff');
-  const spzLibraryUrl = new URL('/node_modules/@adobe/spz/dist/spz.js', location).href; // a module that the page serves
+  const spzLibraryUrl = new URL('/node_modules/@adobe/spz/dist/spz.js', location).href; // a file that run.mjs serves
   const pluginOptions = variant === 'default' ? {} : { splat: { spzLibraryUrl, fflate } };
   await BABYLON.ImportMeshAsync(file, scene, { pluginOptions });
   const splats = scene.meshes.find((mesh) => mesh.getClassName().startsWith('GaussianSplatting'));
@@ -32,7 +32,7 @@ function addCamera(scene, view, world) {
   camera.position = Vector3.TransformCoordinates(Vector3.FromArray(view.position), world);
   camera.upVector = Vector3.TransformNormal(Vector3.FromArray(view.up), world);
   camera.setTarget(Vector3.TransformCoordinates(Vector3.FromArray(view.target), world));
-  const leftHanded = view.projection.map((x, i) => (i >= 8 && i < 12 ? -x : x)); // it looks along +z
+  const leftHanded = view.projection.map((x, i) => (i >= 8 && i < 12 ? -x : x)); // for a camera that looks along +z
   camera.freezeProjectionMatrix(Matrix.FromArray(leftHanded));
   return camera;
 }

@@ -1,6 +1,6 @@
-// The views of the photos, from the .cameras.json beside a result. Its axes are those of OpenCV: x right, y down.
+// Cameras of the photos, as in the .cameras.json beside a result, with OpenCV axes: x right, y down.
 
-/** Return the camera whose photo has this name, or the one in the middle, from which gsmerge lets viewers start. */
+/** Return the camera whose photo has this name; without a name, the middle one, where gsmerge lets viewers start. */
 export function chooseCamera(cameras, name) {
   if (name) return cameras.find((camera) => stem(camera.img_name) === name);
   const positions = cameras.map((camera) => camera.position);
@@ -20,16 +20,16 @@ export function stem(path) {
   return path.split('/').pop().replace(/\.[^.]*$/, '');
 }
 
-/** Enlarge the picture of a camera until its axis meets the middle, for viewers whose axis does so always. */
+/** Enlarge the picture of a camera until the camera's axis meets its middle, as it always does in some viewers. */
 export function centre(camera) {
   const { width, height, cx = width / 2, cy = height / 2 } = camera;
   const [wide, high] = [2 * Math.max(cx, width - cx), 2 * Math.max(cy, height - cy)].map(Math.round);
   return { ...camera, width: wide, height: high, cx: wide / 2, cy: high / 2, left: wide / 2 - cx, top: high / 2 - cy };
 }
 
-/** Describe a camera in the frame of the file that is opened. */
+/** Describe a camera in the frame of the file that is opened, in the ways in which viewers want it. */
 export function placeView(camera, file) {
-  // glTF has y up: what gsmerge writes as .glb is half a turn about z from its other files.
+  // glTF has y up. So gsmerge turns the scene in a .glb by half a turn about z, compared with its other files.
   const turn = /(\.glb|tileset\.json)$/.test(file) ? [-1, -1, 1] : [1, 1, 1];
   const column = (k) => camera.rotation.map((row, i) => turn[i] * row[k]);
   const negate = (vector) => vector.map((x) => -x);
@@ -40,7 +40,7 @@ export function placeView(camera, file) {
     position, right, up: negate(down), forward, width, height, fx, fy, cx, cy, left, top,
     target: position.map((x, i) => x + 20 * forward[i]),
     vertical: (2 * Math.atan(height / 2 / fy) * 180) / Math.PI, // field of view in degrees
-    // As OpenGL has them, column after column: its cameras look along -z, with y up.
+    // OpenGL's matrices, column by column: its cameras look along -z, with y up.
     pose: [...right, 0, ...negate(down), 0, ...negate(forward), 0, ...position, 1],
     projection: projectionMatrix({ width, height, fx, fy, cx, cy }, 0.1, 1000),
   };

@@ -1,9 +1,9 @@
-// Cesium. It reads Gaussians as .spz inside of a .glb, of which a tileset.json speaks.
+// Cesium. It reads a .spz inside a .glb, by itself or as the tile of a tileset.json.
 import * as Cesium from 'cesium';
 import { show } from './page.js';
 
 const { Cartesian3, Matrix4 } = Cesium;
-// Some place on the ground: Cesium draws on a globe.
+// An arbitrary place above the ground, because Cesium draws on a globe.
 const PLACE = Cesium.Transforms.eastNorthUpToFixedFrame(Cartesian3.fromDegrees(10, 50, 100));
 
 show(async ({ file, look, view, parent }) => {
@@ -12,7 +12,7 @@ show(async ({ file, look, view, parent }) => {
   style.textContent = '.cesium-widget, .cesium-widget canvas { width: 100%; height: 100% }';
   document.head.append(style);
   const bare = { baseLayer: false, globe: false, skyBox: false, skyAtmosphere: false };
-  const credits = document.createElement('div'); // outside of the page
+  const credits = document.createElement('div'); // not part of the page, so that no credits cover the picture
   const widget = new Cesium.CesiumWidget(parent, { ...bare, creditContainer: credits });
   const { scene, camera } = widget;
   scene.backgroundColor = Cesium.Color.BLACK;
@@ -52,7 +52,7 @@ function lookFrom(camera, view) {
   const place = ([x, y, z]) => new Cartesian3(-x, z, y); // as the tileset turns glTF's y up to Cesium's z up
   const turn = (vector) => Matrix4.multiplyByPointAsVector(PLACE, place(vector), new Cartesian3());
   const { width, height, fx, fy } = view;
-  const fov = 2 * Math.atan(Math.max(width / fx, height / fy) / 2); // of the longer side
+  const fov = 2 * Math.atan(Math.max(width / fx, height / fy) / 2); // field of view of the longer side, radians
   camera.frustum = new Cesium.PerspectiveFrustum({ fov, aspectRatio: width / height, near: 0.1, far: 10000 });
   const destination = Matrix4.multiplyByPoint(PLACE, place(view.position), new Cartesian3());
   camera.setView({ destination, orientation: { direction: turn(view.forward), up: turn(view.up) } });

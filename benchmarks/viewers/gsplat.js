@@ -1,4 +1,4 @@
-// gsplat.js. Its cameras look along +z, with y down, as those of .cameras.json do.
+// gsplat.js. Its cameras look along +z, with y down, like those of .cameras.json.
 import * as SPLAT from 'gsplat';
 import { addCanvas, show } from './page.js';
 

@@ -7,7 +7,7 @@ show(async ({ file, look, view, parent }) => {
   const place = { cameraUp: view.up, initialCameraPosition: view.position, initialCameraLookAt: view.target };
   const viewer = new GaussianSplats3D.Viewer({
     rootElement: parent,
-    sharedMemoryForWorkers: false, // it would need headers of the server
+    sharedMemoryForWorkers: false, // shared memory would need special headers from the server
     sphericalHarmonicsDegree: 2,
     sceneRevealMode: GaussianSplats3D.SceneRevealMode.Instant,
     ...(look === 'photo' ? place : {}),

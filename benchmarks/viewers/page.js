@@ -1,13 +1,14 @@
-// What the pages of all viewers share: they read their task from the address and say when the file is open.
+// Shared by the pages of all viewers. A page reads its task from its address, and reports when the file is open.
 import { angleBetween, centre, chooseCamera, placeView } from './camera.js';
 
 /**
  * Open the file that the address names with `open`, which gets { file, look, variant, view, parent }.
  *
- * It draws into `parent` and returns the direction that its camera looks in, in the frame of the file.
- * `look` is where from: photo (the photo's view), file (a camera that the result brings), box (all of the bounding box)
- * or default (where the viewer stands if it is told nothing). The variant "default" is without our settings.
- * With `centred`, `parent` is larger than the picture, so that the axis of the view meets its middle.
+ * `open` draws into `parent` and returns the direction in which its camera looks, in the frame of the file.
+ * `look` says where the camera is: photo (the photo's view), file (a camera of the result or its settings), box (so
+ * that it sees all of the bounding box) or default (where the viewer stands without any camera). The variant "default"
+ * uses none of our settings. With `centred`, `parent` is larger than the picture, so that the axis of the view meets
+ * the middle of `parent`.
  */
 export async function show(open, { centred = false } = {}) {
   addEventListener('error', (event) => report(event.error ?? event.message));
@@ -28,7 +29,7 @@ export async function show(open, { centred = false } = {}) {
   }
 }
 
-// The first error is what the driver gets. Some viewers throw outside of what they promise.
+// Report an error to run.mjs, unless something was reported before. Some viewers throw errors outside their promises.
 function report(error) {
   window.opened ??= { error: String(error?.message ?? error) };
 }
@@ -42,7 +43,7 @@ export function addCanvas(parent, { width, height }) {
   return canvas;
 }
 
-/** Resolve when an emitter says `event`, reject when it says `failure`. */
+/** Return a promise that resolves when an emitter emits `event`, and rejects when it emits `failure`. */
 export function waitFor(emitter, event, failure) {
   return new Promise((resolve, reject) => {
     emitter.on(event, resolve);

@@ -1,4 +1,4 @@
-// PlayCanvas' engine. It has no camera of its own: by default one stands at the origin and looks along -z.
+// PlayCanvas' engine. Its scenes have no camera; a new one stands at the origin and looks along -z.
 import * as pc from 'playcanvas';
 import { addCanvas, show, waitFor } from './page.js';
 

@@ -9,10 +9,10 @@ import puppeteer from 'puppeteer-core';
 import { chooseCamera, stem } from './camera.js';
 
 const HERE = import.meta.dirname;
-const SECONDS = 60; // for each picture
+const SECONDS = 60; // longest time for each picture
 const PAUSE = 1500; // milliseconds between two pictures that have to be the same
 
-// Each viewer: its page, its package, a variant of the page, and the formats that are opened from each place.
+// Each viewer: its name, page, package and variant of the page, and the formats to open for each `look` (see page.js).
 const SPLATS = ['ply', 'spz', 'splat'];
 const VIEWERS = [
   ['Spark', 'spark', '@sparkjsdev/spark', 'default', { photo: [...SPLATS, 'sog'], default: ['ply'], box: ['ply'] }],
@@ -95,7 +95,7 @@ async function bundle(folder) {
     bundle: true,
     format: 'esm',
     logLevel: 'error',
-    define: { CESIUM_BASE_URL: '"/node_modules/cesium/Build/Cesium/"' }, // its workers and decoders
+    define: { CESIUM_BASE_URL: '"/node_modules/cesium/Build/Cesium/"' }, // where Cesium finds its workers and decoders
   });
   for (const page of pages) {
     const head = '<!doctype html><link rel="icon" href="data:,">';
@@ -121,7 +121,7 @@ async function serve(folders) {
 
 function launch() {
   const software = ['--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'];
-  // No other host has an address: what a viewer wants from a network fails, and is listed.
+  // No other host has an address. So requests of a viewer to the network fail, and are listed.
   const refuse = '--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1';
   return puppeteer.launch({
     executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
@@ -154,8 +154,8 @@ async function openPage(browser, address, { width, height }, picture) {
   return { ...result, refused: [...refused], messages: [...messages].slice(0, 5), seconds };
 }
 
-// Viewers sort and stream after they have opened a file. Their picture is done when it does not change any more.
-// Return whether that has happened.
+// Write the picture of a page to a file; return true if it does not change any more. Viewers still sort and stream
+// after they have opened a file, so pictures are taken until two are equal.
 async function takePicture(page, file, deadline) {
   let [before, now] = [new Uint8Array(), await page.screenshot()];
   while (Date.now() < deadline && !Buffer.from(now).equals(before)) {

@@ -8,7 +8,7 @@ show(async ({ file, look, variant, view, parent }) => {
   const renderer = new THREE.WebGLRenderer({ canvas: addCanvas(parent, view), antialias: false });
   const scene = new THREE.Scene();
   const camera = new THREE.PerspectiveCamera(view.vertical, view.width / view.height, 0.1, 1000);
-  // gsmerge draws without antialiasing of Gaussians. Spark's default draws with it, and its pictures are softer.
+  // gsmerge draws Gaussians without antialiasing. Spark's default uses it, and its pictures are softer.
   const sharp = variant === 'default' ? {} : { preBlurAmount: 0.3, blurAmount: 0 };
   scene.add(new SparkRenderer({ renderer, ...sharp }));
   const mesh = new SplatMesh({ url: file });

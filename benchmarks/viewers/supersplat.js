@@ -6,12 +6,12 @@ import { show, waitFor } from './page.js';
 show(async ({ file, look, view, parent }) => {
   const style = { rel: 'stylesheet', href: '/node_modules/@playcanvas/supersplat-viewer/dist/viewer.css' };
   document.head.append(Object.assign(document.createElement('link'), style));
-  // Without `noanim` and an animation in the settings, it turns about the target or swings, away from the photos.
+  // Unless `noanim` is set or the settings have an animation, its camera circles or swings, away from the photos.
   const options = { renderer: 'webgl', ui: false, noanim: look !== 'file' };
   const settings = look === 'file' ? settingsBeside(file) : { ...defaultSettings(), cameras: camerasFor(look, view) };
   const viewer = await createViewer({ container: parent, contentUrl: file, settings, ...options });
   if (!viewer.state.loaded) await waitFor(viewer.events, 'loaded:changed');
-  if (look === 'file') await new Promise((resolve) => setTimeout(resolve, 3000)); // until one sees whether it moves
+  if (look === 'file') await new Promise((resolve) => setTimeout(resolve, 3000)); // after that, a movement shows
   const splats = viewer.app.root.findComponent('gsplat').entity;
   const camera = viewer.app.root.findComponent('camera').entity;
   const { x, y, z } = splats.getWorldTransform().clone().invert().transformVector(camera.forward);
@@ -26,8 +26,8 @@ function settingsBeside(file) {
 
 function camerasFor(look, view) {
   if (look !== 'photo') return [];
-  const turn = ([x, y, z]) => [-x, -y, z]; // the viewer turns what it opens by half a turn about z
-  // Its field of view is that of the picture's longer side.
+  const turn = ([x, y, z]) => [-x, -y, z]; // the viewer turns scenes by half a turn about z
+  // The viewer's field of view belongs to the picture's longer side.
   const longer = Math.max(view.width / view.fx, view.height / view.fy);
   const fov = (2 * Math.atan(longer / 2) * 180) / Math.PI;
   return [{ initial: { position: turn(view.position), target: turn(view.target), fov } }];

@@ -1,4 +1,4 @@
-// Cameras of three, for its own renderer and for those on top of it.
+// Cameras of three.js, for its own renderer and for renderers that build on it.
 import { Vector3 } from 'three';
 
 /** Give a camera the pose and the projection of the photo's view. */
@@ -10,7 +10,7 @@ export function lookFrom(camera, view) {
   camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
 }
 
-/** Stand on the +z side of a box, as viewers of glTF do, so far away that the sphere around it fills the picture. */
+/** Place a camera on the +z side of a box, as viewers of glTF do. The sphere around the box fills its picture. */
 export function frameBox(camera, box) {
   const centre = box.getCenter(new Vector3());
   const radius = box.getSize(new Vector3()).length() / 2;

@@ -1,4 +1,4 @@
-// three's own renderer of Gaussians, with its fallback to WebGL2.
+// three.js' own renderer of Gaussians, in WebGL2.
 import { GLTFGaussianSplatLoaderExtension } from 'three/addons/loaders/GLTFGaussianSplatLoaderExtension.js';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
 import { GaussianSplatPLYLoader } from 'three/addons/loaders/GaussianSplatPLYLoader.js';
@@ -15,7 +15,7 @@ show(async ({ file, look, variant, view, parent }) => {
   const canvas = addCanvas(parent, view);
   const renderer = new THREE.WebGPURenderer({ canvas, antialias: false, forceWebGL: true });
   await renderer.init();
-  // The colours of the files are those of the screen. By default three takes them for linear ones: washed out.
+  // Files have the colours of the screen. By default three takes them for linear colours, and pictures are washed out.
   if (variant !== 'default') renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
   const { object, cameras } = await load(file);
   const scene = new THREE.Scene();

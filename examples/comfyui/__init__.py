@@ -12,19 +12,20 @@ from comfy_api.latest import IO, ComfyExtension, Types
 
 import gsmerge
 
-UNITS = 1000  # of the progress bar
-FLIP = np.diag([1.0, -1, -1])  # three.js' axes, y up and z backward, to those of a splat, y down and z forward
-CHOICES = [
+UNITS = 1000  # length of the progress bar
+FLIP = np.diag([1.0, -1, -1])  # from three.js' axes (y up, z backward) to those of a splat (y down, z forward)
+CHOICES = [  # inputs of both nodes
     IO.String.Input("budget", default="", tooltip="How many to keep: 20000, 4%, 5MB or mobile; empty: as many as pay."),
     IO.Combo.Input("effort", options=["default", "draft", "fast", "best"], tooltip="draft: a quarter of the time."),
 ]
 
 
 def make_progress() -> Any:
-    """Return a progress of gsmerge that moves the bar of the running node, and ends a cancelled run."""
-    bar, place = comfy.utils.ProgressBar(UNITS), [0, 1]  # the stage that runs, of how many
+    """Return a progress function for gsmerge, which moves the bar of the running node and ends a cancelled run."""
+    bar, place = comfy.utils.ProgressBar(UNITS), [0, 1]  # number of the current stage, and number of stages
 
     def move(stage: str, done: int, total: int) -> None:
+        """Move the bar; names of steps within a stage have a colon."""
         comfy.model_management.throw_exception_if_processing_interrupted()
         if ": " not in stage:
             place[:] = done, max(1, total)
@@ -35,7 +36,7 @@ def make_progress() -> Any:
 
 
 def place_camera(camera: dict[str, Any], width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a camera's view matrix in the world of the splat, OpenCV axes, and K, as Render Splat draws with it."""
+    """Return view matrix (OpenCV axes, world of the splat) and K of a camera of ComfyUI, as Render Splat uses it."""
     if str(camera.get("cameraType", "")).lower().startswith("ortho"):
         raise ValueError("camera_info: expected perspective cameras, found an orthographic one")
     eye, target = (np.array([float(camera[name].get(axis, 0)) for axis in "xyz"]) for name in ("position", "target"))
@@ -51,13 +52,13 @@ def place_camera(camera: dict[str, Any], width: int, height: int) -> tuple[np.nd
         rotation = np.stack([right, np.cross(back, right), back], 1)
     pose = np.eye(4)  # camera to world
     pose[:3, :3], pose[:3, 3] = FLIP @ rotation @ FLIP, FLIP @ eye
-    tangent = np.tan(np.radians(float(camera.get("fov") or 35)) / 2)  # of the shorter side
+    tangent = np.tan(np.radians(float(camera.get("fov") or 35)) / 2)  # the field of view is that of the shorter side
     focal = min(width, height) / 2 / tangent * float(camera.get("zoom") or 1)
     return np.linalg.inv(pose), np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
 
 def place_views(images: list[torch.Tensor], cameras: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the views of batches of images ``[b,h,w,3]`` and the camera of each; ValueError if they do not fit."""
+    """Return batches of images ``[b,h,w,3]`` and their cameras as arguments; ValueError if they do not fit."""
     if len({image.shape[1:3] for image in images}) > 1:
         raise ValueError("images: expected one size")
     photos = torch.cat([image[..., :3] for image in images])
@@ -77,7 +78,7 @@ def split_batch(splat: Types.SPLAT) -> list[dict[str, torch.Tensor]]:
 
 
 def join_batch(items: list[gsmerge.Gaussians]) -> Types.SPLAT:
-    """Return Gaussians as a batch; shorter items end in zeros."""
+    """Return several Gaussians as one batch, in which shorter items are filled up with zeros."""
     columns = [(g.means, g.scales, g.quats, g.opacities[:, None], torch.cat([g.sh0, g.shN], 1)) for g in items]
     padded = [torch.nn.utils.rnn.pad_sequence(list(column), batch_first=True) for column in zip(*columns, strict=True)]
     return Types.SPLAT(*padded, torch.tensor([len(g) for g in items]) if len(items) > 1 else None)
@@ -99,7 +100,7 @@ class CompactGaussians(IO.ComfyNode):
 
     @classmethod
     def execute(cls, splat, budget, effort, images=None, camera_info=None) -> IO.NodeOutput:
-        batches = [split_batch(one) for one in splat]
+        batches = [split_batch(batch) for batch in splat]
         if bool(images) != bool(camera_info) or (images and sum(map(len, batches)) > 1):
             raise ValueError("images, camera_info: expected both of them, and one splat, or neither")
         settings: Any = {"budget": budget[0].strip() or None, "effort": effort[0], "order": "none"}

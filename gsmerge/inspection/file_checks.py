@@ -33,7 +33,7 @@ class FileCheck:
 
     path: str
     kind: str  # "Gaussians", "cameras", "networks" or "Feature Gaussians"; "" if the file cannot be read
-    count: int = 0  # Number of Gaussians, Feature Gaussians, views of cameras, or parameters of networks
+    count: int = 0  # Number of Gaussians, cameras, parameters of networks, or Feature Gaussians
     layout: str = ""  # Layout of the columns, or format of the camera file
     file_bytes: int = 0
     problems: tuple[str, ...] = ()  # One sentence each, without a full stop
@@ -59,7 +59,7 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
     The ending decides the kind of file. A scene is read as ``compact`` reads it. UsageError if a package is missing.
     """
     try:
-        file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read(path)
+        file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read_other(path)
     except SceneError as error:
         return FileCheck(str(path), "", problems=(str(error).removeprefix(f"{path}: "),))
     size = 0 if path.is_dir() else path.stat().st_size
@@ -67,13 +67,13 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
 
 
 def holds_scene(path: Path) -> bool:
-    """Return whether a path is read as a scene, not as cameras, networks, levels or a state."""
+    """Return True if a path is read as a scene, and False if as cameras, networks, levels or a state."""
     if STATE.names(path):
         return os.path.isfile(path) and not holds_features(path)
     return os.path.isdir(path) or may_hold_gaussians(path)
 
 
-def _read(path: Path) -> FileCheck:
+def _read_other(path: Path) -> FileCheck:
     """Read a file that is not a scene; SceneError if it cannot be read."""
     suffix = path.suffix.lower()
     if suffix == STATE_ENDING:
@@ -87,7 +87,7 @@ def _read(path: Path) -> FileCheck:
         return FileCheck(str(path), "cameras", len(cameras), cameras.source)
     check_file(path)
     if suffix in SCENE_SUFFIXES:
-        find_scene_files(path)  # which says what a file without Gaussians holds
+        find_scene_files(path)  # raises an error that says what a file without Gaussians holds
     if suffix in IMAGE_SUFFIXES | OTHER_SUFFIXES:
         raise ply.no_ply(path)
     endings = ", ".join(dict.fromkeys((*READ_ENDINGS, *CAMERA_FILE_ENDINGS, NETWORKS)))
@@ -109,6 +109,7 @@ def _read_levels(path: Path) -> FileCheck:
     """Read all levels of detail of an index, one after the other."""
     index = streamed.read_index(path)
     infos = [streamed.read_level(path, level, index).info for level in range(len(index.levels))]
+    # The bytes of every level include the index
     total_bytes = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
     notes = dict.fromkeys(note for info in infos for note in file_notes(info))
     return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, total_bytes, notes=tuple(notes))

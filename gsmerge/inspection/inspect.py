@@ -44,7 +44,7 @@ from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
-_OWN = "gsmerge"  # name of the exporter of files that gsmerge wrote
+_OWN = "gsmerge"  # exporter of files that gsmerge wrote
 _FILE_KEYS = (
     "path", "layout", "format", "count", "bytes_by_attribute", "extra_columns", "extra_elements", "sh_degree",
     "opacity_encoding", "num_nonfinite", "num_empty", "num_zero_quats",
@@ -52,9 +52,9 @@ _FILE_KEYS = (
 _UNKNOWN_KEYS = (
     "camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement", "num_unseen",
 )  # None unless the views are known  # fmt: skip
-_CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
-_REPEATED = "read as: "  # begins notes that repeat another line
-_ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
+_CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # elements of a .ply that hold its camera
+_REPEATED = "read as: "  # beginning of notes that repeat the line "rows"
+_ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}  # words for the encodings of opacities
 
 
 @check_arguments
@@ -133,7 +133,10 @@ def _describe_file(ply: GaussianFile) -> dict[str, Any]:
 
 
 def _prepare_quietly(scene: Scene) -> tuple[Scene, list[str]]:
-    """Return the canonical scene with sizes as a run uses them, and the notes of a run on sizes and photos."""
+    """Prepare a scene as a run does, without showing its progress.
+
+    Returns the canonical scene with the sizes that a run uses, and a run's notes on sizes and photos.
+    """
     if len(scene.gaussians) == 0:
         return scene, []
     with record_part(silent=True) as record:
@@ -153,7 +156,7 @@ def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] 
 
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
-    """Describe the views of a scene, and whether its rows belong to their pixels."""
+    """Describe the views of a scene, and whether its rows belong to pixels; see :func:`inspect` for the keys."""
     is_result, expected = is_from_gsmerge(ply.info.comments), read_new_views(ply.info.comments)
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
@@ -186,38 +189,51 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
 
 
 def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
-    """Describe a scene that was read: its views, their coverage, and the result that ``compact`` would make."""
-    scene, sight, num_sky_views = load.scene, None, 0
-    if len(scene):
-        gaussians = scene.gaussians
-        images = photo_array(scene.images)
-        sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
-        means = gaussians.means[np.isfinite(gaussians.means).all(1)]
-        num_sky_views = len(sky_regions(means, scene.cameras, images))
+    """Describe a scene that was read: its views, and the result that ``compact`` would make."""
+    scene = load.scene
     distinct = without_repeats(scene)[0]  # each view once, as in a run
-    canonical, notes = _prepare_quietly(distinct)
-    agreement = confirm_depths(canonical)
-    doubt, depth = unlike_captures(canonical.gaussians), None if agreement is None else agreement.advice
-    all_notes = [*load.notes, *views_notes(scene), *notes, doubt and Doubt(doubt), depth]
-    facts: dict[str, Any] = {
-        **note_entries(list(dict.fromkeys(filter(None, all_notes)))),
-        "num_views": len(load.scene),
+    canonical, run_notes = _prepare_quietly(distinct)
+    agreement, doubt = confirm_depths(canonical), unlike_captures(canonical.gaussians)
+    doubts = doubt and Doubt(doubt), agreement.advice if agreement else None
+    return {
+        **note_entries(list(dict.fromkeys(filter(None, [*load.notes, *views_notes(scene), *run_notes, *doubts])))),
+        "num_views": len(scene),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),
-        "sight": sight and asdict(sight),
-        "num_sky_views": num_sky_views,
+        **_describe_sight(scene),
         "compact": estimate(scene, CompactOptions()),
         "auto": _describe_auto(distinct, agreement),
         "agreement": agreement and agreement.to_dict(),
+        **(_count_unseen(load) if is_result else _name_exporter(load)),
     }
-    # In a scene with pixels, Gaussians of overlapping views hide each other
-    if is_result and len(scene) and load.recovery is None:
-        facts["num_unseen"] = int((count_views_in_world(scene.gaussians, scene.cameras) == 0).sum())
-    if not is_result:
-        is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
-        titles = join_words(model.title for exporter in load.exporters for model in exporter.models)
-        facts["exporter"] = (is_known and titles) or f"not known: {load.info.layout}"
-    return facts
+
+
+def _describe_sight(scene: Scene) -> dict[str, Any]:
+    """Describe what the views show: how colours fit the photos, and the number of photos with sky; {} without views."""
+    if len(scene) == 0:
+        return {}
+    gaussians, images = scene.gaussians, photo_array(scene.images)
+    sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
+    means = gaussians.means[np.isfinite(gaussians.means).all(1)]
+    return {"sight": asdict(sight), "num_sky_views": len(sky_regions(means, scene.cameras, images))}
+
+
+def _count_unseen(load: Loaded) -> dict[str, Any]:
+    """Count the Gaussians of a result that no view shows; {} if that is not known.
+
+    It is not known without views, or with a Gaussian for each pixel, since Gaussians of overlapping views then hide
+    each other.
+    """
+    if len(load.scene) == 0 or load.recovery is not None:
+        return {}
+    return {"num_unseen": int((count_views_in_world(load.scene.gaussians, load.scene.cameras) == 0).sum())}
+
+
+def _name_exporter(load: Loaded) -> dict[str, Any]:
+    """Name the models that may have exported a scene."""
+    is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
+    titles = join_words(model.title for exporter in load.exporters for model in exporter.models)
+    return {"exporter": (is_known and titles) or f"not known: {load.info.layout}"}
 
 
 def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
@@ -276,7 +292,7 @@ def _batch_lines(batches: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _ignored(scene: Mapping[str, Any]) -> list[str]:
-    """List the columns and elements that gsmerge does not use; elements with the camera are used."""
+    """List the columns and elements of the file that gsmerge does not use."""
     used = _CAMERA_ELEMENTS if scene["cameras"] is None and scene["camera_format"] else ()
     elements = [name for name in scene["extra_elements"] if name not in used]
     return [*scene["extra_columns"], *(f"element {name}" for name in elements)]
@@ -292,7 +308,7 @@ def _describe_cameras(scene: Mapping[str, Any]) -> str:
 
 
 def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe the order of the rows and their distances from their pixels; or say why these are unknown."""
+    """Describe the order of the rows and their distances from their pixels, or say why these are unknown."""
     alignment, problem = scene["alignment"], scene["alignment_problem"]
     if problem is not None and scene["compact"] is None:
         return []  # the error says why
@@ -300,7 +316,7 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
         return [f"alignment  not one Gaussian per pixel: {problem.removeprefix('expected one Gaussian per pixel, ')}"]
     if alignment is None:
         return []
-    worst = max(m for m in alignment["median_px"] if m is not None)
+    worst = max(offset for offset in alignment["median_px"] if offset is not None)
     missing = f", none for {scene['num_missing']:,} of them" if scene["num_missing"] else ""
     return [
         f"rows       {scene['rows']}",
@@ -318,8 +334,8 @@ def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
     colors = ""
     if sight["color_ratio"] is not None:
         colors = f"; colours {sight['color_ratio']:.2f} times as far from their own pixels as from any others"
-    pixelwise = views[0]["share_of_pixels"] is not None
-    key, unit = ("share_of_pixels", "pixels") if pixelwise else ("share_of_gaussians", "Gaussians")
+    has_pixels = views[0]["share_of_pixels"] is not None
+    key, unit = ("share_of_pixels", "pixels") if has_pixels else ("share_of_gaussians", "Gaussians")
     shares = [view[key] for view in views]
     low, high = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
     range_text = f"{high} % of the {unit} in every view"
@@ -342,5 +358,7 @@ def _new_views_lines(scene: Mapping[str, Any]) -> list[str]:
     expected = scene["new_views"]
     if expected is None:
         return []
-    gain = f"{expected['low']:+.1f} to {expected['high']:+.1f} dB"
-    return [f"new views  {gain} expected against its input, which shows them at {expected['before']:.1f} dB"]
+    return [
+        f"new views  {expected['low']:+.1f} to {expected['high']:+.1f} dB expected against its input, which shows them"
+        f" at {expected['before']:.1f} dB"
+    ]

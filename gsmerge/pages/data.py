@@ -27,7 +27,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s
-MAX_SHOWN_VIEWS = 32  # of more views, only so many at equal intervals are shown; each takes up to 300 kB
+MAX_SHOWN_VIEWS = 32  # most views in a page, chosen at equal intervals; each takes up to 300 kB
 SplitViews = tuple[Cameras, np.ndarray, Sequence[str]]  # cameras in the world, photos and names of a split
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
 
@@ -43,8 +43,8 @@ class Side:
     splats: bytes | None  # the Gaussians in the page's frame, see :func:`pack_splats`; None: too many for a page
     sh_degree: int  # degree of the harmonics in the page
     file_sh_degree: int  # degree of the harmonics in the file
-    covered_share: float | None  # share of the pixels of these views that the input covers
-    covered: Quality  # mean over the covered pixels
+    covered_share: float | None  # share of the pixels of the views of ``mean`` that the input covers
+    covered: Quality  # mean over the covered pixels of these views
     seconds: float  # time to draw a view on this machine, with all threads
     new_gain: tuple[float, float] | None = None  # bounds of the expected gain of new views, dB; None: not known
 
@@ -54,7 +54,7 @@ class PageView:
     """A view that the page can jump to."""
 
     name: str
-    place: int  # among all views, the input views first
+    place: int  # index among all views, of which the input views are first
     held_out: bool
     camera: Cameras  # one, in the page's frame
     distance: float  # median depth of the scene, in units of that frame
@@ -70,7 +70,7 @@ class ViewData:
 
     title: str  # name of the scene
     sides: tuple[Side, ...]  # the scene itself, then its results
-    views: tuple[PageView, ...]  # the worst first, by the scores of the first result, or of the scene without results
+    views: tuple[PageView, ...]  # the worst first, by the scores of the first result; without results, of the scene
     outside: PageView  # the view from outside the capture
     num_views: int  # number of measured views; `views` may have fewer
     reference: str  # words for the pictures against which scores are measured
@@ -85,7 +85,7 @@ class ViewData:
 
     @property
     def start(self) -> int:
-        """Index of the view with which the page opens: the view with the median score, or the first without scores.
+        """Index of the view with which the page opens: the view with the median score; without scores, the first one.
 
         Held-out views are preferred, as in the figures at the top; among them, views with LPIPS.
         """
@@ -120,26 +120,27 @@ def collect_page_data(
 ) -> ViewData:
     """Draw and score a scene with at least one view, and its results, in all views.
 
-    ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes``: file sizes of the scene
-    and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's cameras.
-    ``new_gains``: bounds of the expected gain of new views, dB; left out if a result is worse than the scene.
-    ``light``: show the scene itself in stills only.
+    ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes`` are the file sizes of the
+    scene and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's
+    cameras. ``new_gains`` are the bounds of the expected gain of new views, dB, by result; the gain of a result that is
+    worse than the scene is left out. If ``light``, the scene itself is shown in stills only.
     """
     stills: Stills = {}
 
     def add_still(result: str, split: str, view: int, image: np.ndarray) -> None:
+        """Keep a rendered view as an encoded still."""
         stills[result, split, view] = encode_still(to_picture(image))
 
     options = EvaluateOptions((LPIPS,) if lpips_available(LPIPS) else (), None, fog=False)
     evaluation = evaluate(scene, results, held_out, options, cameras=cameras, progress=progress, on_image=add_still)
     progress("the view from outside", 0, 0)
     with use_threads():
-        data = _collect(title, scene, results, file_bytes, held_out, evaluation, stills, light=light)
+        data = _fill_page(title, scene, results, file_bytes, held_out, evaluation, stills, light=light)
     progress("done", 0, 0)
     return _with_gains(data, new_gains or {})
 
 
-def _collect(
+def _fill_page(
     title: str,
     scene: Scene,
     results: Mapping[str, Gaussians],
@@ -150,7 +151,7 @@ def _collect(
     *,
     light: bool,
 ) -> ViewData:
-    """Make the content of a page from an evaluation and its stills; see :func:`collect_page_data`."""
+    """Collect the content of a page from an evaluation and its stills, without gains; see :func:`collect_page_data`."""
     pictures = photo_array(evaluation.pictures)
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
@@ -158,18 +159,18 @@ def _collect(
     scene_cameras = frame.enter_cameras(scene.cameras.numpy())
     split = "context" if held_out is None else "target"
     sides = [
-        _side(result, size, split, canonical[result.name], scene, scene_cameras, light=light)
+        _collect_side(result, size, split, canonical[result.name], scene, scene_cameras, light=light)
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
-    means = canonical[evaluation.results[:2][-1].name].means  # of the first result, or of the scene without results
+    means = canonical[evaluation.results[:2][-1].name].means  # of the first result; without results, of the scene
     splits: dict[str, SplitViews] = {"context": (scene.cameras.numpy(), pictures, scene.names)}
     if held_out is not None:
         splits["target"] = held_out.cameras.numpy(), held_out.images, held_out.names
-    views = _page_views(splits, evaluation, stills, frame, means)
-    shown = _shown(views)
-    outside = _outside_view(scene, named, frame, len(views))
-    measured_notes = evaluation.notes if results else ()  # they concern results
-    notes = (*measured_notes, *_limits(sides, len(shown), len(views)))
+    views = _list_views(splits, evaluation, stills, frame, means)
+    shown = _choose_shown(views)
+    outside = _draw_outside_view(scene, named, frame, len(views))
+    result_notes = evaluation.notes if results else ()  # notes of an evaluation concern results
+    notes = (*result_notes, *_list_limits(sides, len(shown), len(views)))
     covered_share, _ = evaluation.results[0].mean_covered("context")
     lacks_pixels = covered_share is not None and covered_share < WHOLE_SHARE
     agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
@@ -180,7 +181,10 @@ def _collect(
 
 
 def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> ViewData:
-    """Add the expected gains to the results; a result that shows its own photos worse than the scene has none."""
+    """Return the content with the expected gains of results; a result that is worse than the scene gets a note instead.
+
+    A result is worse if it shows the photos of the fit worse than the scene does.
+    """
     sides, notes = [], list[str]()
     for side in data.sides:
         gain = gains.get(side.name)
@@ -194,10 +198,10 @@ def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> Vie
     return replace(data, sides=tuple(sides), notes=(*data.notes, *notes))
 
 
-def _page_views(
+def _list_views(
     splits: Mapping[str, SplitViews], evaluation: Evaluation, stills: Stills, frame: Frame, means: np.ndarray
 ) -> list[PageView]:
-    """List the measured views of the splits; ``means [n,3]`` are canonical."""
+    """List the measured views of all splits; the canonical ``means [n,3]`` define how far away the scene is."""
     views: list[PageView] = []
     for split, (cameras, photos, names) in splits.items():
         encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
@@ -217,8 +221,8 @@ def _page_views(
     return views
 
 
-def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
-    """Draw Gaussians in a scene's world from outside its capture."""
+def _draw_outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
+    """Draw the scene and the results from outside the capture; ``named`` are their Gaussians in the scene's world."""
     camera, distance = outside_camera(scene.cameras.numpy(), named[INPUT].means)
     renders = (render(gaussians, camera, near=NEAR_PLANE * frame.unit) for gaussians in named.values())
     return PageView(
@@ -246,12 +250,13 @@ def encode_still(picture: BytePicture) -> bytes:
     return encode_picture(picture, webp_quality)
 
 
-def _pack(
+def _pack_side(
     gaussians: Gaussians, name: str, scene: Scene, cameras: Cameras, light: bool
 ) -> tuple[bytes | None, int, int]:
-    """Pack one side's Gaussians for the page; also return the SH degrees of the page and of the file.
+    """Pack one side's Gaussians for the page; return the bytes, and the SH degrees of the page and of the file.
 
-    Gaussians and ``cameras`` are canonical. In a ``light`` page the Gaussians of the scene itself are left out.
+    Gaussians and ``cameras`` are canonical. In a ``light`` page the Gaussians of the scene itself are left out, and the
+    bytes are None.
     """
     highest = highest_degree(gaussians.shN)
     if name != INPUT:
@@ -265,7 +270,7 @@ def _pack(
     return *pack_splats(gaussians, cameras, homes), highest
 
 
-def _side(
+def _collect_side(
     result: ResultScores,
     file_bytes: int,
     split: str,
@@ -275,18 +280,22 @@ def _side(
     *,
     light: bool,
 ) -> Side:
-    """Collect the data of one side of a page: scores and packed canonical Gaussians."""
-    packed = _pack(gaussians, result.name, scene, cameras, light)
+    """Collect the data of one side of a page: scores and packed Gaussians. Gaussians and cameras are canonical."""
+    packed = _pack_side(gaussians, result.name, scene, cameras, light)
     mean, covered = result.mean(split)[1], result.mean_covered(split)
     return Side(
         result.name, result.num_gaussians, file_bytes, mean, *packed, *covered, result.render_seconds
     )  # fmt: skip
 
 
-def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
-    """Choose at most ``MAX_SHOWN_VIEWS`` views and the worst view, by the scores of the first result, worst first."""
+def _choose_shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
+    """Choose ``MAX_SHOWN_VIEWS`` views and the worst view; return them worst first.
+
+    Views are compared by the scores of the first result, or of the scene without results.
+    """
 
     def quality(view: PageView) -> float:
+        """Return the PSNR of a view, or infinity without one."""
         score = view.scores[:2][-1].psnr
         return np.inf if score is None else score
 
@@ -295,8 +304,8 @@ def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
     return tuple(sorted((views[i] for i in sorted(ids)), key=quality))
 
 
-def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
-    """List the Gaussians, harmonics and views that the page leaves out."""
+def _list_limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
+    """Return notes on the Gaussians, harmonics and views that the page leaves out."""
     notes = []
     for side in sides:
         if side.num_gaussians > MAX_GAUSSIANS and side.splats is None:

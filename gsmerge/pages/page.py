@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Content security policy: a page may run only its own scripts and styles, which the policy names by their hashes
 PICTURES_POLICY = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
-# Spark decodes in WebAssembly and sorts in a worker; its text contains both as data: addresses
+# The 3D viewer Spark decodes in WebAssembly and sorts in a worker, which its script holds as data: and blob: addresses
 SOLID_POLICY = f"{PICTURES_POLICY} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY_MARK = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
@@ -35,18 +35,18 @@ MISSING = "-"  # replaces a missing figure
 def view_page(data: ViewData) -> bytes:
     """Make the HTML page of a scene and its results, in UTF-8."""
     has_photos = any(view.photo is not None for view in data.views)
-    sources = _sources(data, has_photos)
-    right = min(int(has_photos) + 1, len(sources) - 1)
+    sources = _list_sources(data, has_photos)
+    right = min(int(has_photos) + 1, len(sources) - 1)  # the first result, with the scene itself to its left
     left = max(right - 1, 0)
     pictures = [(view.photo, *view.stills)[not has_photos :] for view in data.shown]
     stills = [[None if picture is None else data_uri(picture, "image/webp") for picture in row] for row in pictures]
     start_stills = stills[data.start]
-    first = {source: start_stills[source] for source in (left, right)}  # in the HTML itself, to appear at once
+    first = {source: start_stills[source] for source in (left, right)}  # shown by the HTML itself, so they appear first
     start_stills[left] = start_stills[right] = None
 
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
-    result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # sides; a single scene counts as a result
-    results = [_result(data, i) for i in result_ids]
+    result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # sides that are results; a single scene is one
+    results = [_result_entry(data, i) for i in result_ids]
     by_size = sorted(result_ids, key=lambda i: data.sides[i].num_gaussians)
     own = reference_words(data)[1]
     page = render_template(
@@ -70,7 +70,7 @@ def view_page(data: ViewData) -> bytes:
             ],
             "sizes": [i + has_photos for i in by_size],
             "own": own,
-            "views": [_view(view) for view in data.shown],
+            "views": [_view_entry(view) for view in data.shown],
         },
         stills=stills,
         speed_words=speed_words(results[0]["speed"]),
@@ -81,8 +81,8 @@ def view_page(data: ViewData) -> bytes:
     return page.encode()
 
 
-def _sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:
-    """List the choices for the two sides of a page: the photos if there are any, and each scene."""
+def _list_sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:
+    """List what either side of a page can show: the photos if there are any, the scene itself, and each result."""
     picture = "own colours" if data.reference == ROW_COLORS else "photo"
     sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if has_photos else []
     return sources + [
@@ -93,16 +93,19 @@ def _sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _result(data: ViewData, place: int) -> dict[str, Any]:
-    """Return the headline, words and figures of a result."""
+def _result_entry(data: ViewData, place: int) -> dict[str, Any]:
+    """Return the headline, speed, words and figures of a result, for the template and the page's script."""
     return {
         "headline": _unbroken(headline(data, place)), "speed": speed(data, place), "words": size_words(data, place),
-        "figures": figures(data, place),
+        "figures": list_figures(data, place),
     }  # fmt: skip
 
 
 def headline(data: ViewData, place: int = 1) -> str:
-    """Return the headline of a result, its share of Gaussians and change of quality; for a single scene its size."""
+    """Return the headline of a result: its share of the Gaussians, and its change of quality.
+
+    The headline of a single scene has the number of Gaussians and the quality.
+    """
     before = data.sides[0]
     if len(data.sides) == 1:
         quality = before.mean.psnr
@@ -131,30 +134,30 @@ def describe_gain(low: float, high: float) -> str:
 
 
 def _closer_or_farther(gain: float) -> str:
-    """Return a gain (dB) as "closer" or "farther"."""
+    """Return a gain (dB) in words, such as "1.2 dB closer"."""
     return f"{abs(gain):.1f} dB {'closer' if gain >= 0 else 'farther'}"
 
 
 def agreement_words(data: ViewData) -> str:
-    """Describe the share of depth that other views confirm, or what would help if it is small."""
+    """Describe the share of the depth that other views confirm, or say what would help if the share is small."""
     if data.agreement is None:
         return ""
     return data.agreement.advice or f"{100 * data.agreement.confirmed:.0f} % of the depth is confirmed by other views"
 
 
 def speed(data: ViewData, place: int = 1) -> float | None:
-    """Return the ratio of the drawing times of the scene and a result on this processor; None for a single scene."""
+    """Return how many times faster a result draws than the scene, on this processor; None for a single scene."""
     if len(data.sides) == 1 or not data.sides[place].seconds:
         return None
     return round(data.sides[0].seconds / data.sides[place].seconds, 2)
 
 
 def speed_words(ratio: float | None) -> str:
-    """Return the end of the headline, rounded to one digit from 3 on; "" if a result is not clearly faster."""
+    """Return the end of the headline, which says how much faster a result draws; "" if it is not clearly faster."""
     min_ratio = 1.2  # the headline mentions a ratio of drawing times from this value on
     if ratio is None or ratio < min_ratio:
         return ""
-    times = f"about {float(f'{ratio:.1g}'):.0f}" if ratio >= 3 else f"{ratio:.1f}"
+    times = f"about {float(f'{ratio:.1g}'):.0f}" if ratio >= 3 else f"{ratio:.1f}"  # one digit from 3 on
     return f", {times}\u00a0\u00d7\u00a0faster to draw"
 
 
@@ -162,7 +165,7 @@ def size_words(data: ViewData, place: int) -> str:
     """Describe the size of a result: share, bytes, quality."""
     side = data.sides[place]
     share = human_share(side.num_gaussians / max(data.sides[0].num_gaussians, 1), 1)
-    quality = _number(side.mean.psnr, 1)
+    quality = _format_number(side.mean.psnr, 1)
     words = [share, human_bytes(side.file_bytes), *([f"{quality} dB"] if quality != MISSING else [])]
     return _unbroken(" · ".join(words))
 
@@ -172,13 +175,13 @@ class Figure:
     """A figure at the top of the page, for the scene itself and for a result."""
 
     label: str
-    old: str
-    new: str
+    old: str  # value of the scene itself
+    new: str  # value of the result
     mark: str  # CSS class: "up" if better than the scene, "own" if the figure is over photos of the fit, otherwise ""
 
 
-def figures(data: ViewData, place: int) -> list[Figure]:
-    """Collect the figures at the top of the page for one side: its size and mean quality."""
+def list_figures(data: ViewData, place: int) -> list[Figure]:
+    """List the figures at the top of the page for one side: its size, mean quality, and expected gain."""
     before, after = data.sides[0], data.sides[place]
     sizes = [
         Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", ""),
@@ -186,7 +189,7 @@ def figures(data: ViewData, place: int) -> list[Figure]:
     ]
     views, own = reference_words(data)
     is_expected = not data.held_out and any(side.new_gain for side in data.sides)
-    names = ("psnr",) if is_expected else ("psnr", "ssim")  # to leave room for the expected gain
+    names = ("psnr",) if is_expected else ("psnr", "ssim")  # the expected gain takes the room of the SSIM
     qualities = [(f"{name.upper()}, {views}", name, before.mean, after.mean) for name in names]
     if data.lacks_pixels:
         label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
@@ -204,32 +207,40 @@ def figures(data: ViewData, place: int) -> list[Figure]:
 
 
 def _score_figure(label: str, name: str, old: float | None, new: float | None, *, own: bool, is_result: bool) -> Figure:
-    """Format a mean score ``name`` of the scene and of one side."""
+    """Make the figure of a mean score: ``old`` of the scene itself, and ``new`` of one side.
+
+    ``own`` is True if the scores are over the photos of the fit, and ``is_result`` if the side is not the scene itself.
+    """
     digits, unit = (2, " dB") if name == "psnr" else (3, "")
     is_better = is_result and old is not None and new is not None and old < new
-    return Figure(label, _number(old, digits), _number(new, digits) + unit, "own" if own else "up" if is_better else "")
+    return Figure(
+        label,
+        _format_number(old, digits),
+        _format_number(new, digits) + unit,
+        "own" if own else "up" if is_better else "",
+    )
 
 
 def reference_words(data: ViewData) -> tuple[str, bool]:
-    """Describe the reference of the scores; also return whether it is the scene's own photos, used in the fit."""
+    """Return words for the reference of the scores, and True if it is the scene's own photos, which fits have seen."""
     if data.held_out:
         return "held-out photos", False
     return ("its own photos", True) if data.reference == PHOTOS else (data.reference, False)
 
 
 def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:
-    """Make the table of all results, head and rows, without columns that have no figure."""
+    """Return the head and the rows of the table of all results, without columns that have no figure."""
     first = data.sides[0]
     columns: dict[str, list[str]] = {
         "": [side.name for side in data.sides],
         "File": [human_bytes(side.file_bytes) for side in data.sides],
     }
     for head, name, digits in (("PSNR (dB)", "psnr", 2), ("SSIM", "ssim", 3), ("LPIPS", "lpips_alex", 3)):
-        columns[head] = [_number(getattr(side.mean, name), digits) for side in data.sides]
+        columns[head] = [_format_number(getattr(side.mean, name), digits) for side in data.sides]
     columns["Gaussians"] = [f"{side.num_gaussians:,}" for side in data.sides]
     columns["Share"] = [human_share(side.num_gaussians / max(first.num_gaussians, 1), 1) for side in data.sides]
     if data.lacks_pixels:
-        columns["PSNR, covered"] = [_number(side.covered.psnr, 2) for side in data.sides]
+        columns["PSNR, covered"] = [_format_number(side.covered.psnr, 2) for side in data.sides]
     filled = {head: cells for head, cells in columns.items() if set(cells) != {MISSING}}
     return list(filled), [list(row) for row in zip(*filled.values(), strict=True)]
 
@@ -239,24 +250,27 @@ def _unbroken(text: str) -> str:
     return text.replace(" dB", "\u00a0dB").replace(" %", "\u00a0%")
 
 
-def _number(value: float | None, digits: int) -> str:
+def _format_number(value: float | None, digits: int) -> str:
     """Format a number; a missing number and the infinite PSNR of equal pictures become ``MISSING``."""
     return MISSING if value is None or value == float("inf") else f"{value:.{digits}f}"
 
 
-def _view(view: PageView) -> dict[str, Any]:
+def _view_entry(view: PageView) -> dict[str, Any]:
     """Convert a view to JSON types for the page's script."""
     return {
         "name": view.name,
         "held_out": view.held_out,
         "outside": view.outside,
         **page_camera(view.camera, view.distance),
-        "scores": [[_finite(score.psnr), _finite(score.ssim), _finite(score.lpips_alex)] for score in view.scores],
+        "scores": [
+            [_round_finite(score.psnr), _round_finite(score.ssim), _round_finite(score.lpips_alex)]
+            for score in view.scores
+        ],
     }
 
 
 def page_camera(camera: Cameras, distance: float) -> dict[str, Any]:
-    """Convert a camera for a page's script: row-major world to camera, intrinsics in pixels, distance of the scene."""
+    """Convert a camera to JSON types for a page's script; ``distance`` is the distance of what it looks at."""
     return {
         "viewmat": camera.viewmats[0].reshape(-1).tolist(),
         "K": [float(camera.Ks[0, row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],
@@ -266,7 +280,7 @@ def page_camera(camera: Cameras, distance: float) -> dict[str, Any]:
     }
 
 
-def _finite(value: float | None) -> float | None:
+def _round_finite(value: float | None) -> float | None:
     """Round a number for JSON; the infinite PSNR of equal pictures becomes None."""
     return None if value is None or value == float("inf") else round(value, 4)
 
@@ -284,8 +298,8 @@ def base64_text(content: bytes) -> str:
 def render_template(name: str, policy: str, **values: Any) -> str:
     """Fill a template with values, which are escaped unless the template says otherwise.
 
-    ``policy`` is the page's content security policy, in which ``{script}`` and ``{style}`` are replaced by the hashes
-    of the page's elements.
+    ``policy`` is the page's content security policy. Its ``{script}`` and ``{style}`` become the hashes of the page's
+    scripts and styles.
     """
     text = _environment().get_template(name).render(version=__version__, **values)
     text = text.encode("utf-8", "replace").decode("utf-8")  # names of files may have lone surrogates
@@ -310,7 +324,7 @@ def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"bytes": human_bytes, "number": _number}
+    environment.filters |= {"bytes": human_bytes, "number": _format_number}
     dumps = partial(json.dumps, separators=(",", ":"), allow_nan=False)
     environment.policies["json.dumps_function"] = lambda value, **_: dumps(value)
     return environment

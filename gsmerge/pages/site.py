@@ -1,4 +1,4 @@
-"""Write a page with a viewer and a ``.sog`` in it; the camera stays near the viewpoints of photos."""
+"""Write a page that contains a viewer and a ``.sog``; its camera stays near the viewpoints of the photos."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ from gsmerge.photos.views import even_views
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
-# Only its own scripts; Spark has data: addresses and a worker in its text
+# Content security policy: only the page's own scripts run. The 3D viewer Spark has data: addresses and a worker in its
+# script
 SITE_POLICY = (
     "default-src 'none'; img-src data:; style-src {style}; script-src {script} blob: 'wasm-unsafe-eval';"
     " worker-src data: blob:; connect-src data: blob:"
 )
-NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}
+NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}  # of the files in the page
 MAX_VIEWPOINTS = 64  # largest number of viewpoints in the page
-LICENSED = ("spark", "three", "fflate")
+LICENSED = ("spark", "three", "fflate")  # parts of the viewer that have a licence
 
 
 def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> dict[Path, list[Path]]:
@@ -37,14 +38,13 @@ def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> 
 
 
 def least_bytes() -> int:
-    """Return the least number of bytes of a page without its Gaussians: the viewer as text, and the rest."""
-    # Least bytes of a page without viewer: scripts, licences, and picture and textures of one Gaussian
-    page_bytes = 43_000
+    """Return the least number of bytes of a page without its Gaussians."""
+    page_bytes = 43_000  # least bytes of scripts, licences, and the picture and textures of one Gaussian
     return int(4 / 3 * VIEWER.stat().st_size) + page_bytes
 
 
 def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
-    """Return the largest number of bytes that a page takes with any title."""
+    """Return the number of bytes of a page of these Gaussians with the longest possible title."""
     longest_title = 255  # bytes; a title is a file name
     return len(make_page(gaussians, cameras, "x" * longest_title, comments).encode())
 
@@ -57,11 +57,11 @@ def _read_licences() -> bytes:
 
 
 def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str]) -> str:
-    """Make a page. Without cameras viewpoints are placed, and the user may look from any side."""
+    """Make the HTML of a page. Without cameras, viewpoints are placed, and the user may look from any side."""
     expected = read_new_views(comments)
     is_free = len(cameras) == 0
     viewpoints = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
-    start = 0 if is_free else median_camera(viewpoints)  # the first placed viewpoint is outside
+    start = 0 if is_free else median_camera(viewpoints)  # the first of the placed viewpoints is outside the scene
     poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
     views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWPOINTS)), start})
     inside = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, comments)}

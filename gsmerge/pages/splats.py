@@ -1,4 +1,4 @@
-"""Pack Gaussians for a page: the numbers of a ``.spz`` as differences of rows, coarser for many Gaussians."""
+"""Pack Gaussians for a page, as the differences between rows of a ``.spz``; many Gaussians are stored less exactly."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ from gsmerge.types import SH_C0, Cameras, Gaussians
 
 MAX_GAUSSIANS = 2_000_000  # larger scenes have only stills, since a page gets too large and loads too slowly
 MAX_SPZ_BYTES = 40_000_000  # before compression; enough for 2 million Gaussians without harmonics
-COARSE_COUNT = 300_000  # more Gaussians are as small as pixels and may be less exact
-# Step sizes of the numbers of a .spz (opacity, colour, logarithm of the scale), and levels of half a turn's rotation.
-# With COARSE, pictures are at 50 dB from pictures of the exact scene
+COARSE_COUNT = 300_000  # Gaussians of larger scenes are as small as pixels and may be less exact
+# Step sizes of the numbers of a .spz (opacity, colour, logarithm of the scale), and number of levels of a rotation by
+# half a turn. With COARSE, pictures are at 50 dB from pictures of the exact scene
 EXACT, COARSE = ((1, 1, 1), 255), ((16, 2, 2), 31)
-PIXEL_PARTS, DEPTH_PARTS = 8, 1024  # steps of a shift per pixel, and of a log depth per unit, for rows of pixels
+PIXEL_PARTS, DEPTH_PARTS = 8, 1024  # steps per pixel of a shift within it, and steps per unit of a logarithm of depth
 
 
 def pack_splats(
     gaussians: Gaussians, cameras: Cameras | None = None, homes: np.ndarray | None = None
 ) -> tuple[bytes | None, int]:
-    """Pack the visible Gaussians with as many harmonics as fit; return bytes (None for too many rows) and SH degree.
+    """Pack the visible Gaussians with as many harmonics as fit; return the bytes and the degree of these harmonics.
+
+    The bytes are None, and the degree 0, if there are more than ``MAX_GAUSSIANS``.
 
     The bytes are a gzip stream of a line of JSON and of columns. A column has the numbers of a ``.spz`` in steps. Each
     number is the difference from the row before, with the sign as the lowest bit. All low bytes of a column come first,
@@ -74,7 +76,7 @@ def _num_harmonics(degree: int) -> int:
 
 
 def _camera_head(cameras: Cameras) -> dict[str, Any]:
-    """Describe the cameras in whose pixels positions are packed, for the line of JSON."""
+    """Describe the cameras whose pixels stand for positions, for the line of JSON."""
     poses = [
         {"viewmat": viewmat.reshape(-1).tolist(), "K": [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()]}
         for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True)
@@ -84,7 +86,7 @@ def _camera_head(cameras: Cameras) -> dict[str, Any]:
 
 
 def _pack_column(column: np.ndarray) -> tuple[int, bytes]:
-    """Pack a column ``[m]`` of numbers: the bytes per number, and the planes of low bytes, then of higher bytes."""
+    """Pack a column ``[m]``; return the bytes per number, and the low bytes of all numbers before the higher bytes."""
     size = max(1, -(-int(column.max(initial=0)).bit_length() // 8))
     return size, column.astype("<u4").view(np.uint8).reshape(-1, 4)[:, :size].T.tobytes()
 
@@ -99,7 +101,11 @@ def drawn_rows(gaussians: Gaussians) -> np.ndarray:
 
 
 def _pixel_positions(rows: np.ndarray, means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:
-    """Return pixels, shifts and log depths ``[4,m]`` of ``rows [m]`` with pixel ``ids [n]``; None if one is behind."""
+    """Return the positions of ``rows [m]`` relative to their pixels; ``ids [n]`` are the pixels of all rows.
+
+    Row 0 of the result ``[4,m]`` has the pixel, rows 1 and 2 the shift in it, row 3 the logarithm of the depth. None if
+    a Gaussian cannot be stored like this, as when it is behind its camera.
+    """
     positions = np.empty((4, len(rows)), np.uint32)
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     sizes = (cameras.width, cameras.height, PIXEL_PARTS, DEPTH_PARTS)

@@ -35,7 +35,7 @@ class Page:
     """A page in one file, which notebooks can show."""
 
     text: str  # HTML
-    headline: str
+    headline: str  # share of the Gaussians and change of quality, in words
 
     def __repr__(self) -> str:
         return f"Page({self.headline}, {human_bytes(len(self.text))})"
@@ -96,8 +96,8 @@ def view(
         'small.html'
     """
     with record_run(progress):
-        read = as_scene(scene).numpy()
-        shown = add_views(read, shown=True)
+        input_scene = as_scene(scene).numpy()
+        shown_scene = add_views(input_scene, shown=True)  # a scene without views gets some
     named = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
     files = {name: read_gaussians(path) for name, path in named.items() if isinstance(path, str | PathLike)}
     loaded: dict[str, Any] = {**named, **files}
@@ -108,14 +108,15 @@ def view(
         if (expected := getattr(getattr(result, "report", None), "new_views", None)) is not None
     }
     cameras = {
-        name: replace(shown.cameras, viewmats=moved.numpy().viewmats)
+        name: replace(shown_scene.cameras, viewmats=moved.numpy().viewmats)
         for name, result in named.items()
-        if (moved := getattr(result, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
+        if (moved := getattr(result, "cameras", None)) is not None
+        and len(moved) == len(shown_scene) == len(input_scene)
     }
-    max_solid = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
-    is_light = len(read.gaussians) > max_solid if light is None else light
+    max_solid = 600_000  # most Gaussians of a scene that is shown in 3D, 8 MB of a notebook
+    is_light = len(input_scene.gaussians) > max_solid if light is None else light
     data = collect_page_data(
-        scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
+        scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown_scene, gaussians,
         [_num_bytes(scene), *(_num_bytes(result) for result in loaded.values())], held_out,
         cameras=cameras, new_gains=gains, light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
@@ -129,7 +130,7 @@ def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, floa
 
 
 def _num_bytes(value: Any) -> int:
-    """Return the bytes of a scene's files, or of a file that was read; for other Gaussians, of a ``.ply`` of them."""
+    """Return the bytes of a scene's files, or of a file that was read; for other Gaussians, those of their ``.ply``."""
     if isinstance(value, GaussianFile):
         return value.info.file_bytes
     if isinstance(value, str | PathLike):

@@ -1,7 +1,7 @@
 """Compact a scene under bad conditions: with worse views, poses, photos or rows.
 
 A case defines how a scene is changed, which scenes it applies to, and the property that must hold. Every change returns
-a new scene, and also changes the views that results are compared with.
+a new scene, and moves the views that results are compared with along with it.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ Check = Literal["better", "same", "near", "once", "again"]
 
 UTM = (4.0e5, 5.0e6, 100.0)  # metres, as in map coordinates
 
-PROPERTIES: dict[Check, str] = {
-    "better": "not below its own input by more than {worse:g} dB",
-    "same": "as many Gaussians within 0.5 %, with those that no photo shows, not more than {same:g} dB below the "
-    "unchanged scene",
+PROPERTIES: dict[Check, str] = {  # of the result
+    "better": "not more than {worse:g} dB below its own input",
+    "same": "as many Gaussians as the unchanged scene within 0.5 %, counting those that no photo shows, and not more "
+    "than {same:g} dB below it",
     "near": "not more than {near:g} dB below the unchanged scene",
-    "once": "at most 1.05 times the Gaussians, not more than {same:g} dB below the unchanged scene",
+    "once": "at most 1.05 times the Gaussians of the unchanged scene, and not more than {same:g} dB below it",
     "again": "compacted again to the same count, not more than {same:g} dB below",
 }
 SEED = 7  # seed of all random choices
 MAX_WORSE = 0.1  # dB by which a result may be below its input
 MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that the result of a changed scene may lose compared with the unchanged scene
-SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference, and largest ratio, of counts
+SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # of counts: largest relative difference for "same", largest ratio for "once"
 _QUICK = EvaluateOptions(lpips=(), fog=False)
 
 
@@ -52,16 +52,16 @@ class StressScene:
     """A scene and the views that its results are compared with."""
 
     scene: Scene
-    views: Views | None  # held-out views in its world; None: its own views
+    views: Views | None  # held-out views in the scene's world; None: results are compared with the scene's own views
 
 
 def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> StressScene:
-    """Keep the views that ``choose(number of views)`` returns."""
+    """Keep the views whose numbers ``choose`` returns; it is called with the number of views."""
     return replace(setup, scene=subset(setup.scene, choose(len(setup.scene))))
 
 
-def move(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
-    """Scale the world by ``factor``, and shift it by ``shift`` in units of its own size."""
+def scale_and_shift(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
+    """Scale the world by ``factor``, and shift it by ``shift``, in units of the scaled scene's size."""
     scene, views = setup.scene, setup.views
     frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)
     scene = replace(scene, gaussians=frame.leave(scene.gaussians), cameras=frame.leave_cameras(scene.cameras))
@@ -69,7 +69,7 @@ def move(setup: StressScene, factor: float, shift: Sequence[float]) -> StressSce
 
 
 def perturb_poses(setup: StressScene, degrees: float) -> StressScene:
-    """Rotate every view with its Gaussians about the camera centre, by a random axis."""
+    """Rotate every view and its Gaussians about the view's camera centre and a random axis."""
     viewmats, rng = setup.scene.cameras.viewmats.astype(np.float64), np.random.default_rng(SEED)
     for viewmat in viewmats:
         axis = rng.normal(size=3)
@@ -78,7 +78,7 @@ def perturb_poses(setup: StressScene, degrees: float) -> StressScene:
 
 
 def change_exposure(setup: StressScene, share: float) -> StressScene:
-    """Make photos and their views' Gaussians alternately brighter and darker."""
+    """Make the photo and the Gaussians of every second view brighter by ``share``, and those of the others darker."""
     scene = setup.scene
     assert scene.images is not None
     gains = np.array([1 + share if view % 2 else 1 - share for view in range(len(scene))], np.float32)
@@ -91,9 +91,9 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
 
 
 def break_rows(setup: StressScene) -> StressScene:
-    """Break a random share of the rows, at least one, as if the file had NaN there."""
+    """Remove 1 % of the rows at random, at least one, as reading does with rows of a file that have NaN."""
     count = len(setup.scene.gaussians)
-    broken_share = 0.01  # share of the rows that become NaN
+    broken_share = 0.01  # share of the rows that are removed
     broken = np.random.default_rng(SEED).choice(count, max(1, round(broken_share * count)), replace=False)
     return replace(setup, scene=take_rows(setup.scene, np.delete(np.arange(count), broken)))
 
@@ -126,9 +126,9 @@ CASES: dict[str, Case] = {
         Case("poses-1", "poses 1 degree off", "better", "photos", partial(perturb_poses, degrees=1.0)),
         Case("poses-5", "poses 5 degrees off", "better", "photos", partial(perturb_poses, degrees=5.0)),
         Case("exposure", "exposure +-20 % by turns", "better", "photos", partial(change_exposure, share=0.2)),
-        Case("utm", "moved to map coordinates", "same", "anything", partial(move, factor=1.0, shift=UTM)),
-        Case("small", "scaled by 1e-4", "same", "anything", partial(move, factor=1e-4, shift=(0, 0, 0))),
-        Case("large", "scaled by 1e4", "same", "anything", partial(move, factor=1e4, shift=(0, 0, 0))),
+        Case("utm", "moved to map coordinates", "same", "anything", partial(scale_and_shift, factor=1.0, shift=UTM)),
+        Case("small", "scaled by 1e-4", "same", "anything", partial(scale_and_shift, factor=1e-4, shift=(0, 0, 0))),
+        Case("large", "scaled by 1e4", "same", "anything", partial(scale_and_shift, factor=1e4, shift=(0, 0, 0))),
         Case("broken", "1 % of the rows not finite", "near", "anything", break_rows),
         Case("again", "the result compacted once more", "again"),
     )
@@ -142,13 +142,13 @@ class StressOutcome:
     case: str  # name of the case
     words: str  # how the scene was changed
     wanted: str  # the property that must hold
-    held: bool | None  # True if it holds; None if the case does not apply to the scene
-    found: str  # the figures, or the reason why the case does not apply
+    held: bool | None  # True if the property holds; None if the case does not apply to the scene
+    found: str  # the measured figures, or the reason why the case does not apply
     seconds: float  # wall time
 
 
 @dataclass(frozen=True)
-class _Result:
+class _ScoredResult:
     """A compact result with its figures."""
 
     gaussians: Gaussians
@@ -183,7 +183,7 @@ def stress(
     report, slack = progress or (lambda *_: None), _fit_slack(options)
     limits = {"same": MAX_SAME + slack, "near": MAX_NEAR + slack, "worse": MAX_WORSE}
     setup = StressScene(scene, targets)
-    base = _run(setup, options)
+    base = _compact_and_score(setup, options)
     out = []
     for i, name in enumerate(names):
         case, start = CASES[name], time.perf_counter()
@@ -195,8 +195,13 @@ def stress(
     return tuple(out)
 
 
-def _check_case(case: Case, setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool | None, str]:
-    """Check if the property of a case holds; return the answer, None if the case does not apply, and the figures."""
+def _check_case(
+    case: Case, setup: StressScene, base: _ScoredResult, options: CompactOptions
+) -> tuple[bool | None, str]:
+    """Check if the property of a case holds.
+
+    Returns True if it holds, or None if the case does not apply; and the figures, or the reason why it does not apply.
+    """
     if case.needs != "anything" and not setup.scene.has_own_pixels:
         return None, "needs a Gaussian for each pixel"
     if case.needs == "photos" and setup.scene.images is None:
@@ -205,22 +210,25 @@ def _check_case(case: Case, setup: StressScene, base: _Result, options: CompactO
         if case.check == "again":
             return _check_again(setup, base, options)
         changed = setup if case.change is None else case.change(setup)
-        result = base if case.name == "unchanged" else _run(changed, options)
+        result = base if case.name == "unchanged" else _compact_and_score(changed, options)
     except (GsmergeError, ValueError) as error:  # a case that fails must not end the others
         return False, f"ended with: {error}"
     defect = _find_defect(result.gaussians, changed.scene)
     return (False, defect) if defect else _check_result(case, base, result, _fit_slack(options))
 
 
-def _run(setup: StressScene, options: CompactOptions) -> _Result:
-    """Compact a scene, and score the input and the result."""
+def _compact_and_score(setup: StressScene, options: CompactOptions) -> _ScoredResult:
+    """Compact a scene; return the result, and the PSNR of the input and of the result."""
     result = compact(setup.scene, options)
     count = len(result.gaussians) + result.report.choices.get("pruned", 0)
-    return _Result(result.gaussians, count, *_quality(setup, result.gaussians))
+    return _ScoredResult(result.gaussians, count, *_measure_psnr(setup, result.gaussians))
 
 
-def _quality(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
-    """Measure the PSNR (dB) of the input and of a result on the views; infinite if the input is the reference."""
+def _measure_psnr(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
+    """Measure the PSNR (dB) of the input and of a result on the views.
+
+    The input's PSNR is infinite if the views have no photos, because its own renders are then the reference.
+    """
     evaluation = evaluate(setup.scene, {"result": gaussians}, setup.views, replace(_QUICK, context=setup.views is None))
     split = "context" if setup.views is None else "target"
     before, after = (result.mean(split)[1].psnr for result in evaluation.results)
@@ -228,15 +236,18 @@ def _quality(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
 
 
 def _fit_slack(options: CompactOptions) -> float:
-    """Return the additional tolerance (dB) of results with these options."""
-    fit_slack = 1.0  # additional tolerance after a full fit, dB, since rounding changes thin structures by up to this
+    """Return the additional tolerance (dB) of results with these options, which is 0 without a full fit."""
+    fit_slack = 1.0  # dB; rounding changes the thin structures of a full fit, and the PSNR by up to this
     return fit_slack if options.fit.fit == "full" else 0.0
 
 
-def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:
-    """Compare a result with its own input, or with the result ``base`` of the unchanged scene."""
+def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack: float) -> tuple[bool, str]:
+    """Compare a result with its own input, or with the result ``base`` of the unchanged scene, as the case requires.
+
+    Returns True if the property holds, and the figures.
+    """
     figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
-    both = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
+    with_base = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
     if case.check == "better":
         if math.isinf(result.before):
             return True, f"{figures} against renders of the input"
@@ -246,16 +257,19 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
         "same": abs(result.count - base.count) <= max(1, SAME_COUNT * base.count),
     }
     max_loss = MAX_NEAR if case.check == "near" else MAX_SAME
-    return count_holds.get(case.check, True) and result.after >= base.after - max_loss - slack, both
+    return count_holds.get(case.check, True) and result.after >= base.after - max_loss - slack, with_base
 
 
-def _check_again(setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
-    """Compact the result as a new scene, to as many Gaussians as it has, and check that it does not get worse."""
+def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOptions) -> tuple[bool, str]:
+    """Compact the result ``base`` once more, to as many Gaussians as it has, and check that it does not get worse.
+
+    Returns True if it does not, and the figures.
+    """
     scene = setup.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)
     same_count = BudgetOptions(budget=len(base.gaussians))
     settings = replace(options, budget=same_count, decode=replace(options.decode, k=1))
-    after = _quality(setup, compact(unaligned, settings).gaussians)[1]
+    after = _measure_psnr(setup, compact(unaligned, settings).gaussians)[1]
     return after >= base.after - MAX_SAME - _fit_slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 
 

@@ -145,5 +145,5 @@ def test_drawing_alone(copied: Path, run: Run) -> None:
 def test_without_targets_it_is_said_which_photos_judge(small_copy: Path, tmp_path: Path, run: Run) -> None:
     args = ("--grid", "budget=5%", "--set", "fit=none", "--set", "lpips=none")
     done = run("lab", "chart", small_copy, "-o", tmp_path / "out", *args, code=0)
-    assert names(done.err, "without --targets", "judged", "view_001.png")
+    assert names(done.err, "without --targets", "scored", "view_001.png")
     assert "without --targets" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")

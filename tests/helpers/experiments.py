@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from gsmerge.kernels import elementary
-from gsmerge.research.charts.measure_run import RunRecord, describe
+from gsmerge.research.charts.measure_run import RunRecord, describe_run
 
 SCENES = ("apples", "fern", "fox")
 LEVELS = {"apples": 2.0, "fern": 0.0, "fox": -3.0}  # how hard a scene is, dB
@@ -25,7 +25,7 @@ def make_record(scene: str, method: str, settings: dict[str, Any] | None = None)
         "lpips_vgg_target_visible": 0.8 - quality / 50,
         "psnr_context": quality + 2,
     }
-    label, seconds = describe(method, settings), 0.0 if method == "input" else 6 * (ratio / 0.044) ** 0.2
+    label, seconds = describe_run(method, settings), 0.0 if method == "input" else 6 * (ratio / 0.044) ** 0.2
     return RunRecord(
         scene, label, f"{scene} {label}", method, settings, 12_000, round(12_000 * ratio), 800, seconds, scores
     )

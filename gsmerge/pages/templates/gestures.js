@@ -1,19 +1,19 @@
 "use strict";
-// Keys, pointers and wheel: the swipe and the zoom of stills, turning and moving in 3D.
+// Keys, pointers and wheel: they swipe and zoom stills, and turn and move the camera in 3D.
 
 const MODES = { 1: "swipe", 2: "side", 3: "blink", 4: "difference" };
 const TOGGLED = { solid: ["", "1"], shape: ["splats", "points"], frustums: ["", "1"] };
-const FLIGHT = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // right, up, ahead
-const SPEED = 0.5; // distances to what is looked at, in a second
+const FLIGHT = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // direction by key: right, up, ahead
+const SPEED = 0.5; // flight in a second, in distances of the target
 const [MOST_ZOOM, CLICK_ZOOM, KEY_ZOOM] = [16, 3, 1.25];
-const WHEEL = 0.0015; // of a logarithm for a pixel of the wheel
-const LINE = 33; // such pixels
-const PINCH = 6; // as many for one where fingers on a touchpad zoom
-const TWICE = 500; // milliseconds, the longest of a double click
-const flying = new Set(); // the keys that are down
-let haste = 1; // times the speed
+const WHEEL = 0.0015; // change of the logarithm of the zoom for each pixel of the wheel
+const LINE = 33; // pixels of the wheel in a line of it
+const PINCH = 6; // factor on the pixels of the wheel when two fingers zoom on a touchpad
+const TWICE = 500; // longest time of a double click, milliseconds
+const flying = new Set(); // keys of the flight that are down
+let haste = 1; // factor on the speed
 
-// Enlarges stills; what lies at a place of a pane, in shares of it, stays there.
+// Enlarges stills. The point at a place of a pane, which is given in shares of it, does not move.
 function zoomTo(scale, place = [0.5, 0.5]) {
   const zoom = clamp(scale, 1, MOST_ZOOM);
   const centre = state.centre.map((at, i) => at + (place[i] - 0.5) * (1 / state.zoom - 1 / zoom));
@@ -31,7 +31,7 @@ function centreOn(centre) {
   showZoom();
 }
 
-// The pane below a pointer, its size, and where in it the pointer is, in shares.
+// Returns the source of the pane below a pointer, the pane's size, and the place of the pointer in shares of the pane.
 function paneAt({ clientX, clientY }) {
   const stageBox = stage.getBoundingClientRect();
   const [x, y] = [(clientX - stageBox.left) / stageBox.width, (clientY - stageBox.top) / stageBox.height];
@@ -48,7 +48,7 @@ function toggle(name) {
   const inSolidOnly = name === "shape" || name === "frustums";
   const values = TOGGLED[name];
   const after = values.map((_, i) => values[(values.indexOf(state[name]) + 1 + i) % values.length]);
-  const next = after.find((value) => value === "" || !isGrey(name, value)); // off is always possible
+  const next = after.find((value) => value === "" || !isGrey(name, value)); // "" (off) is always possible
   if (name === "solid" ? solid : !inSolidOnly || state.solid) set(name, next === undefined ? state[name] : next);
 }
 
@@ -67,7 +67,7 @@ function frameScene() {
   if (source !== undefined) solid.frameAll(source);
 }
 
-// Turns about what is seen below the pointer from now on.
+// Makes the point that is seen below the pointer the target, about which the camera then turns.
 function turnAbout(event) {
   const { source, place } = paneAt(event);
   const drawn = [source, state.right, state.left].find((one) => inSolid(one));
@@ -100,7 +100,7 @@ function takeOff(key, fast) {
 function onKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.target.tagName)) return;
   const key = event.key.toLowerCase();
-  const letter = event.code.replace("Key", "").toLowerCase(); // where W, A, S and D are on other keyboards
+  const letter = event.code.replace("Key", "").toLowerCase(); // by place, so that other keyboards have the keys of W, A, S and D
   const arrow = (dx, dy, otherwise) => () => (event.shiftKey && !state.solid ? shift(0.1 * dx, 0.1 * dy) : otherwise());
   const actions = {
     arrowleft: arrow(1, 0, () => swipeTo(state.at - 0.02)), arrowright: arrow(-1, 0, () => swipeTo(state.at + 0.02)),
@@ -148,8 +148,8 @@ function listen() {
   listenToPointers();
 }
 
-// The handle, or anywhere in whole stills: the swipe. Elsewhere one finger turns in 3D and shifts enlarged stills; two
-// zoom and shift in both.
+// Dragging the handle, or any place of whole stills, moves the swipe. Elsewhere one finger turns the camera in 3D and
+// shifts enlarged stills. Two fingers zoom and shift in both.
 function listenToPointers() {
   const pointers = new Map();
   let [swiping, pressed, before] = [false, -TWICE, state.at];
@@ -180,7 +180,7 @@ function listenToPointers() {
   for (const name of ["pointerup", "pointercancel"]) stage.addEventListener(name, (event) => pointers.delete(event.pointerId));
   stage.addEventListener("contextmenu", (event) => event.preventDefault());
   stage.addEventListener("touchstart", (event) => {
-    if (event.touches.length > 1) event.preventDefault(); // which would scroll the page
+    if (event.touches.length > 1) event.preventDefault(); // two fingers do not scroll the page
   }, { passive: false });
   stage.addEventListener("dblclick", (event) => {
     if (event.target === id("back")) return;
@@ -191,7 +191,7 @@ function listenToPointers() {
   stage.addEventListener("wheel", onWheel, { passive: false });
 }
 
-// At a whole picture the wheel's other direction scrolls the page.
+// Zooms with the wheel. While stills are whole, turning it towards smaller pictures scrolls the page.
 function onWheel(event) {
   const by = WHEEL * clamp(event.deltaY * (event.deltaMode ? LINE : 1) * (event.ctrlKey ? PINCH : 1), -240, 240);
   if (!state.solid && state.zoom === 1 && by > 0) return;
@@ -214,7 +214,7 @@ function drag(last, event, other) {
 
 function dragStill(last, event, other) {
   const { width, height } = paneAt(event);
-  const share = other ? 0.5 : 1; // of two fingers each moves the picture by half
+  const share = other ? 0.5 : 1; // each of two fingers moves the picture by half of its own way
   if (other) {
     const between = { clientX: (event.clientX + other.clientX) / 2, clientY: (event.clientY + other.clientY) / 2 };
     zoomTo((state.zoom * apart(event, other)) / apart(last, other), paneAt(between).place);

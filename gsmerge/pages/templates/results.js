@@ -1,11 +1,11 @@
 "use strict";
-// The chosen result: headline, figures, table, strip; and the scores of a view.
+// Shows the chosen result in the headline, the figures, the table and the strip, and shows the scores of a view.
 
-const FIRST_RESULT = Number(data.photos) + Number(data.results.length < data.sources.length - Number(data.photos)); // among the sources
-const FASTER = 1.2; // times, from which on the headline says it
+const FIRST_RESULT = Number(data.photos) + Number(data.results.length < data.sources.length - Number(data.photos)); // index of the first result among the sources
+const FASTER = 1.2; // the headline mentions a ratio of drawing times from this value on
 const times = new Map(); // milliseconds of a frame in 3D, by source
 const number = (value, digits) => (value === null ? "-" : value.toFixed(digits));
-// What a picture shows, for those who cannot see it.
+// Returns the role of a source, for the text that describes its picture to those who cannot see it.
 const roleOf = (source) => {
   if (data.photos && source === 0) return "photo";
   if (source < FIRST_RESULT) return "before";
@@ -32,7 +32,7 @@ function showNumbers() {
   id("scores").replaceChildren(...rows);
 }
 
-// What stands about the picture, for one of the results.
+// Shows a result in the parts of the page around the picture.
 function showResult(source) {
   state.result = source;
   const { headline, figures, speed } = data.results[source - FIRST_RESULT];
@@ -54,14 +54,14 @@ function showScore(line, named) {
   line.replaceChildren(`${number(before, 1)} → `, make("b", `${number(after, 1)} dB`, { className: (after || 0) < (before || 0) ? "down" : data.own ? "own" : "" }));
 }
 
-// The end of the headline.
+// Shows at the end of the headline how much faster a result draws, if it is clearly faster.
 function showSpeed(ratio, by = "As drawn by the processor that made this page") {
   const isFaster = ratio !== null && ratio >= FASTER;
   id("speed").textContent = isFaster ? `, ${ratio >= 3 ? `about ${Number(ratio.toPrecision(1))}` : ratio.toFixed(1)}\u00a0×\u00a0faster to draw` : "";
   id("speed").title = isFaster ? by : "";
 }
 
-// Where this device draws both scenes in 3D, their frames say how much faster the result is.
+// Measures on this device how much faster the result draws than the input, if both are in 3D.
 function measureSpeed() {
   const input = FIRST_RESULT - 1;
   if (!solid || solid.software || data.sizes[0] === input || ![input, state.result].every((source) => solid.has(source))) return;
@@ -82,7 +82,7 @@ function markResult() {
   for (const row of id("results").rows) row.setAttribute("aria-current", String(Number(row.dataset.result) === state.result));
 }
 
-// A result on the right, and beside it what stood there.
+// Shows a result on the right side. If the left side shows it already, the left side gets the input.
 function choose(source) {
   if (state.left === source) pick("left", FIRST_RESULT - 1);
   pick("right", source);
@@ -93,7 +93,7 @@ function pick(side, source) {
   set(side, source);
 }
 
-// The views from the worst of the chosen result, or as the input has them; the one from outside comes last.
+// Orders the views from the worst of the chosen result on, or as in the input. The view from outside comes last.
 function orderStrip() {
   const quality = (card) => scoreOf(data.views[card.dataset.view], state.result)[0] ?? Infinity;
   const place = (card) => Number(card.dataset.place);
@@ -104,7 +104,7 @@ function orderStrip() {
   id("strip").lastElementChild.style.order = data.views.length + Math.max(...measured.map(place));
 }
 
-// The view that many cards further along the strip.
+// Shows the view that is `count` cards further along the strip.
 function step(count) {
   const cards = [...id("strip").children].sort((a, b) => a.style.order - b.style.order);
   const at = cards.findIndex((card) => Number(card.dataset.view) === state.view);

@@ -1,24 +1,24 @@
 "use strict";
-// 3D: one canvas, one camera, a scene for each result. Frames are drawn on request only.
+// The 3D view: one canvas, one camera, and a scene for each result. A frame is drawn only when it is requested.
 
-const FEWER = 0.5; // of the pixels per side: while the camera moves and frames take long, and without a GPU
+const FEWER = 0.5; // share of the pixels per side that are drawn without a GPU, and while the camera moves if frames are slow
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i; // names of renderers that draw on the processor
-const SLOW_FRAME = 90; // milliseconds
-const FRAMES = 7; // of which the median counts
+const SLOW_FRAME = 90; // milliseconds from which on a frame is slow
+const FRAMES = 7; // number of frames whose median time is measured
 const REST = 160; // milliseconds without a movement after which the camera is at rest
-const SOLID = 0.1; // least opacity of Gaussians that points and the frame count
-const FRAMED = 0.8; // of the Gaussians are in the picture: what lies far behind would make it small
-const GAIN_POINTS = 1.6; // pixels of the screen per point
-// Spark leaves out Gaussians whose centre is far outside the picture, for their footprints grow without bounds there.
-// gsmerge, like gsplat, draws them with the footprint of a direction 15 % outside.
-const EVERYWHERE = 1e6; // half pictures from the middle
+const SOLID = 0.1; // least opacity of the Gaussians that are shown as points, or that frameAll brings into the picture
+const FRAMED = 0.8; // share of the Gaussians that frameAll brings into the picture, since some may lie far away
+const GAIN_POINTS = 1.6; // side of a point, pixels of the screen
+// Spark leaves out Gaussians whose centre is far outside the picture, since their footprints grow without bounds there.
+// gsmerge, like gsplat, draws them with the footprint of a direction 15 % outside the picture.
+const EVERYWHERE = 1e6; // distance from the picture's middle up to which Spark draws Gaussians, in half pictures
 const FOOTPRINT = "vec2 J2 = -(J1 * viewCenter.xy) * invZ;";
 const BOUNDED_FOOTPRINT = `vec2 seen = clamp(clipCenter.xy / clipCenter.w, -1.3, 1.3);
   vec2 principal = vec2(projectionMatrix[2][0], projectionMatrix[2][1]);
   vec2 J2 = J1 * (seen + principal) / vec2(projectionMatrix[0][0], projectionMatrix[1][1]);`;
 const COLORS = { input: [1, 0.78, 0.28], held: [0.42, 0.78, 1], current: [1, 1, 1] };
 
-// Bytes of a script element that holds them in base64; the element's text is given up.
+// Returns the bytes that a script element holds in base64, and removes the element to free memory.
 function takeBytes(name) {
   const element = document.getElementById(name);
   const text = element.textContent.trim();
@@ -35,7 +35,8 @@ async function gunzip(bytes) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// Runs the compressed script of the renderer, which its WebAssembly follows; its exports are then in `Vendor`.
+// Unpacks and runs the script of the renderer, whose exports are then in `Vendor`. A zero byte and the renderer's
+// WebAssembly follow the script.
 async function loadVendor(packed) {
   const bytes = await gunzip(packed);
   const end = bytes.indexOf(0);
@@ -51,7 +52,8 @@ async function loadVendor(packed) {
 }
 
 class SplatView {
-  // `frame()` says what is to be drawn; `onMove` and `onSettle` hear of camera and sorting.
+  // `frame()` returns what is to be drawn. `onMove` is called when the camera moves, and `onSettle` with true when camera
+  // and sorting are at rest.
   constructor(canvas, views, frame, onMove, onSettle) {
     Object.assign(this, { canvas, views, frame, onMove, onSettle });
     const options = { canvas, antialias: false, alpha: true, powerPreference: "high-performance" };
@@ -63,7 +65,7 @@ class SplatView {
     this.camera = new Vendor.PerspectiveCamera(60, 1, 0.01, 1000);
     this.camera.matrixAutoUpdate = false;
     this.results = new Map();
-    this.version = 0; // of the camera
+    this.version = 0; // number of changes of the camera
     this.queued = false;
     this.moving = false;
     this.slow = false;
@@ -82,7 +84,7 @@ class SplatView {
   async add(source, fileBytes, fileName = "scene.spz") {
     const mesh = new Vendor.SplatMesh({ fileBytes, fileName });
     await mesh.initialized;
-    // As gsmerge's own renderer: sorted by depth, 0.3 square pixels of low-pass, nothing below 1/255
+    // Like gsmerge's own renderer: sorting by depth, a low-pass filter of 0.3 square pixels, no opacities below 1/255
     const spark = new Vendor.SparkRenderer({
       renderer: this.renderer, autoUpdate: false, sortRadial: false, preBlurAmount: 0.3, blurAmount: 0,
       maxStdDev: Math.sqrt(2 * Math.log(255)), minAlpha: 1 / 255, maxPixelRadius: 4096, clipXY: EVERYWHERE, onDirty: () => this.request(),
@@ -90,7 +92,7 @@ class SplatView {
     if (!spark.material.vertexShader.includes(FOOTPRINT)) throw new Error("another renderer than expected");
     spark.material.vertexShader = spark.material.vertexShader.replace(FOOTPRINT, BOUNDED_FOOTPRINT);
     const pane = spark.uniforms.renderSize.value;
-    spark.onBeforeRender = (...values) => { // which would take the whole canvas for the size of the picture
+    spark.onBeforeRender = (...values) => { // Spark assumes that the picture has the size of the whole canvas
       Vendor.SparkRenderer.prototype.onBeforeRender.apply(spark, values);
       if (!this.renderer.xr.isPresenting) pane.set(this.pane[2], this.pane[3]);
     };
@@ -99,7 +101,7 @@ class SplatView {
     this.results.set(source, { mesh, spark, scene, version: -1, busy: false, points: null });
   }
 
-  // Exactly the camera of a view: roll, principal point and both focal lengths.
+  // Takes exactly the camera of a view, with its roll, principal point and both focal lengths.
   look(index) {
     this.view = this.views[index];
     this.current = index;
@@ -129,7 +131,7 @@ class SplatView {
     this.request();
   }
 
-  // Turns about the target: `dx` about the scene's up, `dy` about the picture's right; in radians.
+  // Turns the camera about the target, by `dx` radians about the scene's up and `dy` about the picture's right.
   orbit(dx, dy) {
     const about = (axis, angle) => {
       const there = new Vendor.Matrix4().makeTranslation(this.target.x, this.target.y, this.target.z);
@@ -142,7 +144,7 @@ class SplatView {
     this.moved();
   }
 
-  // Shifts by shares of the picture's width and height.
+  // Shifts the picture by shares of its width and height.
   pan(dx, dy) {
     const distance = column(this.camera.matrix, 3).distanceTo(this.target);
     const shift = column(this.camera.matrix, 0).multiplyScalar((-dx * distance * this.view.width) / this.view.K[0]);
@@ -151,12 +153,12 @@ class SplatView {
     this.place(column(this.camera.matrix, 3).add(shift));
   }
 
-  // Moves to `factor` times the distance from the target.
+  // Moves the camera to `factor` times its distance from the target.
   dolly(factor) {
     this.place(column(this.camera.matrix, 3).sub(this.target).multiplyScalar(factor).add(this.target));
   }
 
-  // Moves by multiples of the distance from the target, which comes along.
+  // Moves the camera and the target, by multiples of the distance between them.
   fly(right, up, ahead) {
     const centre = column(this.camera.matrix, 3);
     const distance = centre.distanceTo(this.target);
@@ -165,7 +167,7 @@ class SplatView {
     this.place(centre.add(shift));
   }
 
-  // Steps to where most of a scene is in the picture, looking as before, and turns about its middle from then on.
+  // Moves the camera until most of a scene is in the picture, without turning it. The scene's middle becomes the target.
   frameAll(source) {
     const places = [[], [], []];
     this.results.get(source).mesh.forEachSplat((_, centre, scales, turn, opacity) => {
@@ -181,7 +183,8 @@ class SplatView {
     this.place(this.target.clone().addScaledVector(column(this.camera.matrix, 2), distance));
   }
 
-  // The point seen at a place of the picture, in shares of it: where half of the light is stopped; null where it is not.
+  // Returns the point that is seen at a place of the picture, which is given in shares of it: the depth at which half of
+  // the light is stopped. Returns null if less than half is stopped.
   pointAt(source, x, y) {
     const { width, height, K: [fx, fy, cx, cy] } = this.view;
     const ray = new Vendor.Vector3((x * width - cx) / fx, (cy - y * height) / fy, -1);
@@ -192,7 +195,7 @@ class SplatView {
       point.copy(centre).applyMatrix4(toCamera);
       const depth = -point.z;
       if (depth <= this.camera.near) return;
-      const size = (scales.x + scales.y + scales.z) / 3 + depth / fx; // at least a pixel
+      const size = (scales.x + scales.y + scales.z) / 3 + depth / fx; // a pixel more, so that thin Gaussians are hit
       const off = Math.hypot(point.x - ray.x * depth, point.y - ray.y * depth) / size;
       if (off < 3) met.push([depth, opacity * Math.exp(-off * off / 2)]);
     });
@@ -227,7 +230,7 @@ class SplatView {
     requestAnimationFrame(() => this.draw());
   }
 
-  // Brings a result's order and colours up to the camera, one pass at a time.
+  // Sorts and colours a result for the current camera; only one pass runs at a time.
   async refresh(result) {
     if (result.busy || result.version === this.version) return;
     result.busy = true;
@@ -237,7 +240,7 @@ class SplatView {
     this.request();
   }
 
-  // Before the first frame is shown.
+  // Sorts and colours all results before the first frame is shown.
   async prepare() {
     for (const result of this.results.values()) await this.refresh(result);
   }
@@ -262,17 +265,18 @@ class SplatView {
     this.onSettle(!this.moving && results.every((result) => !result.busy && !result.spark.dirty));
   }
 
-  // Milliseconds of a frame with one result, the median of several; what the screen shows stays.
+  // Returns the milliseconds of a frame of one result, the median of several; afterwards the screen shows the same as
+  // before.
   frameTime(source) {
     const [context, pixel, whole] = [this.renderer.getContext(), new Uint8Array(4), [0, 0, 1, 1]];
     const times = Array.from({ length: FRAMES + 1 }, () => {
       const start = performance.now();
       this.drawPane({ source, box: whole, clip: whole }, { shape: "splats" });
-      context.readPixels(0, 0, 1, 1, context.RGBA, context.UNSIGNED_BYTE, pixel); // waits for it
+      context.readPixels(0, 0, 1, 1, context.RGBA, context.UNSIGNED_BYTE, pixel); // waits until the frame is drawn
       return performance.now() - start;
     });
     this.draw();
-    return times.slice(1).sort((a, b) => a - b)[FRAMES >> 1]; // the first prepares
+    return times.slice(1).sort((a, b) => a - b)[FRAMES >> 1]; // without the first frame, which also prepares the renderer
   }
 
   drawPane(pane, frame) {
@@ -323,7 +327,7 @@ class SplatView {
     return result.points;
   }
 
-  // Pyramids in front of every camera; the current one last, in white.
+  // Draws a pyramid in front of every camera, and that of the current one in white.
   frustums() {
     this.helpers.clear();
     const distances = this.views.map((view) => view.distance).sort((a, b) => a - b);
@@ -350,7 +354,7 @@ class SplatView {
   }
 }
 
-// Camera to world, with the picture's up as y and towards the viewer as z, as WebGL has it.
+// Returns the camera-to-world matrix of a view with WebGL's axes: y points up, and z towards the viewer.
 function poseOf(view) {
   const pose = new Vendor.Matrix4().set(...view.viewmat).invert();
   return pose.multiply(new Vendor.Matrix4().makeScale(1, -1, -1));
@@ -367,7 +371,7 @@ function geometry(places, colors) {
   return made;
 }
 
-// Colours as they are, in sRGB, in front of everything that was drawn before.
+// Returns a material that draws sRGB colours unchanged. Lines (size 1) are in front of all that was drawn before.
 function flatMaterial(size) {
   return new Vendor.ShaderMaterial({
     uniforms: { size: { value: size } },

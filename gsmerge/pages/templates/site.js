@@ -1,28 +1,29 @@
 "use strict";
-// A published scene: its files are in the page or beside it, and the camera stays where photos stood.
+// The page of a published scene, which contains all files. The camera stays near the places of the photos.
 
 const id = (name) => document.getElementById(name);
 const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const [SCENE, VR] = ["scene", "immersive-vr"];
-const METRES = 2; // in VR, to what is looked at
-// Shares of the distance of what photos show: how far the camera may leave their hull, what it looks at that of what
-// they show, and how near it may come to that
+const METRES = 2; // distance of the target in VR
+// In distances of the photos' cameras from their targets: how far the camera may be outside the hull of these cameras, how
+// far its target may be outside the hull of their targets, and how near the camera may come to its target
 const [AROUND, BESIDE, NEAREST] = [0.1, 0.15, 0.25];
-const MOST_LENS = 5; // times the focal length, where the camera can go no nearer
+const MOST_LENS = 5; // largest factor on the focal length, which grows when the camera can come no nearer
 const DIRECTIONS = [-1, 0, 1].flatMap((x) => [-1, 0, 1].flatMap((y) => [-1, 0, 1].map((z) => [x, y, z]))).filter((one) => one.some(Boolean));
-const ROUNDS = 12; // in which a point is brought into all half spaces of a hull
+const ROUNDS = 12; // rounds over all half spaces of a hull to bring a point into them
 const [TURN, KEY_TURN, KEY_FACTOR, STRIDE, WHEEL] = [2.5, 0.06, 1.15, 0.04, 0.0015];
-const WALKS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // right, up, ahead
+const WALKS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // direction by key: right, up, ahead
 let site = null; // the 3D view, once it is there
 
-// Half spaces around points, each moved outwards: a direction, and how far one may go along it.
+// Returns the half spaces that contain points and a margin around them. Each is a direction and the largest coordinate
+// along it.
 function hullOf(points, margin) {
   const vectors = DIRECTIONS.map((one) => new Vendor.Vector3(...one).normalize());
   return vectors.map((along) => [along, margin + Math.max(...points.map((point) => point.dot(along)))]);
 }
 
-// Brings a point into a hull; returns whether it was outside.
+// Moves a point into a hull; returns true if it was outside.
 function pullInto(hull, point) {
   let moved = false;
   for (let round = 0; round < ROUNDS; round++) {
@@ -52,7 +53,7 @@ class SiteView extends SplatView {
     this.moved();
   }
 
-  // The picture of the first camera covers the stage.
+  // Chooses the focal length with which the picture of the first camera covers the stage.
   fit() {
     const first = this.views[data.start];
     const { width, height } = this.frame();
@@ -61,7 +62,7 @@ class SiteView extends SplatView {
     this.changed();
   }
 
-  // Looks at the target from a place that is allowed, with the scene's up.
+  // Moves camera and target to places that are allowed, and makes the camera look at the target, with the scene's up.
   moved() {
     const place = column(this.camera.matrix, 3);
     if (!data.free) {
@@ -81,7 +82,7 @@ class SiteView extends SplatView {
     this.fit();
   }
 
-  // Comes nearer by a factor: the camera as far as it may, and its lens for the rest.
+  // Comes nearer by a factor. The camera moves as far as it may, and the focal length does the rest.
   nearer(factor) {
     if (factor < 1 && this.lens > 1) {
       const lens = Math.max(1, this.lens * factor);
@@ -94,7 +95,8 @@ class SiteView extends SplatView {
     this.fit();
   }
 
-  // Times the distance from the target at which the way back leaves the hull; beyond, it would be pulled to the side.
+  // Returns how many times its distance from the target the camera may have, straight back. At larger distances it would
+  // leave the hull, and be pulled to the side.
   farthest() {
     if (data.free) return Infinity;
     const place = column(this.camera.matrix, 3);
@@ -104,10 +106,10 @@ class SiteView extends SplatView {
   }
 
   request() {
-    if (!this.renderer.xr.isPresenting) super.request(); // which the headset does itself
+    if (!this.renderer.xr.isPresenting) super.request(); // a headset requests frames itself
   }
 
-  // Into a headset: its wearer stands where the camera is, upright, with what it looks at a few metres ahead.
+  // Shows the scene in a headset. Its wearer stands upright at the camera's place, with the target a few metres ahead.
   async enter() {
     const session = await navigator.xr.requestSession(VR);
     const { scene, mesh, spark } = this.results.get(SCENE);

@@ -1,10 +1,10 @@
 "use strict";
-// The Gaussians of the page, as numbers that take few bytes, to a file that the renderer reads.
+// Converts the page's packed Gaussians to a file that the renderer reads.
 
-const [SPZ, HEADER] = [0x5053474e, 16]; // first word of a .spz, bytes of its header
-const BLOCK = 65535; // most bytes of a block that is not compressed
+const [SPZ, HEADER] = [0x5053474e, 16]; // first word of a .spz, and number of bytes of its header
+const BLOCK = 65535; // most bytes of an uncompressed block of a gzip stream
 
-// The .spz of what pages/splats.py packs, in a gzip stream that is not compressed.
+// Returns the .spz of Gaussians that gsmerge/pages/splats.py has packed, as an uncompressed gzip stream.
 async function unpackSplats(packed) {
   const bytes = await gunzip(packed);
   const end = bytes.indexOf(10);
@@ -16,7 +16,7 @@ async function unpackSplats(packed) {
   [SPZ, 3, count].forEach((value, i) => numbers.setUint32(4 * i, value, true));
   raw.set([degree, fraction], 12);
   let from = end + 1;
-  const columns = sizes.map((size) => { // sums of differences, whose sign is the lowest bit
+  const columns = sizes.map((size) => { // a number is the sum of all differences up to it; their lowest bit is the sign
     const column = new Int32Array(count);
     for (let row = 0, sum = 0; row < count; row++) {
       let value = 0;
@@ -54,7 +54,7 @@ async function unpackSplats(packed) {
   return new Uint8Array(await new Blob(blocks).arrayBuffer());
 }
 
-// For rows of pixels: fixed-point places of depths and shifts within the pixel.
+// Returns a function from a row to its fixed-point position, for rows that store a pixel, a shift in it and a depth.
 function pixelPlaces({ cameras, width, height, parts, fraction }, [ids, rights, downs, depths]) {
   const unit = 2 ** fraction;
   return (row) => {
@@ -68,7 +68,7 @@ function pixelPlaces({ cameras, width, height, parts, fraction }, [ids, rights, 
   };
 }
 
-// The word of a .spz for a rotation: which of xyzw is largest, and the others with 9 bits and a sign.
+// Returns the word of a .spz for a rotation: 2 bits for the largest of xyzw, then a sign and 9 bits for each other one.
 function rotationWord(plane) {
   const square = plane.reduce((sum, value) => sum + value * value, 0);
   const quat = [...plane.map((value) => (2 * value) / (1 + square)), (1 - square) / (1 + square)];
@@ -81,7 +81,7 @@ function rotationWord(plane) {
   return word >>> 0;
 }
 
-// CRC-32
+// Returns the CRC-32 of bytes.
 function checksum(bytes) {
   const table = Uint32Array.from({ length: 256 }, (_, byte) => {
     for (let i = 0; i < 8; i++) byte = byte & 1 ? (byte >>> 1) ^ 0xedb88320 : byte >>> 1;

@@ -1,24 +1,24 @@
 "use strict";
-// What is shown, and where. Results (results.js) and gestures (gestures.js) change it; 3D (scene.js), which may never
-// come, draws it.
+// Decides what is shown, and where. results.js and gestures.js change this state. scene.js draws it in 3D, but some
+// browsers never load it.
 
 const id = (name) => document.getElementById(name);
 const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
   view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
-  order: "worst", overlay: 0, other: false, from: data.start, // the view before the step back
+  order: "worst", overlay: 0, other: false, from: data.start, // `from` is the view before the step back
   atCamera: true, left: 0, right: 0, scheme: "",
-  result: 0, zoom: 1, centre: [0.5, 0.5], // of the stills: what lies in the middle, in shares of the picture
+  result: 0, zoom: 1, centre: [0.5, 0.5], // `centre` is the point of the stills in the middle, in shares of the picture
 };
-const BLINK = 700; // milliseconds
-const SOFTWARE_MOST = 150000; // Gaussians: 2 seconds a frame on a processor
-const PIXELS = 8; // of the screen for one of a still, from which on they are drawn as squares
-const QUIET = 1000; // milliseconds after which a 3D that has come is measured
-const NARROW = 640; // pixels of the stage, below which sides go one above the other
-let stills = null; // per view the pictures of every source; those that are seen first are in the page itself
-let solid = null; // the 3D view, once it is there
-let blinking = 0; // the timer
+const BLINK = 700; // milliseconds that each side is shown
+const SOFTWARE_MOST = 150000; // most Gaussians that are drawn without a GPU, where a frame takes 2 seconds
+const PIXELS = 8; // pixels of the screen per pixel of a still, from which on these are drawn as squares
+const QUIET = 1000; // milliseconds from the start of 3D to the measurement of its speed
+const NARROW = 640; // on a stage of fewer pixels, sides are one above the other
+let stills = null; // pictures of every source, for each view; the page's HTML has those that are seen first
+let solid = null; // the 3D view, once it is loaded
+let blinking = 0; // timer of the blinking
 let chosen = false; // whether the reader has chosen stills or 3D
 
 const clamp = (value, least, most) => Math.max(least, Math.min(most, value));
@@ -27,16 +27,16 @@ const inSolid = (source) => Boolean(state.solid && solid && solid.has(source));
 
 const stillOf = (source) => (stills ? stills[state.view][source] : null);
 
-// Whether a source can be seen from here; the photos cannot once the camera has moved, nor what 3D has not taken in.
+// Returns whether a source can be seen from here. Once the camera has moved, only what is in 3D can be seen.
 const isThere = (source) => inSolid(source) || (state.atCamera && (!stills || Boolean(stillOf(source))));
 
-// What a side shows: its source, or the other side's where it has nothing to show from here.
+// Returns the source that a side shows: its own, or the other side's if its own cannot be seen from here.
 function shownAt(side) {
   const [own, other] = side === "left" ? [state.left, state.right] : [state.right, state.left];
   return isThere(own) || !isThere(other) ? own : other;
 }
 
-// Which of the sides are seen, and where: shares of the stage from its top left corner.
+// Returns the sides that are seen, and their boxes in shares of the stage from its top left corner.
 function panes() {
   const whole = [0, 0, 1, 1];
   const [left, right, at] = [shownAt("left"), shownAt("right"), state.at];
@@ -67,7 +67,7 @@ function frame() {
   };
 }
 
-// As large as the window allows from where the stage begins, so that its lower edge is seen without scrolling.
+// Makes the stage as large as the window allows, so that its lower edge is seen without scrolling.
 function fitStage() {
   const { width, height } = view();
   const side = state.mode === "side";
@@ -78,7 +78,7 @@ function fitStage() {
   stage.style.setProperty("--above", `${Math.ceil(above)}px`);
 }
 
-// Stills only: 3D goes nearer instead.
+// Shows the zoom of stills; in 3D the camera comes nearer instead.
 function showZoom() {
   const zoom = state.solid ? 1 : state.zoom;
   const [x, y] = state.centre.map((at) => `${100 * (0.5 - zoom * at)}%`);
@@ -90,7 +90,7 @@ function showZoom() {
   id("back").textContent = state.atCamera ? `${zoom.toFixed(1)} × · whole picture` : "Back to the view";
 }
 
-// Lays the photo over a side.
+// Lays a photo over a side, with an opacity.
 function lay(layer, address, opacity) {
   layer.hidden = !address || opacity === 0;
   if (layer.hidden) return;
@@ -140,7 +140,7 @@ function show() {
   if (solid && state.solid) solid.request();
 }
 
-// Greys out what has no effect now, and says why; what is about 3D alone is there with it.
+// Greys out controls that have no effect now, with the reason; hides the controls of 3D unless 3D is shown.
 function showLimits() {
   const away = !state.atCamera ? "From a view's camera only: press R" : state.mode === "difference" ? "Not over a difference" : "";
   const none = solid ? "" : id("status").textContent || "3D is not there yet";
@@ -159,7 +159,7 @@ function grey(control, reason) {
   control.title = reason || "";
 }
 
-// To the camera of a view, exactly.
+// Moves to exactly the camera of a view.
 function jump(index) {
   state.view = clamp(index, 0, data.views.length - 1);
   state.atCamera = true;
@@ -177,7 +177,7 @@ function jump(index) {
   show();
 }
 
-// Outside of the capture, and back to the view before.
+// Moves to the view from outside the capture, or back to the view before.
 function stepBack() {
   if (!view().outside) state.from = state.view;
   zoomTo(1);
@@ -208,11 +208,11 @@ function toggleFull() {
   else if (document.fullscreenEnabled) stage.parentElement.requestFullscreen().catch((error) => say(error.message));
 }
 
-// The strip, when the stills have come.
+// Fills the strip of views, once the stills are loaded.
 function startStrip() {
   stills = JSON.parse(id("stills").textContent);
   stills[data.start] = stills[data.start].map((still, source) => still || inPage.get(source) || null);
-  const shown = Number(!data.photos && data.sources.length > 1); // without photos the result, not its reference
+  const shown = Number(!data.photos && data.sources.length > 1); // without photos, cards show the result and not the input
   for (const card of id("strip").children) {
     const still = stills[card.dataset.view].find((one, i) => one && i >= shown);
     if (still) card.querySelector("img").src = still;
@@ -225,7 +225,7 @@ function say(words) {
   showLimits();
 }
 
-// Takes in what the sides show; without a GPU nothing that would take minutes for a frame.
+// Loads the Gaussians that the sides show into 3D; without a GPU, only small scenes.
 async function load(made) {
   for (const source of [state.left, state.right]) {
     const { splats, count } = data.sources[source];
@@ -241,7 +241,7 @@ async function startScene() {
   if (!window.DecompressionStream || !probe.getContext("webgl2")) return say("Stills only: this browser has no WebGL 2");
   say("3D loads …");
   const painted = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
-  await painted().then(painted); // the first still comes first
+  await painted().then(painted); // so that the first still appears before 3D is loaded
   try {
     await loadVendor(takeBytes("engine"));
     const moved = () => {

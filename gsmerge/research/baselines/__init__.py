@@ -13,12 +13,12 @@ from gsmerge.settings.setting import flat_settings
 
 FULL_FIT_SETTINGS = ("effort", "poses", *(name for name in flat_settings(FitOptions) if name != "fit"))
 
-_baseline = partial(Method, prepare=partial(prepare, fill=False))  # with only the Gaussians of the file
+_baseline = partial(Method, prepare=partial(prepare, fill=False))  # works on the Gaussians of the file alone
 
 UNMERGED = _baseline("unmerged", simple.unmerged, uses=())
 UNMERGED_FIT = _baseline("unmerged-fit", simple.unmerged_fit, needs_photos=True, uses=FULL_FIT_SETTINGS)
 MOMENT_MATCHING = _baseline("moment-matching", simple.match_moments)
 OPACITY = _baseline("opacity", simple.prune_faintest)
 RANDOM = _baseline("random", simple.prune_at_random)
-GREEDY = _baseline("greedy", greedy.run)
+GREEDY = _baseline("greedy", greedy.reduce_to_count)
 SPLAT_TRANSFORM = _baseline("splat-transform", simple.splat_transform, check=find_program)

@@ -58,7 +58,7 @@ def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
 
 
 def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
-    """List each pair of near neighbours once: lower row, higher row, cost."""
+    """List each pair of near neighbours once; return the lower rows, the higher rows, and the costs."""
     from scipy.spatial import cKDTree
 
     with use_threads() as threads:
@@ -67,10 +67,11 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
     nearest = nearest.astype(np.int32)
 
     def chunk_pairs(start: int) -> tuple[Ints, Ints, Floats]:
+        """List the pairs of the rows from ``start`` on; a pair of mutual neighbours is listed by its lower row."""
         chunk = nearest[start : start + CHUNK_GAUSSIANS]
         rows = np.repeat(np.arange(start, start + len(chunk)), chunk.shape[1])
         neighbors = chunk.reshape(-1).astype(np.int64)
-        candidates = (neighbors <= rows).nonzero()[0]  # the row itself, or pairs that the lower row may list too
+        candidates = (neighbors <= rows).nonzero()[0]  # may be the row itself, or a pair that the lower row lists too
         is_repeat = (nearest[neighbors[candidates]] == rows[candidates, None]).any(1)
         keep = np.ones(len(rows), bool)
         keep[candidates[is_repeat | (neighbors[candidates] == rows[candidates])]] = False
@@ -85,9 +86,9 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Ints:
     """Choose at most ``limit`` disjoint pairs greedily, by ascending cost ``[m]``.
 
-    A pair that is the cheapest pair of both its members is always chosen. So all such pairs are chosen at once, and the
-    search is repeated among the remaining pairs. Of pairs with equal costs the first counts as cheaper. Returns indices
-    of pairs, by ascending cost.
+    A pair that is the cheapest pair of both its Gaussians is always chosen. So all such pairs are chosen at once, and
+    the search is repeated among the remaining pairs. Of pairs with equal costs the first counts as cheaper. Returns
+    indices of pairs, by ascending cost.
     """
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))
@@ -129,7 +130,7 @@ def merge_greedily(gaussians: Gaussians, count: int) -> Gaussians:
     return replace(merged, opacities=opacities)
 
 
-def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+def reduce_to_count(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Merge to exactly ``count`` Gaussians; return the input if it has at most ``count``."""
     gaussians = prepared.scene.file_gaussians
     if len(gaussians) <= count:

@@ -29,7 +29,7 @@ def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Run the full fit on the input without merging, with the steps or time of gsmerge's own fit, for comparison.
+    """Run the full fit on the unmerged input, with the steps or time of gsmerge's own fit.
 
     Gaussians that no photo shows are replaced by new ones, so their number does not change; ``count`` is ignored.
     """
@@ -56,9 +56,9 @@ def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Merge each superpixel into one Gaussian without matching across views: the paper's "Mom. Match.".
 
-    All views have equally many superpixels, up to one. Empty superpixels are left out. A Gaussian has the
-    opacity-weighted mean and covariance of the members' means (eq. teacher_mean, teacher_cov). The paper states no
-    opacity, so the members' mean opacity is used.
+    Views differ by at most one in their number of superpixels. Empty superpixels are left out. A Gaussian has the
+    opacity-weighted mean and covariance of the means of its members (eq. teacher_mean, teacher_cov). The paper states
+    no opacity, so the members' mean opacity is used.
     """
     scene = prepared.scene
     quotient, remainder = divmod(count, len(scene))  # the first views have one superpixel more
@@ -74,7 +74,7 @@ def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge with PlayCanvas' splat-transform, an installed program: ``-d COUNT`` on the CPU, with its own defaults.
+    """Merge with PlayCanvas' splat-transform, which must be installed: ``-d COUNT`` on the CPU, with its own defaults.
 
     The input is returned if it has at most ``count`` Gaussians. Nothing is downloaded. The measured time includes the
     start of the program, but not the transfer of Gaussians.

@@ -1,4 +1,4 @@
-"""Make a self-contained HTML file with tables, figures and commands, and a table of all runs."""
+"""Make the two summaries of a folder of runs: an HTML page with tables and figures, and a CSV table of all runs."""
 
 from __future__ import annotations
 

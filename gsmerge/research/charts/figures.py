@@ -83,13 +83,13 @@ def make_figures(results: Results) -> list[Chart]:
     time = "Quality against time", "the wall time of the merge (reading and writing not counted)", "Seconds"
     size = "Quality against size", "the share of the input's Gaussians that is kept", "Gaussians kept (%)"
     figures = [
-        _against(results, "seconds", "quality-seconds", *time),
-        _against(results, "percent", "quality-ratio", *size),
+        _plot_against(results, "seconds", "quality-seconds", *time),
+        _plot_against(results, "percent", "quality-ratio", *size),
     ]
     return [figure for figure in figures if figure is not None]
 
 
-def _against(results: Results, cost: str, name: str, title: str, described: str, label: str) -> Chart | None:
+def _plot_against(results: Results, cost: str, name: str, title: str, described: str, label: str) -> Chart | None:
     """Plot quality against a cost, with a panel for each metric and a table of all points; None without lines."""
     panels = []
     for metric in results.metrics:
@@ -102,7 +102,7 @@ def _against(results: Results, cost: str, name: str, title: str, described: str,
     if not panels:
         return None
     rows = [
-        (panel.y_label, line.name, point.label, f"{point.x:.4g}", *_numbers(point.y))
+        (panel.y_label, line.name, point.label, f"{point.x:.4g}", *_format_interval(point.y))
         for panel in panels
         for line in panel.lines
         for point in line.points
@@ -125,14 +125,17 @@ def _describe_scenes(panel: Panel) -> str:
     )
 
 
-def _numbers(interval: Interval) -> list[str]:
-    """Write a mean, and the ends of its interval if there are enough scenes."""
+def _format_interval(interval: Interval) -> list[str]:
+    """Format a mean and the ends of its interval; the ends are empty if there are too few scenes."""
     ends = [interval.low, interval.high] if interval.count >= MIN_SCENES else []
     return [f"{value:.5g}" for value in (interval.mean, *ends)] + [""] * (2 - len(ends))
 
 
 def draw_figures(figures: Sequence[Chart], folder: Path) -> dict[str, bytes]:
-    """Draw figures as ``NAME.png`` and ``NAME.svg``; equal numbers give equal bytes. Return the SVG by name."""
+    """Draw figures to ``NAME.png`` and ``NAME.svg`` in a folder, and return the SVGs by name.
+
+    Equal numbers give equal bytes.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     names = dict.fromkeys((line.name, line.is_own) for f in figures for panel in f.panels for line in panel.lines)
     drawn, styles = {}, line_styles(names)
@@ -150,11 +153,11 @@ def draw_figures(figures: Sequence[Chart], folder: Path) -> dict[str, bytes]:
     return drawn
 
 
-Style = dict[str, Any]  # arguments of a line
+Style = dict[str, Any]  # arguments of matplotlib for a line
 
 
 def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
-    """Make a style for each line by name; gsmerge's own lines are broader and in front."""
+    """Choose a style for each line, by its name; gsmerge's own lines are broader and in front."""
     styles: dict[str, Style] = {INPUT: {"color": "#555555", "ls": (0, (2, 2)), "marker": "s", "lw": 1.0, "zorder": 2}}
     for i, (name, is_own) in enumerate(line for line in names if line[0] != INPUT):
         dash = DASHES[i // len(LINE_COLORS) % len(DASHES)]
@@ -166,11 +169,11 @@ def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
 def draw_curves(figure: Chart, styles: Mapping[str, Style]) -> Drawing:
     """Draw a figure's panels side by side, with one legend beside them."""
     num_panels = len(figure.panels)
-    key_width, key_line = 2.3, 0.135  # width of the legend, and height of its lines, inches
-    width = (SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels) + key_width
+    legend_width, legend_line = 2.3, 0.135  # width of the legend, and height of its lines, inches
+    width = (SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels) + legend_width
     names = list(dict.fromkeys(line.name for panel in figure.panels for line in panel.lines))
     names += [INPUT] * (INPUT not in names and any(panel.reference is not None for panel in figure.panels))
-    size = width, max(PANEL_HEIGHT, key_line * len(names))
+    size = width, max(PANEL_HEIGHT, legend_line * len(names))
     drawing = Drawing(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.08))
     all_axes = np.atleast_1d(drawing.subplots(1, num_panels))
     for axes, panel in zip(all_axes, figure.panels, strict=True):

@@ -15,15 +15,15 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions
 from gsmerge.research.charts.lines import SIZE_SETTINGS
-from gsmerge.research.charts.measure_run import ChartScene, RunRecord, describe
+from gsmerge.research.charts.measure_run import ChartScene, RunRecord, describe_run
 from gsmerge.scene.content_hash import content_hash, digest, fill_template, list_files, list_photos, scene_name
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.setting import flat_settings
 from gsmerge.version import __version__
 
-OF_ALL = ("seed", "threads")  # settings that all methods use
-SettingGrid = Mapping[str, Sequence[Any]]  # values by the name of a setting
-GridRun = tuple[ChartScene, RunRecord, CompactOptions]
+COMMON_SETTINGS = ("seed", "threads")  # used by all methods
+SettingGrid = Mapping[str, Sequence[Any]]  # the values of each setting, by the setting's name
+GridRun = tuple[ChartScene, RunRecord, CompactOptions]  # scene, record without results, options
 
 
 def parse_grid(pairs: Sequence[str]) -> SettingGrid:
@@ -31,15 +31,15 @@ def parse_grid(pairs: Sequence[str]) -> SettingGrid:
     grid: dict[str, list[Any]] = {}
     for pair in pairs:
         name, _, text = pair.partition("=")
-        values = [parse_cell(part.strip()) for part in text.split(",") if part.strip()]
+        values = [parse_value(part.strip()) for part in text.split(",") if part.strip()]
         if name not in flat_settings(CompactOptions) or name in grid or not values:
             raise UsageError(f"--grid {pair}: expected a setting of compact, each once, with values: NAME=A,B")
         grid[name] = values
     return grid
 
 
-def parse_cell(text: str) -> Any:
-    """Parse a number, true or false; other text stays."""
+def parse_value(text: str) -> Any:
+    """Parse a number, true or false; return any other text as it is."""
     try:
         return json.loads(text)
     except ValueError:
@@ -49,9 +49,9 @@ def parse_cell(text: str) -> Any:
 def list_settings(grid: SettingGrid, fixed: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     """List (method, settings) of every run on one scene, the unmerged input first.
 
-    Budgets and superpixels stand next to each other; other lists are multiplied. ``fixed`` settings hold for all runs.
-    Baselines get the settings that they use. Raises UsageError if a method or setting is unknown or impossible, or if
-    a program is missing.
+    Each run has one budget or one number of superpixels, and every such size is combined with all values of the other
+    settings. ``fixed`` settings hold for all runs. Baselines get the settings that they use. Raises UsageError if a
+    method or setting is unknown or impossible, or if a program is missing.
     """
     sizes = [{name: value} for name in SIZE_SETTINGS for value in grid.get(name, ())] or [{}]
     others = {name: values for name, values in grid.items() if name not in (*SIZE_SETTINGS, "method")}
@@ -61,22 +61,24 @@ def list_settings(grid: SettingGrid, fixed: Mapping[str, Any]) -> list[tuple[str
         for size, *values in product(sizes, *others.values()):
             settings = {**size, **dict(zip(others, values, strict=True))}
             settings |= {name: value for name, value in fixed.items() if name not in settings}
-            settings = {name: value for name, value in settings.items() if uses is None or name in (*uses, *OF_ALL)}
-            runs.setdefault(describe(method, settings), (method, settings))
+            settings = {
+                name: value for name, value in settings.items() if uses is None or name in (*uses, *COMMON_SETTINGS)
+            }
+            runs.setdefault(describe_run(method, settings), (method, settings))
     return list(runs.values())
 
 
 def options_of(method: str, settings: Mapping[str, Any]) -> CompactOptions:
-    """Make the options of a run, with all Gaussians that are asked for; UsageError if a setting is invalid."""
+    """Make the options of a run, which uses all of its budget; UsageError if a setting is invalid."""
     try:
-        choice = {} if method in (OURS, INPUT) else {"method": method}
-        return CompactOptions().with_settings({"fill": True, **settings, **choice})
+        baseline = {} if method in (OURS, INPUT) else {"method": method}
+        return CompactOptions().with_settings({"fill": True, **settings, **baseline})
     except ValueError as error:
         raise UsageError(str(error)) from error
 
 
 def find_sources(arguments: Sequence[str], out: Path, targets: str | None = None) -> list[ChartScene]:
-    """Find scenes as ``gsmerge batch`` does, and hash all files of each.
+    """Find scenes as ``gsmerge batch`` does, and hash the files of each.
 
     ``targets`` are the cameras of held-out views: one path for all scenes, or a template with ``{scene}`` (as given),
     ``{parent}`` (its folder) and ``{stem}`` (its name without extension). Raises SceneError if a file is missing, and
@@ -108,10 +110,10 @@ def make_runs(
     sources: Sequence[ChartScene], grid: SettingGrid, fixed: Mapping[str, Any], measured: EvaluateOptions
 ) -> list[GridRun]:
     """Make the runs of a grid, scene by scene; UsageError if a setting is invalid."""
-    asked = [(method, settings, options_of(method, settings)) for method, settings in list_settings(grid, fixed)]
+    combinations = [(method, settings, options_of(method, settings)) for method, settings in list_settings(grid, fixed)]
     runs = []
-    for source, (method, settings, options) in product(sources, asked):
-        depends = {"scene": source.sha256, "method": method, "settings": settings, "measured": asdict(measured)}
-        key = digest({**depends, "tool_version": __version__})
-        runs.append((source, RunRecord(source.name, describe(method, settings), key, method, settings), options))
+    for source, (method, settings, options) in product(sources, combinations):
+        facts = {"scene": source.sha256, "method": method, "settings": settings, "measured": asdict(measured)}
+        key = digest({**facts, "tool_version": __version__})
+        runs.append((source, RunRecord(source.name, describe_run(method, settings), key, method, settings), options))
     return runs

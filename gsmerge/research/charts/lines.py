@@ -16,7 +16,7 @@ from gsmerge.settings.compact import OURS
 
 CONFIDENCE = 0.95  # confidence of the intervals
 MIN_SCENES = 3  # least number of scenes of an interval; with two scenes an interval is too wide to be useful
-MIN_SHARE = 0.5  # share of the scenes that every point of a line must have
+MIN_SHARE = 0.5  # least share of the scenes that every point of a line has
 SIZE_SETTINGS = ("budget", "superpixels")  # settings that define the number of Gaussians
 PARTS = {  # views and pixels over which scores are averaged; the most meaningful first
     "target_visible": "held-out views, pixels that the input views see",
@@ -24,7 +24,7 @@ PARTS = {  # views and pixels over which scores are averaged; the most meaningfu
     "context_visible": "input views, pixels that they see",
     "context": "input views",
 }
-ByScene = Mapping[str, tuple[float, float]]  # x and y of each scene
+ByScene = Mapping[str, tuple[float, float]]  # x and y of a point for each scene
 LineKey = tuple[str, tuple[tuple[str, Any], ...]]  # method, settings without the size
 K = TypeVar("K")
 
@@ -68,7 +68,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Line:
-    """Points of one method with fixed settings, over sizes."""
+    """The points of one method with fixed settings, one point for each size."""
 
     name: str  # method and settings
     is_own: bool  # True for gsmerge, False for a baseline
@@ -78,7 +78,7 @@ class Line:
 def mean_interval(values: Sequence[float]) -> Interval:
     """Compute the mean of at least one value with its two-sided t interval (Student 1908).
 
-    With few scenes it is wide; with two it has 12.7 standard errors to each side.
+    The interval is wide for few values: with two it reaches 12.7 standard errors to each side.
     """
     if not len(values):
         raise ValueError("expected at least one value, got none")
@@ -91,10 +91,10 @@ def mean_interval(values: Sequence[float]) -> Interval:
 
 
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
-    """Compute confidence intervals of the columns of ``values [scenes, conditions]``, with scene differences removed.
+    """Compute confidence intervals of the columns of ``values [scenes, conditions]``, without the scenes' differences.
 
     Scenes differ by several dB, but conditions by tenths. So plain intervals would hide the effect of conditions.
-    Here the mean of every scene is subtracted first (Cousineau 2005), and the interval is corrected for that (Morey
+    Here the mean of every scene is subtracted first (Cousineau 2005), and the intervals are corrected for that (Morey
     2008).
     """
     num_scenes, num_conditions = values.shape
@@ -124,7 +124,7 @@ def size_label(record: RunRecord) -> str:
 
 
 def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
-    """Name every line by its method and the settings in which the lines of the method differ."""
+    """Name every line by its method, and by the settings in which the method's lines differ from each other."""
     names = {}
     for method, settings in keys:
         variants = [dict(other) for name, other in keys if name == method]
@@ -188,10 +188,10 @@ def make_lines(records: Sequence[RunRecord], x: str, y: str) -> list[Line]:
             cells.setdefault((line_key(record), size_label(record)), {})[record.scene] = float(cost), value
     common = keep_common({cell: set(points) for cell, points in cells.items()})
     by_cell = {cell: {s: xy for s, xy in cells[cell].items() if s in scenes} for cell, scenes in common.items()}
-    intervals = _intervals(list(by_cell.values()))
+    intervals = _cell_intervals(list(by_cell.values()))
     points: dict[LineKey, list[Point]] = {}
     for ((key, size), by_scene), interval in zip(by_cell.items(), intervals, strict=True):
-        costs = [cost for cost, _ in by_scene.values()]  # their geometric mean, which is exact if all are equal
+        costs = [cost for cost, _ in by_scene.values()]  # below, equal costs are not averaged, which would round them
         mean_cost = costs[0] if min(costs) == max(costs) else float(np.exp(np.mean(np.log(costs))))
         points.setdefault(key, []).append(Point(size, mean_cost, interval, by_scene))
     names = line_names(list(points))
@@ -211,10 +211,10 @@ def keep_common(scenes: Mapping[K, set[str]]) -> dict[K, set[str]]:
     return {name: common or scene_names for name, scene_names in covering.items()}
 
 
-def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Compute an interval for each column, with scene differences removed.
+def _cell_intervals(columns: Sequence[ByScene]) -> list[Interval]:
+    """Compute an interval of y for each cell, without the scenes' differences.
 
-    If columns differ in their scenes, intervals have the width 0.
+    If cells differ in their scenes, intervals have the width 0.
     """
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]

@@ -1,4 +1,4 @@
-"""Run one setting of a grid on a scene: merge it, or keep it unmerged, and score the result; a line of JSON each."""
+"""Run one setting of a grid on a scene, and score the result; the records of runs are lines of a JSON file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene, Views
 
 RUNS = "runs.jsonl"  # in the folder of a grid
-HELD_OUT_NOTE = "without --targets no run sees these photos, by which all are judged"
+HELD_OUT_NOTE = "without --targets, these photos are hidden from all runs, which are scored on them"
 SCORING = ("score", "input")  # stages of a run that only measure
 
 
@@ -33,7 +33,7 @@ class ChartScene:
     path: Path  # the ``.ply``, or its folder
     name: str  # short name, unique in a grid
     targets: Path | None  # cameras of held-out views
-    sha256: str  # hash of all files that are read
+    sha256: str  # hash of all files of the scene and of its held-out views
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ class RunRecord:
         return getattr(self, name) if name in ("count", "bytes", "seconds", "percent") else self.scores.get(name)
 
 
-def describe(method: str, settings: Mapping[str, Any]) -> str:
+def describe_run(method: str, settings: Mapping[str, Any]) -> str:
     """Describe a run in a few words: method and settings."""
     return ", ".join([method, *(f"{name} {value}" for name, value in settings.items())])
 
 
 def read_runs(folder: Path) -> list[RunRecord]:
-    """Read the newest record of each run in a folder; damaged lines, and those of other versions, are passed over."""
+    """Read the newest record of each run in a folder; skip damaged lines, and lines of other versions."""
     runs: dict[tuple[str, str], RunRecord] = {}
     for _, line in each_line(folder / RUNS):
         if line is not None and line.keys() == RunRecord.__dataclass_fields__.keys():
@@ -83,7 +83,10 @@ def read_runs(folder: Path) -> list[RunRecord]:
 
 
 def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, measured: EvaluateOptions) -> RunRecord:
-    """Merge a scene and measure the result; ``record`` has what is known before."""
+    """Merge a scene, measure the result, and return the completed record.
+
+    ``record`` names the scene, the method and the settings. With the method ``INPUT`` the scene itself is measured.
+    """
     scene, held_out, notes = load_source(source)
     if record.method == INPUT:
         gaussians, seconds = scene.file_gaussians, 0.0
@@ -104,17 +107,23 @@ def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, 
 
 @lru_cache(maxsize=1)
 def load_source(source: ChartScene) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
-    """Read a scene with its held-out views, once for consecutive runs."""
+    """Read a scene and its held-out views, and return them with notes; consecutive runs share what was read.
+
+    The held-out views are those of ``targets``, otherwise some of the scene's own, which it then loses.
+    """
     load = load_files(find_scene_files(source.path))
     if source.targets is not None:
         return load.scene, read_held_out(load, source.targets), tuple(load.notes)
     scene, held_out = hold_out(load.scene)
-    judges = () if held_out is None else (f"{HELD_OUT_NOTE}: {', '.join(held_out.names)}",)
-    return scene, held_out, (*load.notes, *judges)
+    held_out_notes = () if held_out is None else (f"{HELD_OUT_NOTE}: {', '.join(held_out.names)}",)
+    return scene, held_out, (*load.notes, *held_out_notes)
 
 
 def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:
-    """Hold out some photos of a scene to score its results on; none of fewer than four photos."""
+    """Hold out some photos of a scene to score its results on; return the other views, and the held-out ones.
+
+    A scene with fewer than four photos keeps all of them.
+    """
     photos = scene.photo_views
     if len(photos) < LEAST_VIEWS or scene.images is None:
         return scene, None

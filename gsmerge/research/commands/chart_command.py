@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.research.charts.grid import GridRun
 
-CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # in the folder
+CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # a folder and two files in the output folder
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,17 @@ def chart(args: opt.Args) -> None:
         return
     say_notes(notes, quiet=args.silent)
     failed = _run_all(args, pending, measured)
-    _draw(args, notes, len(pending))
+    _draw_results(args, notes, len(pending))
     check_failures(failed, len(pending), "run")
 
 
 def _plan_runs(
     args: opt.Args, scenes: Sequence[str], own: ChartOptions, fixed: dict[str, Any]
 ) -> tuple[EvaluateOptions, list[GridRun], list[str]]:
-    """Make the options of all measurements, the runs of the grid, and notes."""
+    """Return the options of all measurements, the runs of the grid, and notes for the user.
+
+    ``own`` are the settings of the measurements, and ``fixed`` those of all runs.
+    """
     from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.research.charts.grid import find_sources, make_runs, parse_grid
 
@@ -94,7 +97,7 @@ def _plan_runs(
 
 
 def _run_all(args: opt.Args, runs: Sequence[GridRun], measured: EvaluateOptions) -> list[tuple[str, str]]:
-    """Run all, and append the record of each to the folder; return name and reason of those that failed."""
+    """Run all runs, and append a record of each to the folder; return the name and the error of each failed run."""
     from gsmerge.io.jsonl import append_line
     from gsmerge.research.charts.measure_run import RUNS, run_setting
 
@@ -104,16 +107,19 @@ def _run_all(args: opt.Args, runs: Sequence[GridRun], measured: EvaluateOptions)
             name = f"{source.name}/{record.label}"
             progress(name, i, len(runs))
             try:
-                record = run_setting(source, record, options, measured)
+                finished = run_setting(source, record, options, measured)
             except Exception as error:  # a run that fails does not end the others
-                record = replace(record, error=" ".join(f"{type(error).__name__}: {error}".split()))
-                failed.append((name, str(record.error)))
-            append_line(args.output / RUNS, asdict(record))
+                finished = replace(record, error=" ".join(f"{type(error).__name__}: {error}".split()))
+                failed.append((name, str(finished.error)))
+            append_line(args.output / RUNS, asdict(finished))
     return failed
 
 
-def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
-    """Draw charts, page and table of all runs in the folder, and print a summary; ``notes`` were printed before."""
+def _draw_results(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
+    """Draw the charts, page and table of all runs in the folder, and print a summary.
+
+    ``notes`` were printed before. ``num_done`` is the number of runs of this call.
+    """
     from gsmerge.research.charts.chart_page import list_held_out_notes, make_chart_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures
     from gsmerge.research.charts.lines import Results

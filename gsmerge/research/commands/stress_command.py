@@ -59,14 +59,14 @@ def stress(args: opt.Args) -> None:
         "failed": sum(outcome.held is False for outcome in outcomes),
         **note_entries(notes),
     }
-    print_document(document, _lines(outcomes), as_json=args.json, quiet=args.quiet)
+    print_document(document, _outcome_lines(outcomes), as_json=args.json, quiet=args.quiet)
     failed = [outcome.case for outcome in outcomes if outcome.held is False]
     if failed:
         raise TargetError(f"{len(failed)} of {len(outcomes)} cases failed: {', '.join(failed)}")
 
 
-def _lines(outcomes: Sequence[StressOutcome]) -> list[str]:
-    """Write one line for each case, and the number of passed cases."""
+def _outcome_lines(outcomes: Sequence[StressOutcome]) -> list[str]:
+    """Return the lines of the summary: one for each case, the properties that failed, and the number that held."""
     marks = {True: "held", False: "FAILED", None: "-"}
     width = max((len(outcome.words) for outcome in outcomes), default=0)
     lines = [f"{marks[o.held]:<7} {o.words:<{width}}  {o.found}" for o in outcomes]

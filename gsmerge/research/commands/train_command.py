@@ -43,33 +43,41 @@ def train(args: opt.Args) -> None:
     with opt.usage_errors():
         options = change_settings(preset_options(args.preset), values)
     options.require_weights()
-    apart = find_training_scenes(args.validation or [], out)
-    scenes = find_training_scenes(args.data, out, apart)
-    notes = [] if apart else ["without --validation, other crops of the same scenes choose the best checkpoint"]
+    validation_scenes = find_training_scenes(args.validation or [], out)
+    scenes = find_training_scenes(args.data, out, validation_scenes)
+    notes = (
+        [] if validation_scenes else ["without --validation, other crops of the same scenes choose the best checkpoint"]
+    )
     say_notes(notes, quiet=args.silent)
     with stage_progress(quiet=args.silent) as progress, use_threads():
-        shards, validation = (prepare_shards(part, options, out / "examples", progress) for part in (scenes, apart))
+        shards, validation = (
+            prepare_shards(part, options, out / "examples", progress) for part in (scenes, validation_scenes)
+        )
 
-        def move(step: int, steps: int, loss: float) -> None:
+        def show_step(step: int, steps: int, loss: float) -> None:
+            """Show a step of the training as progress."""
             progress(f"train: loss {loss:.4f}", step, steps)
 
-        done = train_networks(shards, validation, out, options, progress=move)
+        trained = train_networks(shards, validation, out, options, progress=show_step)
     document: dict[str, Any] = {**document_head(), "options": options.to_dict(), **note_entries(notes)}
-    document |= {name: str(value) if isinstance(value, Path) else value for name, value in asdict(done).items()}
-    line = f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"
+    document |= {name: str(value) if isinstance(value, Path) else value for name, value in asdict(trained).items()}
+    line = (
+        f"{trained.best}: {trained.step} steps, PSNR {trained.psnr_learned:.2f} dB"
+        f" ({trained.psnr_analytic:.2f} without networks)"
+    )
     print_document(document, line, as_json=args.json, quiet=args.quiet)
 
 
-def find_training_scenes(paths: Sequence[Path], out: Path, apart: Collection[Path] = ()) -> list[Path]:
+def find_training_scenes(paths: Sequence[Path], out: Path, validation_scenes: Collection[Path] = ()) -> list[Path]:
     """Find the scenes in files and folders, each once; skip the output folder ``out``.
 
-    Scenes of ``apart``, for validation, are left out if a folder contains them, but not if they are named. Raises
-    SceneError if a path does not exist or has no scene, and UsageError if no scene is left.
+    A scene of ``validation_scenes`` is left out, unless it is itself one of ``paths``. Raises SceneError if a path does
+    not exist or has no scene, and UsageError if no scene is left.
     """
     from gsmerge.batch.find import find_scenes
     from gsmerge.errors import UsageError
 
-    kept, excluded = dict[str, Path](), {os.path.realpath(scene) for scene in apart}
+    kept, excluded = dict[str, Path](), {os.path.realpath(scene) for scene in validation_scenes}
     for path in paths:
         for scene in find_scenes([str(path)], out):
             real = os.path.realpath(scene)

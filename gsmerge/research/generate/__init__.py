@@ -6,4 +6,4 @@ from gsmerge.research.generate.folders import generate_scene as generate_scene
 from gsmerge.research.generate.noise import NoiseOptions as NoiseOptions
 from gsmerge.research.generate.synthetic_scene import GenerateOptions as GenerateOptions
 from gsmerge.research.generate.synthetic_scene import SyntheticScene as SyntheticScene
-from gsmerge.research.generate.synthetic_scene import make_scene as make_scene
+from gsmerge.research.generate.synthetic_scene import make_synthetic_scene as make_synthetic_scene

@@ -18,7 +18,7 @@ from gsmerge.io.cameras.camera_file import FLIP
 from gsmerge.kernels.matrices import matmul
 from gsmerge.research.generate.photograph import Float
 from gsmerge.research.generate.shapes import invert_motion
-from gsmerge.research.generate.synthetic_scene import GenerateOptions, make_scene
+from gsmerge.research.generate.synthetic_scene import GenerateOptions, make_synthetic_scene
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras
 
@@ -32,7 +32,7 @@ class SceneFolder:
 
 
 def generate_scene(folder: Path, options: GenerateOptions | None = None, *, seed: int = 0, index: int = 0) -> Path:
-    """Generate scene ``index`` of the series of ``seed`` into a folder, and return the folder.
+    """Generate scene ``index`` of the series that ``seed`` defines into a folder, and return the folder.
 
     A folder with the same scene is not changed. Raises UsageError if the folder has other contents, and SceneError if
     it cannot be written.
@@ -40,7 +40,7 @@ def generate_scene(folder: Path, options: GenerateOptions | None = None, *, seed
     options = options or GenerateOptions()
     key = scene_facts(seed, index, options)
     if not is_complete(folder, key):
-        scene = make_scene(seed, index, options)
+        scene = make_synthetic_scene(seed, index, options)
         record = {
             **key,
             "num_views": len(scene.cameras),
@@ -86,6 +86,7 @@ def generate(
     todo = [i for i, scene in enumerate(planned) if not scene.kept]
 
     def work(index: int) -> None:
+        """Generate the scene of one folder."""
         generate_scene(planned[index].folder, options, seed=seed, index=index)
 
     with use_threads(threads) as workers:
@@ -100,7 +101,7 @@ RECORD = "generated.json"
 
 
 def scene_facts(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
-    """Return everything that a scene depends on, as plain values."""
+    """Return everything that defines a scene, as plain values; they are the beginning of its record."""
     record_version = 3  # increases if the same seed and options give other scenes than before
     return {"record_version": record_version, "seed": seed, "index": index, "options": options.to_dict()}
 
@@ -122,7 +123,7 @@ def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
 
 
 def _write_views(add: AddOutput, folder: Path, cameras: Cameras, images: Sequence[Float]) -> None:
-    """Write ``images/`` and ``transforms.json`` (nerfstudio: camera to world, OpenGL axes)."""
+    """Write photos to ``images/``, and their cameras to ``transforms.json`` (nerfstudio: camera to world, OpenGL)."""
     frames, digits = [], max(3, len(str(len(images) - 1)))
     for i, image in enumerate(images):
         name = f"images/view_{i:0{digits}d}.png"

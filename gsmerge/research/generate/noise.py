@@ -26,7 +26,7 @@ LOG_UNIFORM = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # values
 
 @dataclass(frozen=True)
 class NoiseOptions:
-    """Ranges of an exporter's errors and habits; each scene draws its values from them.
+    """Ranges of an exporter's errors and habits, from which the values of each scene are drawn.
 
     Depth errors are standard deviations of the logarithm of depth. They are about equal to relative errors of depth.
     docs/internals/lab.md compares the ranges with real exports.
@@ -34,14 +34,14 @@ class NoiseOptions:
 
     view_bias: Range = (0.0002, 0.02)  # scale error of a view
     drift: Range = (0.0003, 0.02)  # slow error across a view
-    patches: Range = (0.0, 0.3)  # share of a view whose depth is wrong
-    patch_error: Range = (0.02, 0.5)  # error of these patches
-    grain: Range = (0.0007, 0.003)  # independent error of each pixel
+    patches: Range = (0.0, 0.3)  # share of a view's area in patches of wrong depth
+    patch_error: Range = (0.02, 0.5)  # depth error in these patches
+    grain: Range = (0.0007, 0.003)  # independent depth error of each pixel
     blank: Range = (0.0, 3.0)  # factor of additional errors where the photo has no texture
     bleed: Range = (0.1, 1.0)  # blend towards a smoothed inverse depth at edges, 0 to 1
     bleed_width: Range = (0.6, 1.8)  # standard deviation of the smoothing of inverse depth, pixels
     far: Range = (4.0, 12.0)  # largest depth that the network predicts, in medians of the depth
-    # share of the pixels that float in front of their surface; at depth edges the share is eleven times as large
+    # share of the pixels whose Gaussian floats in front of the surface; it is eleven times as large at depth edges
     floaters: Range = (0.0, 0.004)
     turn: Range = (0.005, 0.3)  # rotation error of a pose, degrees
     shift: Range = (0.0001, 0.004)  # translation error of a pose, in median depths
@@ -54,7 +54,7 @@ class NoiseOptions:
     flatness: Range = (0.15, 1.0)  # thickness along the normal, relative to the other axes
     tilt: Range = (0.02, 0.4)  # error of the normals, radians
     oversized: Range = (0.0, 0.006)  # share of the Gaussians that are far too large
-    oversize: Range = (3.0, 12.0)  # largest factor of their size, at least 2
+    oversize: Range = (3.0, 12.0)  # largest factor on the size of these Gaussians; the least factor is 2
     trust: Range = (0.25, 1.0)  # confidence of pixels without errors
     constant_opacity: float = 0.2  # probability that all opacities are equal
     opacity_low: Range = (0.05, 0.4)  # opacity at a confidence of 0
@@ -75,7 +75,10 @@ else:  # the values that were drawn for one scene, under the names of their rang
 
 
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
-    """Draw the values of one scene; ``factor`` multiplies errors, not habits. Shares and ``bleed`` are at most 1."""
+    """Draw the values of one scene from their ranges.
+
+    ``factor`` multiplies errors, not habits. Shares and ``bleed`` are then cut to 1.
+    """
     drawn: dict[str, float] = {}
     for name in NOISE_RANGES:
         low, high = getattr(options, name)
@@ -93,7 +96,7 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
 
 @dataclass(frozen=True, eq=False)
 class TrueView:
-    """A rendered view with exact depth and normals, and the pose that a network would estimate."""
+    """A view with its photo, exact depth and normals, and the pose that a network would estimate."""
 
     image: Float  # [h,w,3] sRGB
     depth: Array  # [h,w] along z
@@ -118,7 +121,7 @@ def edge_mask(depth: Array) -> Float:
     return np.clip((np.minimum(jump / 2, 4 * bend) - 0.01) / 0.09, 0, 1).astype(np.float32)
 
 
-MEAN_FILTER = np.full(7, 1 / 7, np.float32)  # averages 7 pixels
+MEAN_FILTER = np.full(7, 1 / 7, np.float32)  # filter that averages 7 pixels
 
 
 def texture_mask(image: Float) -> Float:
@@ -159,14 +162,14 @@ def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tup
 
 
 def _wrong_patches(blank: Float, noise: Noise, rng: np.random.Generator) -> Float:
-    """Draw patches ``[h,w]`` of wrong depth, 0 to 1, more likely where the photo is ``blank``."""
+    """Draw a mask ``[h,w]`` of patches of wrong depth, 0 to 1; they are more likely where the photo is ``blank``."""
     height, width = blank.shape
     field = smooth_noise(rng, height, width, int(rng.integers(5, 12))) + noise.blank * blank
     limit = np.float32(np.quantile(field.astype(np.float64), 1 - noise.patches))
     return np.clip((field - limit) / 0.3, 0, 1) if noise.patches > 0 else np.zeros_like(field)
 
 
-RAISED = 10.0  # base colour at which the effect of shN is measured; colours below 0 would be clamped
+RAISED = 10.0  # base colour at which the effect of shN is measured, so high that no colour is clamped at 0
 
 
 def quats_facing(normals: Array) -> Array:
@@ -177,7 +180,10 @@ def quats_facing(normals: Array) -> Array:
 
 
 def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Compute sh0 ``[n,1,3]`` and random shN ``[n,k-1,3]`` with which Gaussians have ``colors`` seen from ``eye``."""
+    """Draw random shN ``[n,k-1,3]``, and compute sh0 ``[n,1,3]`` so that Gaussians have ``colors`` seen from ``eye``.
+
+    Returns sh0 and shN.
+    """
     n, num_rest = len(colors), (noise.sh_degree + 1) ** 2 - 1
     sh0 = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
     common = rng.normal(0, 1, (1, num_rest, 3))  # equal for all Gaussians, since highlights of a view are on one side

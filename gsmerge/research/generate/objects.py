@@ -1,4 +1,4 @@
-"""Build the objects of a room, each standing at the origin, and the room itself; y points down, sizes are in metres."""
+"""Build the objects of a room, and the room itself. Objects stand at the origin; y points down, sizes are in metres."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.kernels.elementary import cos, sin
-from gsmerge.research.generate.photograph import Light, Stage
+from gsmerge.research.generate.photograph import Light, Room
 from gsmerge.research.generate.shapes import (
     LYING,
     Array,
@@ -25,12 +25,12 @@ from gsmerge.research.generate.shapes import (
     quad,
     rod,
 )
-from gsmerge.research.generate.textures import Palette, color
+from gsmerge.research.generate.textures import Palette, draw_color
 
 Shapes = list[Shape]
 
 
-def table(pal: Palette, width: float, depth: float, height: float) -> Shapes:
+def build_table(pal: Palette, width: float, depth: float, height: float) -> Shapes:
     """Build a table with four legs, or a round table with one."""
     rng, top = pal.rng, pal.material("wood", "wood", "plain", "plain", "marble", "granite", repeat=0.8)
     legs = pal.material("wood", "plain")
@@ -47,7 +47,7 @@ def table(pal: Palette, width: float, depth: float, height: float) -> Shapes:
     return out
 
 
-def chair(pal: Palette) -> Shapes:
+def build_chair(pal: Palette) -> Shapes:
     """Build a chair with a slatted or closed back."""
     rng, seat, wood = pal.rng, pal.material("cloth", "wood", "plain"), pal.material("wood", "plain")
     w, h, back = rng.uniform(0.38, 0.5), rng.uniform(0.42, 0.5), rng.uniform(0.8, 1.05)
@@ -62,8 +62,8 @@ def chair(pal: Palette) -> Shapes:
     return [*out, rod((-w / 2, -back, w / 2 + 0.03), (w / 2, -back, w / 2 + 0.03), 0.02, wood)]
 
 
-def shelf(pal: Palette, width: float, height: float) -> Shapes:
-    """Build shelves with books and objects; their back is at z = 0."""
+def build_shelf(pal: Palette, width: float, height: float) -> Shapes:
+    """Build a shelf with books and small objects. The back is at z = 0."""
     rng, board, depth = pal.rng, pal.material("wood", "plain", "plaster", repeat=0.7), 0.3
     out = [box((x - 0.012, -height, -depth), (x + 0.012, 0, 0), board) for x in (-width / 2, width / 2)]
     out.append(box((-width / 2, -height, -0.01), (width / 2, 0, 0), board))
@@ -79,11 +79,11 @@ def shelf(pal: Palette, width: float, height: float) -> Shapes:
             out.append(box((left, -top, front), (max(right, left + 0.1), -y - 0.02, -0.02), pal.material("spines")))
         else:
             for x in rng.uniform(-width / 2.3, width / 2.3, rng.integers(1, 4)):
-                out += place_shapes(small_object(pal), (x, -y - 0.02, -depth / 2), yaw=rng.uniform(0, 6))
+                out += place_shapes(build_small_object(pal), (x, -y - 0.02, -depth / 2), yaw=rng.uniform(0, 6))
     return out
 
 
-def lamp(pal: Palette, height: float) -> Shapes:
+def build_lamp(pal: Palette, height: float) -> Shapes:
     """Build a standing lamp on a thin pole."""
     pole, shade = pal.material("plain", gloss=0.6), pal.material("plain", "cloth")
     radius = pal.rng.uniform(0.1, 0.2)
@@ -91,13 +91,13 @@ def lamp(pal: Palette, height: float) -> Shapes:
     return [*out, column((0, 0.1 - height, 0), 0.25, radius * 1.3, shade, top=0.6)]
 
 
-def carton(pal: Palette) -> Shapes:
-    """Build a package."""
+def build_carton(pal: Palette) -> Shapes:
+    """Build a package of cardboard."""
     w, h, d = pal.rng.uniform(0.04, 0.16, 3) * [1, 1.4, 1]
     return [box((-w / 2, -h, -d / 2), (w / 2, 0, d / 2), pal.material("label", "printed", "label", "plain"))]
 
 
-def can(pal: Palette) -> Shapes:
+def build_can(pal: Palette) -> Shapes:
     """Build a can, a jar or a mug."""
     rng, r, h = pal.rng, pal.rng.uniform(0.025, 0.05), pal.rng.uniform(0.07, 0.16)
     wrapping = pal.material("label", "label", "plain", "marble", gloss=rng.uniform(0, 0.8))
@@ -105,7 +105,7 @@ def can(pal: Palette) -> Shapes:
     return [body, column((0, -h, 0), 0.004, r * 0.85, pal.material("plain", gloss=0.8))]
 
 
-def bottle(pal: Palette) -> Shapes:
+def build_bottle(pal: Palette) -> Shapes:
     """Build a bottle or vase with a neck."""
     rng, glass = pal.rng, pal.material("plain", "gradient", "marble", gloss=0.9)
     r, h = rng.uniform(0.025, 0.06), rng.uniform(0.12, 0.3)
@@ -114,7 +114,7 @@ def bottle(pal: Palette) -> Shapes:
     return [*out, column((0, -0.12 * h, 0), 0.35 * h, r * 1.01, pal.material("label", "printed"))]
 
 
-def bowl(pal: Palette) -> Shapes:
+def build_bowl(pal: Palette) -> Shapes:
     """Build a bowl with fruit."""
     rng, r = pal.rng, pal.rng.uniform(0.07, 0.14)
     out = [column((0, 0, 0), 0.06, r * 0.5, pal.material("plain", "cloth", gloss=0.5), top=2.0)]
@@ -125,7 +125,7 @@ def bowl(pal: Palette) -> Shapes:
     return out
 
 
-def toy(pal: Palette) -> Shapes:
+def build_toy(pal: Palette) -> Shapes:
     """Build a figure of uneven lumps."""
     rng, skin, limbs = pal.rng, pal.material("plain", "cloth", "plaster"), pal.material("plain", "cloth", "gradient")
     h = rng.uniform(0.12, 0.3)
@@ -139,7 +139,7 @@ def toy(pal: Palette) -> Shapes:
     return out
 
 
-def books(pal: Palette) -> Shapes:
+def build_books(pal: Palette) -> Shapes:
     """Build a pile of books."""
     rng, y, out = pal.rng, 0.0, []
     for _ in range(rng.integers(1, 6)):
@@ -150,13 +150,13 @@ def books(pal: Palette) -> Shapes:
     return out
 
 
-def paper(pal: Palette) -> Shapes:
+def build_paper(pal: Palette) -> Shapes:
     """Build a sheet of paper."""
     half = pal.rng.uniform(0.06, 0.15), pal.rng.uniform(0.08, 0.2)
     return [quad((0, -0.003, 0), half, pal.material("printed", "label", "printed"), LYING)]
 
 
-def plant(pal: Palette, height: float, leaves: int) -> Shapes:
+def build_plant(pal: Palette, height: float, leaves: int) -> Shapes:
     """Build a pot with stems and leaves."""
     rng, green, stem = pal.rng, pal.material("foliage"), pal.material("plain", "bark")
     pot = 0.25 * height
@@ -181,7 +181,7 @@ def random_rotation(rng: np.random.Generator) -> Array:
     return np.stack([sign * x, sign * y, z], 1)
 
 
-def wire(pal: Palette, start: Array, end: Array, sag: float, radius: float) -> Shapes:
+def build_wire(pal: Palette, start: Array, end: Array, sag: float, radius: float) -> Shapes:
     """Build a hanging cable."""
     t = np.linspace(0, 1, 9)[:, None]
     points = start + (end - start) * t + [0, 4 * sag, 0] * t * (1 - t)
@@ -189,8 +189,8 @@ def wire(pal: Palette, start: Array, end: Array, sag: float, radius: float) -> S
     return [rod(a, b, radius, material) for a, b in itertools.pairwise(points)]
 
 
-def window(pal: Palette, width: float, height: float) -> Shapes:
-    """Build a window with frame and bars in the plane z = 0, foot at the origin."""
+def build_window(pal: Palette, width: float, height: float) -> Shapes:
+    """Build a window with frame and bars in the plane z = 0; the foot is at the origin."""
     pane = quad((0, -height / 2, -0.01), (width / 2, height / 2), pal.material("sky", "crown"))
     frame, t = pal.material("plain", "wood"), pal.rng.uniform(0.03, 0.07)
     w, h = width / 2, height
@@ -199,24 +199,36 @@ def window(pal: Palette, width: float, height: float) -> Shapes:
     return [replace(pane, shell=True, glow=True), *(box((*a, -t), (*b, 0.0), frame) for a, b in bars)]
 
 
-def picture(pal: Palette, width: float, height: float) -> Shapes:
-    """Build a framed print, back at z = 0, foot at the origin."""
+def build_picture(pal: Palette, width: float, height: float) -> Shapes:
+    """Build a framed print; the back is at z = 0 and the foot at the origin."""
     material = pal.material("label", "printed", "marble", "crown", "spines", "sky", "cloth")
     t = pal.rng.uniform(0.01, 0.03)
     frame = box((-width / 2 - t, -height - t, -0.02), (width / 2 + t, t, 0), pal.material("plain", "wood"))
     return [quad((0, -height / 2, -0.022), (width / 2, height / 2), material), frame]
 
 
-SMALL: tuple[Callable[[Palette], Shapes], ...] = (carton, carton, can, bottle, bowl, toy, books, books)
+SMALL: tuple[Callable[[Palette], Shapes], ...] = (
+    build_carton,
+    build_carton,
+    build_can,
+    build_bottle,
+    build_bowl,
+    build_toy,
+    build_books,
+    build_books,
+)
 
 
-def small_object(pal: Palette) -> Shapes:
-    """Build a random small object, as found on tables."""
+def build_small_object(pal: Palette) -> Shapes:
+    """Build a random one of the objects that lie on tables and shelves."""
     return SMALL[pal.rng.integers(len(SMALL))](pal)
 
 
-def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) -> Shapes:
-    """Spread small objects over a rectangle so that they do not touch, with papers and cables between them."""
+def spread_objects(pal: Palette, count: int, half: tuple[float, float], height: float) -> Shapes:
+    """Spread at most ``count`` small objects over a rectangle with half sides ``half``, at a height.
+
+    The objects do not touch. Papers and perhaps a cable lie between them.
+    """
     rng, out = pal.rng, []
     spots: list[Array] = []
     clearance = 0.16  # least distance between the middles of small objects, metres
@@ -224,31 +236,36 @@ def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) 
         spot = rng.uniform(-1, 1, 2) * half
         if len(spots) < count and all(norm(spot - occupied) > clearance for occupied in spots):
             spots.append(spot)
-            out += place_shapes(small_object(pal), (spot[0], -height, spot[1]), yaw=rng.uniform(0, 2 * np.pi))
+            out += place_shapes(build_small_object(pal), (spot[0], -height, spot[1]), yaw=rng.uniform(0, 2 * np.pi))
     for _ in range(rng.integers(0, count // 2 + 1)):
         x, z = rng.uniform(-1, 1, 2) * half
-        out += place_shapes(paper(pal), (x, -height, z), yaw=rng.uniform(0, 2 * np.pi))
+        out += place_shapes(build_paper(pal), (x, -height, z), yaw=rng.uniform(0, 2 * np.pi))
     if rng.random() < 0.5:
         ends = rng.uniform(-1, 1, (2, 2)) * half
         a, b = (np.array([x, -height - 0.004, z]) for x, z in ends)
-        out += wire(pal, a, b, 0.0, rng.uniform(0.002, 0.005))
+        out += build_wire(pal, a, b, 0.0, rng.uniform(0.002, 0.005))
     return out
 
 
 FACING = axis_rotation(1, np.pi / 2)  # rotates -z to -x
 
 
-def light(rng: np.random.Generator, lamp_at: Array) -> Light:
-    """Draw lights of random colour and strength; the direct light comes from above and in front of the scene."""
+def draw_lights(rng: np.random.Generator, lamp_at: Array) -> Light:
+    """Draw a direct and an ambient light of random colour and strength.
+
+    The direct light comes from above and from the side of the cameras.
+    """
     side, up = rng.uniform(-1.2, 1.2), rng.uniform(0.5, 1.3)
     towards = np.array([sin(side), -up, -cos(side)])
-    key = rng.uniform(0.8, 4.0) * (1 + (0.4 * color(rng, strength=(0, 0.4), light=(0.9, 1)) - 0.4))
-    ambient = rng.uniform(0.5, 1.1) * (1 + (0.3 * color(rng, hue=(0.5, 0.7), strength=(0, 0.3), light=(0.9, 1)) - 0.3))
+    key = rng.uniform(0.8, 4.0) * (1 + (0.4 * draw_color(rng, strength=(0, 0.4), light=(0.9, 1)) - 0.4))
+    ambient = rng.uniform(0.5, 1.1) * (
+        1 + (0.3 * draw_color(rng, hue=(0.5, 0.7), strength=(0, 0.3), light=(0.9, 1)) - 0.3)
+    )
     return Light(towards / norm(towards), lamp_at, key, ambient, rng.uniform(0.02, 0.2))
 
 
-def _walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:
-    """Build floor, ceiling and four walls about the origin, with objects on the walls, a skirting and a pipe."""
+def _build_walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:
+    """Build floor, ceiling and four walls around the origin, with objects along the walls, a skirting and a pipe."""
     rng = pal.rng
     kinds = ("plain", "plain", "plain", "plaster", "bricks", "cloth", "tiles", "wood")
     papers = [pal.material(*kinds, repeat=rng.uniform(0.3, 0.8), gloss=0.0) for _ in range(2)]
@@ -262,25 +279,25 @@ def _walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:
     out.append(box((-w, -0.09, d - 0.02), (w, 0, d), skirting))
     out += [box((x - 0.02, -0.09, -d), (x + 0.02, 0, d), skirting) for x in (-w, w)]
     for half_length, spot, facing in ((w, (0, 0, d), np.eye(3)), (d, (-w, 0, 0), FACING.T), (d, (w, 0, 0), FACING)):
-        out += place_shapes(_wall_objects(pal, half_length, h), spot, rotation=facing)
+        out += place_shapes(_build_wall_objects(pal, half_length, h), spot, rotation=facing)
     pipe = rng.uniform(-w, w)
     return [*out, rod((pipe, 0, d - 0.06), (pipe, -h, d - 0.06), rng.uniform(0.01, 0.04), skirting)]
 
 
-def _wall_objects(pal: Palette, half: float, height: float) -> Shapes:
+def _build_wall_objects(pal: Palette, half: float, height: float) -> Shapes:
     """Build pictures, windows, shelves and doors at random, side by side on the plane z = 0."""
     rng, out, x = pal.rng, [], -half + 0.3
     while x < half - 0.5:
         wide, kind = rng.uniform(0.3, 1.2), rng.integers(0, 5)
         at = (x + wide / 2, 0.0, 0.0)
         if kind <= 1:
-            frame = picture(pal, wide, min(wide * rng.uniform(0.6, 1.4), 0.45 * height))
+            frame = build_picture(pal, wide, min(wide * rng.uniform(0.6, 1.4), 0.45 * height))
             out += place_shapes(frame, (at[0], -rng.uniform(0.35, 0.5) * height, 0))
         elif kind == 2:
-            pane = window(pal, wide, rng.uniform(0.35, 0.55) * height)
+            pane = build_window(pal, wide, rng.uniform(0.35, 0.55) * height)
             out += place_shapes(pane, (at[0], -0.35 * height, 0))
         elif kind == 3:
-            out += place_shapes(shelf(pal, wide, rng.uniform(0.4, 0.85) * height), at)
+            out += place_shapes(build_shelf(pal, wide, rng.uniform(0.4, 0.85) * height), at)
         else:
             out += place_shapes(
                 [box((-0.45, -0.8 * height, -0.04), (0.45, 0, 0), pal.material("wood", "plain", "cloth"))], at
@@ -289,42 +306,44 @@ def _wall_objects(pal: Palette, half: float, height: float) -> Shapes:
     return out
 
 
-def room(pal: Palette) -> Stage:
+def build_room(pal: Palette) -> Room:
     """Build a furnished room: walls with pictures and shelves, tables, chairs, plants, lamps, cables."""
     rng = pal.rng
     w, d, h = rng.uniform(4.0, 7.0), rng.uniform(4.5, 7.0), rng.uniform(2.3, 3.2)
-    shapes = _walls(pal, w, d, h)
+    shapes = _build_walls(pal, w, d, h)
     spots = [(x * w, z * d) for x in (-0.3, 0.0, 0.3) for z in (0.05, 0.32)]
     for i in rng.permutation(len(spots))[: rng.integers(3, 6)]:
         at = spots[i][0] + rng.normal(0, 0.15), 0.0, spots[i][1] + rng.normal(0, 0.15)
-        shapes += place_shapes(_furniture(pal), at, yaw=rng.normal(0, 0.5))
-    pot = plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90)))
+        shapes += place_shapes(_build_furniture(pal), at, yaw=rng.normal(0, 0.5))
+    pot = build_plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90)))
     shapes += place_shapes(pot, (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
-    shapes += place_shapes(lamp(pal, rng.uniform(1.1, 1.8)), (rng.uniform(-0.4, 0.4) * w, 0, rng.uniform(0, 0.4) * d))
+    shapes += place_shapes(
+        build_lamp(pal, rng.uniform(1.1, 1.8)), (rng.uniform(-0.4, 0.4) * w, 0, rng.uniform(0, 0.4) * d)
+    )
     a, b = (np.array([x * w, -h * rng.uniform(0.75, 1), rng.uniform(0, 0.45) * d]) for x in (-0.5, 0.5))
-    shapes += wire(pal, a, b, rng.uniform(0.05, 0.4), rng.uniform(0.003, 0.008))
+    shapes += build_wire(pal, a, b, rng.uniform(0.05, 0.4), rng.uniform(0.003, 0.008))
     focus = np.array([rng.normal(0, 0.2), -rng.uniform(0.4, 1.0), rng.uniform(0.15, 0.35) * d])
     lamp_at = np.array([rng.uniform(-0.3, 0.3) * w, -h + 0.1, rng.uniform(-0.3, 0.2) * d])
     reach = focus[2] + 0.42 * d
-    return Stage(tuple(shapes), tuple(pal.textures), light(rng, lamp_at), focus, (0.6 * reach, reach))
+    return Room(tuple(shapes), tuple(pal.textures), draw_lights(rng, lamp_at), focus, (0.6 * reach, reach))
 
 
-def sofa(pal: Palette) -> Shapes:
-    """Build a sofa with two pillows, its back towards +z."""
+def build_sofa(pal: Palette) -> Shapes:
+    """Build a sofa with two pillows. The back is towards +z."""
     soft = pal.material("cloth", "carpet", repeat=0.9)
     seat = [box((-0.9, -0.42, -0.4), (0.9, 0, 0.4), soft), box((-0.9, -0.85, 0.25), (0.9, 0, 0.45), soft)]
     pillow = pal.material("cloth", "carpet", "label")
     return seat + [ball((x, -0.55, 0.1), (0.22, 0.18, 0.12), pillow) for x in pal.rng.uniform(-0.7, 0.7, 2)]
 
 
-def _furniture(pal: Palette) -> Shapes:
+def _build_furniture(pal: Palette) -> Shapes:
     """Build a chair, a sofa, or a table with small objects and perhaps a chair."""
     rng, kind = pal.rng, pal.rng.integers(0, 4)
     if kind == 0:
-        return chair(pal)
+        return build_chair(pal)
     if kind == 1:
-        return sofa(pal)
+        return build_sofa(pal)
     width, depth, height = rng.uniform(0.7, 1.5), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)
-    top = clutter(pal, int(rng.integers(2, 7)), (0.3 * width, 0.3 * depth), height)
-    out = table(pal, width, depth, height) + top
-    return out + (place_shapes(chair(pal), (0, 0, -0.7), yaw=np.pi) if rng.random() < 0.5 else [])
+    top = spread_objects(pal, int(rng.integers(2, 7)), (0.3 * width, 0.3 * depth), height)
+    out = build_table(pal, width, depth, height) + top
+    return out + (place_shapes(build_chair(pal), (0, 0, -0.7), yaw=np.pi) if rng.random() < 0.5 else [])

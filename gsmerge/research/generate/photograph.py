@@ -1,7 +1,7 @@
-"""Render photos and exact depth of a stage.
+"""Render photos and exact depth of a room.
 
-Rays find the first surface of every sample. Its colour comes from its texture and from lights with shadow maps. A film
-curve with an exposure turns the light into a photo.
+Each sample is a ray, which finds the first surface. The colour comes from the surface's texture and from lights with
+shadow maps. The curve of a film turns the light into a photo.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.kernels.elementary import arctan2, cos, power, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack_shapes, rotate
-from gsmerge.research.generate.textures import Picture, pyramid
+from gsmerge.research.generate.textures import Texture, make_mipmaps
 
-NO_SURFACE_DEPTH = 1e6  # depth of pixels without a surface
+NO_SURFACE_DEPTH = 1e6  # depth of pixels without a surface, metres
 SAMPLE_RAYS = 2  # rays per pixel and axis for the colours; depth is measured at the pixel's centre
 KEY_MAPS, KEY_SIZE = 5, 640  # number of shadow maps of the direct light, for soft shadows, and their side in pixels
 AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # number and side of the shadow maps of the light from all sides
@@ -34,19 +34,19 @@ Float: TypeAlias = NDArray[Any]  # float32
 class Light:
     """The lights of a scene."""
 
-    towards: Array  # [3] unit vector to the light
-    lamp: Array  # [3] position, near which surfaces are brighter
+    towards: Array  # [3] unit vector to the direct light
+    lamp: Array  # [3] position of the lamp, near which surfaces are brighter
     key: Array  # [3] linear colour of the direct light
     ambient: Array  # [3] linear colour of the light from all sides
-    softness: float  # half width of the light, radians
+    softness: float  # half width of the direct light, radians
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class Room:
     """Shapes, textures and light of a scene; y points down, and the cameras look along +z."""
 
     shapes: tuple[Shape, ...]
-    textures: tuple[Picture, ...]  # indexed by the shapes' materials
+    textures: tuple[Texture, ...]  # indexed by the shapes' materials
     light: Light
     focus: Array  # [3] point at which cameras are aimed
     distance: tuple[float, float]  # range of the distance of cameras from the focus
@@ -68,31 +68,31 @@ class Pinhole:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """First hits of a view's rays, h x w samples."""
+    """The first hit of each of a view's h x w rays."""
 
     depth: Array  # [h,w] along the camera's z
-    ids: NDArray[np.int32]  # [h,w] shape, -1 without any
-    points: Float  # [h,w,3] in the shape's frame
-    normals: Float  # [h,w,3] world, towards the camera
+    ids: NDArray[np.int32]  # [h,w] number of the shape; -1 if the ray hits none
+    points: Float  # [h,w,3] hit in the shape's frame
+    normals: Float  # [h,w,3] in the world, towards the camera
 
 
 @dataclass(frozen=True, eq=False)
-class LitStage:
-    """A stage with shadow maps, ready to be rendered."""
+class LitRoom:
+    """A room with shadow maps, ready to be rendered."""
 
-    stage: Stage
+    room: Room
     shapes: ShapeArrays
-    mips: tuple[list[Picture], ...]  # mipmaps of every texture
-    axes: Array  # [k,3,3] axes of the lights, direct ones first
+    mips: tuple[list[Texture], ...]  # mipmaps of every texture
+    axes: Array  # [k,3,3] axes of all shadow maps, first those of the direct light
     middle: Array  # [3] world point in the middle of the shadow maps
     radius: float  # half side of the shadow maps, world units
-    key: Float  # shadow maps of the direct light
-    ambient: Float  # shadow maps of the light from all sides
-    weights: Array  # [k] weights of the ambient maps
+    key: Float  # [KEY_MAPS,KEY_SIZE,KEY_SIZE] shadow maps of the direct light
+    ambient: Float  # [AMBIENT_MAPS,AMBIENT_SIZE,AMBIENT_SIZE] shadow maps of the light from all sides
+    weights: Array  # [AMBIENT_MAPS] weights of the ambient maps
 
 
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
-    """Compute boxes x0, y0, x1, y1 ``[m,4]``, in samples, that contain each shape's image."""
+    """Compute the box ``[m,4]`` that contains each shape's image: x0, y0, x1 and y1 in samples."""
     points, valid = _clipped_corners(shapes, c2w)
     pixels = points[..., :2] / np.where(valid, points[..., 2:], 1) * lens.focal + [lens.width / 2, lens.height / 2]
     limits = np.array([lens.width, lens.height]) * samples
@@ -123,7 +123,7 @@ def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
 
 
 def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
-    """Cast ``samples`` x ``samples`` rays for each pixel."""
+    """Cast ``samples`` x ``samples`` rays for each pixel, and return their first hits."""
     h, w = lens.height * samples, lens.width * samples
     hits = Hits(np.full((h, w), NO_SURFACE_DEPTH), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
@@ -135,7 +135,7 @@ def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
     return hits
 
 
-def _axes(towards: Array) -> Array:
+def _shadow_map_axes(towards: Array) -> Array:
     """Compute the axes of a shadow map as rows right, down, forward ``[3,3]``; ``towards`` points to the light."""
     forward = -towards / norm(towards)
     right = np.cross([0.3, 1.0, 0.2], forward)
@@ -144,7 +144,7 @@ def _axes(towards: Array) -> Array:
 
 
 def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, size: int) -> Float:
-    """Compute a shadow map ``[size,size]``: depth of the first surface, relative to the middle."""
+    """Compute a shadow map ``[size,size]``: the depth of the first surface, relative to ``middle``."""
     c2w = np.eye(4)
     behind = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel
     c2w[:3, :3], c2w[:3, 3] = axes.T, middle - behind * radius * axes[2]
@@ -152,22 +152,22 @@ def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, 
     return (hits.depth - behind * radius).astype(np.float32)
 
 
-def light_stage(stage: Stage) -> LitStage:
-    """Prepare a stage for rendering: arrays, smaller textures, shadow maps."""
-    opaque = pack_shapes([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
+def light_room(room: Room) -> LitRoom:
+    """Prepare a room for rendering: make the arrays of its shapes, the mipmaps, and the shadow maps."""
+    opaque = pack_shapes([s for s in room.shapes if not s.shell and not s.glow] or room.shapes[:1])
     extent = bounds(opaque)
     reach = np.linalg.norm(extent, axis=1)
     low, high = (opaque.centres - reach[:, None]).min(0), (opaque.centres + reach[:, None]).max(0)
     middle, radius = (low + high) / 2, norm(high - low) / 2
     rng = np.random.default_rng(0)
-    key = [stage.light.towards + stage.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
+    key = [room.light.towards + room.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
     ambient = _ambient_directions()
-    axes = np.stack([_axes(towards) for towards in (*key, *ambient)])
+    axes = np.stack([_shadow_map_axes(towards) for towards in (*key, *ambient)])
     from_below = 0.5  # brightness of light from below, relative to light from above
-    return LitStage(
-        stage,
-        pack_shapes(stage.shapes),
-        tuple(pyramid(texture) for texture in stage.textures),
+    return LitRoom(
+        room,
+        pack_shapes(room.shapes),
+        tuple(make_mipmaps(texture) for texture in room.textures),
         axes,
         middle,
         radius,
@@ -185,7 +185,7 @@ def _ambient_directions() -> Array:
     return np.stack([horizontal * cos(azimuth), -up, horizontal * sin(azimuth)], 1)
 
 
-def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
+def texture_coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
     """Compute texture coordinates ``[n,2]`` of points in shape frames, and texture repeats per world unit ``[n]``.
 
     Round surfaces are unrolled about their y axis. Flat faces are projected along their axis.
@@ -211,9 +211,9 @@ def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> t
     return np.stack([u, v], 1).astype(np.float32), np.where(once, 0.5 / np.maximum(half_width, half_height), repeat)
 
 
-def paint(lit: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
-    """Look up texture colours ``[n,3]``, sRGB; ``spread`` is the size of a sample on the surface, world units."""
-    uv, repeat = coordinates(lit.shapes, ids, points)
+def look_up_colors(lit: LitRoom, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
+    """Look up the texture colours ``[n,3]`` sRGB of points; ``spread`` is the size of a sample there, world units."""
+    uv, repeat = texture_coordinates(lit.shapes, ids, points)
     textures = np.array([s.material.texture for s in lit.shapes.shapes])[ids]
     size, num_levels = len(lit.mips[0][0]), len(lit.mips[0])
     levels = np.frexp(np.maximum(spread * repeat * size, 1) * 2**0.5)[1] - 1  # the nearest power of two
@@ -224,11 +224,11 @@ def paint(lit: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) -
     starts = np.flatnonzero(np.diff(mip_ids[order], prepend=-1))
     for rows in np.split(order, starts[1:]):  # the samples of one mipmap
         texture = lit.mips[textures[rows[0]]][levels[rows[0]]]
-        out[rows] = _lookup(texture, uv[rows])
+        out[rows] = _sample_texture(texture, uv[rows])
     return out
 
 
-def _lookup(texture: Picture, uv: Float) -> Float:
+def _sample_texture(texture: Texture, uv: Float) -> Float:
     """Sample a repeating texture bilinearly; y of the texture points down."""
     size = len(texture)
     remap_width = 4096  # columns of a table for cv2.remap, which takes at most 32767
@@ -240,8 +240,8 @@ def _lookup(texture: Picture, uv: Float) -> Float:
     return colors.reshape(-1, 3)[: len(uv)]
 
 
-def radiance(lit: LitStage, c2w: Array, lens: Pinhole, samples: int) -> Float:
-    """Render the linear light ``[h,w,3]`` of a view."""
+def render_light(lit: LitRoom, c2w: Array, lens: Pinhole, samples: int) -> Float:
+    """Render the linear light ``[h,w,3]`` that a view's pixels receive, with ``samples`` x ``samples`` rays each."""
     hits = trace(lit.shapes, c2w, lens, samples)
     h, w = hits.depth.shape
     out = np.zeros((h * w, 3), np.float32)
@@ -251,8 +251,8 @@ def radiance(lit: LitStage, c2w: Array, lens: Pinhole, samples: int) -> Float:
     return out.reshape(h, w, 3).reshape(lens.height, samples, lens.width, samples, 3).mean((1, 3))
 
 
-def _reflect(lit: LitStage, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens: Pinhole, samples: int) -> Float:
-    """Compute the linear light ``[n,3]`` of the samples ``rows [n]``, which hit a shape of the stage."""
+def _reflect(lit: LitRoom, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens: Pinhole, samples: int) -> Float:
+    """Compute the linear light ``[n,3]`` of the samples ``rows [n]``, which hit a shape of the room."""
     points, normals = hits.points.reshape(-1, 3)[rows], hits.normals.reshape(-1, 3)[rows]
     ids, depth = hits.ids.reshape(-1)[rows], hits.depth.reshape(-1)[rows]
     y, x = np.divmod(rows, hits.depth.shape[1])
@@ -260,19 +260,19 @@ def _reflect(lit: LitStage, hits: Hits, rows: NDArray[np.int64], c2w: Array, len
     rays = rotate(np.concatenate([rays, np.ones((len(rays), 1))], 1), c2w[:3, :3])
     positions = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
     rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    min_cosine = 0.1  # least cosine of a surface's tilt in the size of a sample, which has no bound at grazing angles
+    min_cosine = 0.1  # bounds the size of a sample on a surface, which would grow without end at grazing angles
     cosine = np.maximum(-(normals * rays).sum(1), min_cosine)
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
     gamma = 2.2  # exponent from sRGB to linear light
-    albedo = power(paint(lit, ids, points, spread), gamma)
+    albedo = power(look_up_colors(lit, ids, points, spread), gamma)
     return _shade(lit, ids, albedo, positions, normals, rays)
 
 
-def _incoming_light(lit: LitStage, positions: Float, normals: Float) -> tuple[Float, Float]:
+def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Float, Float]:
     """Compute the direct and the ambient light ``[n]`` that arrives at points, with shadows."""
-    light, half_side = lit.stage.light, lit.radius
+    light, half_side = lit.room.light, lit.radius
     direct, indirect = np.zeros((2, len(positions)), np.float32)
-    key_bias, ambient_bias = 2.0, 1.2  # texels of a shadow map by which surfaces may lie behind it and still be lit
+    key_bias, ambient_bias = 2.0, 1.2  # texels by which a surface may lie behind its shadow map's depth and be lit
     bias = key_bias * 2 * half_side / KEY_SIZE
     equal = np.full(KEY_MAPS, 1 / KEY_MAPS)
     # add_light adds to its last argument
@@ -281,15 +281,13 @@ def _incoming_light(lit: LitStage, positions: Float, normals: Float) -> tuple[Fl
     add_light(positions, normals, lit.axes[KEY_MAPS:], lit.middle, half_side, lit.ambient, bias, lit.weights, indirect)
     lamp_distance = np.linalg.norm(positions - light.lamp.astype(np.float32), axis=1)
     lamp_gain, lamp_falloff = 2.5, 1.5  # brightness of the direct light at the lamp, and its decrease with the distance
-    direct *= lamp_gain / (1 + (lamp_distance / norm(light.lamp - lit.stage.focus)) ** 2 * lamp_falloff)
+    direct *= lamp_gain / (1 + (lamp_distance / norm(light.lamp - lit.room.focus)) ** 2 * lamp_falloff)
     return direct, indirect
 
 
-def _shade(
-    lit: LitStage, ids: NDArray[np.int32], albedo: Float, positions: Float, normals: Float, rays: Float
-) -> Float:
+def _shade(lit: LitRoom, ids: NDArray[np.int32], albedo: Float, positions: Float, normals: Float, rays: Float) -> Float:
     """Compute the linear light ``[n,3]`` that points reflect or emit towards the camera."""
-    light, shapes = lit.stage.light, lit.shapes.shapes
+    light, shapes = lit.room.light, lit.shapes.shapes
     direct, indirect = _incoming_light(lit, positions, normals)
     gloss = np.array([s.material.gloss for s in shapes], np.float32)[ids]
     halfway = light.towards.astype(np.float32) - rays  # between light and camera (Blinn 1977)
@@ -306,16 +304,16 @@ def _shade(
 
 
 def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
-    """Find the exposure factor at which the developed pictures have the mean ``brightness``, sRGB, by bisection."""
+    """Find the exposure factor at which tone-mapped pictures have the mean ``brightness``, sRGB, by bisection."""
     values = np.concatenate([picture.reshape(-1) for picture in pictures])
     low, high = 1e-3, 1e3
     for _ in range(30):
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if develop(values * middle).mean() < brightness else (low, middle)
+        low, high = (middle, high) if tone_map(values * middle).mean() < brightness else (low, middle)
     return float((low * high) ** 0.5)
 
 
-def develop(linear: Float) -> Float:
-    """Convert linear light to sRGB in [0, 1]: a film curve (Narkowicz 2015), then gamma."""
+def tone_map(linear: Float) -> Float:
+    """Convert linear light to sRGB in [0, 1] with the curve of a film (Narkowicz 2015) and a gamma."""
     x = 0.6 * linear
     return power(np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1), 1 / 2.2)

@@ -16,9 +16,9 @@ from gsmerge.kernels.matrices import matmul
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
 Pair: TypeAlias = tuple[float, float]
-NUM_WAVES = 4  # waves that bend the surface of a shape
-NO_WAVES = np.zeros((NUM_WAVES, 5))
-TAPER, AMPLITUDE = 3, 4  # columns of a shape's size, and of its waves
+NUM_WAVES = 4  # number of waves that bend the surface of a shape
+NO_WAVES = np.zeros((NUM_WAVES, 5))  # waves with the amplitude 0, for a smooth surface
+TAPER, AMPLITUDE = 3, 4  # column of the taper in a shape's size, and of the amplitude in its waves
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Shape:
     material: Material
     centre: Array = field(default_factory=lambda: np.zeros(3))  # [3] world
     rotation: Array = field(default_factory=lambda: np.eye(3))  # [3,3] local to world
-    waves: Array = field(default_factory=lambda: NO_WAVES)  # [4,5] relief
-    shell: bool = False  # encloses the scene and casts no shadow
-    glow: bool = False  # as bright as its texture, independent of the light (sky, screens, lamps)
+    waves: Array = field(default_factory=lambda: NO_WAVES)  # [4,5] waves of the surface's relief
+    shell: bool = False  # True for walls, which enclose the scene and cast no shadow
+    glow: bool = False  # True if the shape is as bright as its texture in any light (sky, screens, lamps)
 
 
 def norm(vector: Array) -> float:
@@ -64,7 +64,7 @@ def invert_motion(motion: Array) -> Array:
 
 
 def axis_rotation(axis: int, angle: float) -> Array:
-    """Compute the rotation ``[3,3]`` about a coordinate axis, radians."""
+    """Compute the rotation ``[3,3]`` about coordinate axis 0, 1 or 2 by an angle in radians."""
     out = np.eye(3)
     i, j = [(1, 2), (2, 0), (0, 1)][axis]
     out[i, i] = out[j, j] = cos(angle)
@@ -72,7 +72,7 @@ def axis_rotation(axis: int, angle: float) -> Array:
     return out
 
 
-FACING_FRONT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # rotations with which quads and leaves face -z, and up
+FACING_FRONT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # with these rotations quads and leaves face -z, or up
 
 
 def box(low: Vector, high: Vector, material: Material) -> Shape:
@@ -83,7 +83,7 @@ def box(low: Vector, high: Vector, material: Material) -> Shape:
 
 
 def quad(centre: Vector, half: Pair, material: Material, rotation: Array = FACING_FRONT) -> Shape:
-    """Make a rectangle."""
+    """Make a rectangle with half sides ``half``; it faces -z unless it is rotated."""
     return Shape(QUAD, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
 
@@ -110,7 +110,7 @@ def rod(start: Vector, end: Vector, radius: float, material: Material) -> Shape:
 
 
 def leaf(centre: Vector, half: Pair, material: Material, rotation: Array) -> Shape:
-    """Make a pointed leaf, its tips along local y."""
+    """Make a pointed leaf with half sides ``half``; its tips are on the y axis of its own frame."""
     return Shape(LEAF, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
 
@@ -145,7 +145,7 @@ class ShapeArrays:
 
 
 def pack_shapes(shapes: Sequence[Shape]) -> ShapeArrays:
-    """Convert shapes to arrays."""
+    """Convert at least one shape to arrays."""
     return ShapeArrays(
         tuple(shapes),
         np.array([s.kind for s in shapes], np.int32),

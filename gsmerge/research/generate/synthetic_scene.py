@@ -15,19 +15,19 @@ from gsmerge.kernels.elementary import cos, exp, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
-from gsmerge.research.generate.objects import room
+from gsmerge.research.generate.objects import build_room
 from gsmerge.research.generate.photograph import (
     NO_SURFACE_DEPTH,
     SAMPLE_RAYS,
     Float,
     Hits,
-    LitStage,
+    LitRoom,
     Pinhole,
-    Stage,
-    develop,
+    Room,
     find_exposure,
-    light_stage,
-    radiance,
+    light_room,
+    render_light,
+    tone_map,
     trace,
 )
 from gsmerge.research.generate.shapes import Array, invert_motion, norm
@@ -39,11 +39,14 @@ from gsmerge.types import Cameras, Gaussians
 FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
 SWING = 35  # largest angle between -z and a camera, seen from the focus, degrees
 CAMERA_HEIGHTS = 0.9, 1.8  # range of the height of cameras above the ground, metres
-Path = Callable[[float], Array]  # position along a path, 0 to 1 -> camera-to-world matrix [4,4]
+CameraPath = Callable[[float], Array]  # from a position along the path, 0 to 1, to a camera-to-world matrix [4,4]
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
-    """Compute a camera-to-world matrix ``[4,4]``, OpenCV axes, upright (y down) except for ``roll`` radians."""
+    """Compute the camera-to-world matrix ``[4,4]``, OpenCV axes, of a camera at ``eye`` that looks at ``target``.
+
+    The camera is upright (y down) except for ``roll`` radians.
+    """
     forward = (target - eye) / norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= norm(right)
@@ -55,34 +58,35 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
     return out
 
 
-def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Path:
-    """Draw an arc around the focus that sways up and down."""
+def draw_path(room: Room, rng: np.random.Generator, num_views: int) -> CameraPath:
+    """Draw a random path: an arc around the focus, on which the camera also moves up and down."""
     max_turn = 50  # largest angle between neighbouring views, degrees
     limit = max_turn * max(1, num_views - 1)
     arc_degrees = 15, 60  # range of the angle that a path has around the focus, degrees
     span = rng.uniform(min(arc_degrees[0], limit), min(arc_degrees[1], limit))
     start = rng.uniform(-SWING, SWING - span)
-    distance, height = rng.uniform(*stage.distance), rng.uniform(*CAMERA_HEIGHTS)
-    swing = rng.uniform(0, 0.4) * (CAMERA_HEIGHTS[1] - CAMERA_HEIGHTS[0])
+    distance, height = rng.uniform(*room.distance), rng.uniform(*CAMERA_HEIGHTS)
+    sway = rng.uniform(0, 0.4) * (CAMERA_HEIGHTS[1] - CAMERA_HEIGHTS[0])  # largest change of the height, metres
     phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
 
     def pose(s: float) -> Array:
+        """Return the camera-to-world matrix at a position along the path, 0 to 1."""
         angle, radius = np.deg2rad(start + span * s), distance * (1 + closer * s)
-        x, _, z = stage.focus
-        eye = np.array([x + radius * sin(angle), -(height + swing * sin(6 * s + phase)), z - radius * cos(angle)])
-        return look_at(eye, stage.focus, 0.03 * sin(5 * s + phase))
+        x, _, z = room.focus
+        eye = np.array([x + radius * sin(angle), -(height + sway * sin(6 * s + phase)), z - radius * cos(angle)])
+        return look_at(eye, room.focus, 0.03 * sin(5 * s + phase))
 
     return pose
 
 
 def is_usable(hits: Hits) -> bool:
-    """Return True if a view's camera is outside all shapes and not too close to any."""
+    """Return True if most of a view's rays hit a shape, and the camera is not too close to any shape."""
     depth = hits.depth[hits.depth < NO_SURFACE_DEPTH]
     min_hits = 0.6  # least share of a usable view's rays that hit a shape
     if depth.size < min_hits * hits.depth.size:
         return False
     nearest = np.percentile(depth, 1)
-    min_near, min_near_metres = 0.22, 0.6  # least first percentile of depths: as a share of their median, or in metres
+    min_near, min_near_metres = 0.22, 0.6  # least distance of the nearest shape: in median depths, or in metres
     return bool(nearest > min_near * np.median(depth) or nearest > min_near_metres)
 
 
@@ -118,11 +122,11 @@ class SyntheticScene:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shoot:
-    """A lit room with a path of cameras, and the settings of its photos and of the simulated network."""
+class _PhotoSession:
+    """A lit room with the poses of cameras, and the settings of its photos and of the simulated network."""
 
-    lit: LitStage
-    poses: list[Array]  # camera to world, in metres: views at even places, held-out views between them
+    lit: LitRoom
+    poses: list[Array]  # camera to world, in metres, along the path: views at even indices, held-out views at odd ones
     to_export: Array  # [4,4] world of the room -> world of the exporter, without its unit
     lens: Pinhole  # camera of the views
     photo_lens: Pinhole  # camera of the photos
@@ -136,11 +140,11 @@ class _Shoot:
         return pose
 
     def take_photo(self, place: int, seed: int) -> Float:
-        """Take the photo ``[h,w,3]`` at one place of the path."""
-        return _photo(self.lit, self.poses[place], self.photo_lens, self.noise, self.gain, seed)
+        """Take the photo ``[h,w,3]`` of one pose."""
+        return _take_photo(self.lit, self.poses[place], self.photo_lens, self.noise, self.gain, seed)
 
     def predict(self, place: int, photo: Float, deviation: Array, seed: int) -> tuple[Array, Gaussians]:
-        """Simulate the network at one place of the path; return the pose and the Gaussians that it estimates.
+        """Simulate the network for one photo; return the pose and the Gaussians that it estimates.
 
         ``deviation [2,3]`` is the random error of the pose, see :func:`_perturb_pose`.
         """
@@ -154,78 +158,80 @@ class _Shoot:
         return pose, pixel_gaussians(view, self.lens, self.noise, np.random.default_rng(seed))
 
 
-def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScene:
+def make_synthetic_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScene:
     """Generate scene ``index`` of a series; the same arguments give the same bits on any number of threads."""
     rng = np.random.default_rng([seed, index])
-    shoot = _plan_shoot(rng, options)
-    num_places = len(shoot.poses)
+    session = _plan_session(rng, options)
+    num_places = len(session.poses)
     photo_seeds = rng.integers(0, 2**63, num_places)
-    # many exporters use the frame of the first camera
-    shoot = replace(shoot, to_export=invert_motion(shoot.poses[0]) if rng.random() < 0.5 else np.eye(4))
+    # Half of the scenes are in the frame of the first camera, as many exporters write them
+    session = replace(session, to_export=invert_motion(session.poses[0]) if rng.random() < 0.5 else np.eye(4))
     views, targets = range(0, num_places, 2), range(1, num_places, 2)
     errors = {place: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for place in views}
 
     def take_view(place: int) -> tuple[Float, Array, Gaussians | None]:
-        photo = shoot.take_photo(place, photo_seeds[place])
+        """Return the photo, the pose and the Gaussians of a place; held-out views have no Gaussians."""
+        photo = session.take_photo(place, photo_seeds[place])
         if place not in errors:
-            return photo, shoot.exported_pose(place), None
-        return photo, *shoot.predict(place, photo, *errors[place])
+            return photo, session.exported_pose(place), None
+        return photo, *session.predict(place, photo, *errors[place])
 
     photos, poses, gaussians = zip(*parallel_map(take_view, [*views, *targets]), strict=True)
     num_views = len(views)
     return SyntheticScene(
         gaussians=Gaussians.concat(list(gaussians[:num_views])),
-        cameras=_cameras(poses[:num_views], shoot.lens),
+        cameras=_to_cameras(poses[:num_views], session.lens),
         images=photos[:num_views],
-        targets=_cameras(poses[num_views:], shoot.photo_lens),
+        targets=_to_cameras(poses[num_views:], session.photo_lens),
         target_images=photos[num_views:],
-        noise=shoot.noise,
+        noise=session.noise,
     )
 
 
-def _plan_shoot(rng: np.random.Generator, options: GenerateOptions) -> _Shoot:
-    """Draw errors, cameras, room, path and exposure of a scene, in the world of the room."""
+def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoSession:
+    """Draw the errors, cameras, room, path and exposure of a scene; the world is that of the room."""
     noise = draw_noise(options.ranges, rng, options.noise)
     focal = max(options.width, options.height) * rng.uniform(*FOCAL)
     lens, scale = Pinhole(options.width, options.height, focal), options.photo_scale
     photo_lens = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)
-    lit, path = _find_stage(rng, photo_lens, options.views)
+    lit, path = _find_room(rng, photo_lens, options.views)
     poses = [path(s) for s in np.linspace(0, 1, 2 * options.views - 1)]
-    previews = [radiance(lit, pose, _shrink(lens), 1) for pose in poses[::2]]
+    previews = [render_light(lit, pose, _shrink_lens(lens), 1) for pose in poses[::2]]
     brightness = 0.22, 0.62  # range of the mean of a scene's photos, sRGB
     gain = find_exposure(previews, rng.uniform(*brightness))
-    return _Shoot(lit, poses, np.eye(4), lens, photo_lens, noise, gain)
+    return _PhotoSession(lit, poses, np.eye(4), lens, photo_lens, noise, gain)
 
 
-def _shrink(lens: Pinhole) -> Pinhole:
-    divisor = 8  # divides the sides of views to check if they are usable, and to compute exposures
+def _shrink_lens(lens: Pinhole) -> Pinhole:
+    """Return the lens of previews, which show if views are usable and how bright they are."""
+    divisor = 8  # divides the sides of views
     return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
 
-def _find_stage(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitStage, Path]:
+def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitRoom, CameraPath]:
     """Draw a room and a path on which all views are usable; after too many tries, return the last ones."""
     side = 1 << min(max(int(1.6 * max(lens.width, lens.height)).bit_length() - 1, 7), 10)  # side of textures, pixels
-    path_tries, stage_tries = 6, 6  # most paths per stage, and most stages, that are tried until all views are usable
-    for _ in range(stage_tries):
-        lit = light_stage(room(Palette(rng, side)))
+    path_tries, room_tries = 6, 6  # most paths per room, and most rooms
+    for _ in range(room_tries):
+        lit = light_room(build_room(Palette(rng, side)))
         for _ in range(path_tries):
-            path = draw_path(lit.stage, rng, num_views)
+            path = draw_path(lit.room, rng, num_views)
             poses = (path(s) for s in np.linspace(0, 1, 2 * num_views - 1))
-            if all(is_usable(trace(lit.shapes, pose, _shrink(lens), 1)) for pose in poses):
+            if all(is_usable(trace(lit.shapes, pose, _shrink_lens(lens), 1)) for pose in poses):
                 return lit, path
     return lit, path
 
 
-def _photo(lit: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
-    """Take a photo with the errors of lens, sensor and exposure."""
+def _take_photo(lit: LitRoom, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
+    """Render a photo with the errors of lens, sensor and exposure."""
     rng = np.random.default_rng(seed)
-    linear = radiance(lit, pose, lens, SAMPLE_RAYS)
+    linear = render_light(lit, pose, lens, SAMPLE_RAYS)
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     square_radius = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
     vignette = 0.3  # loss of light at a distance of one diagonal from the middle of a photo; grows with its square
     linear = linear * gains.astype(np.float32) * (1 - vignette * square_radius)[..., None].astype(np.float32)
-    image = blur(develop(linear), noise.blur)
+    image = blur(tone_map(linear), noise.blur)
     sensor_noise = 0.004  # standard deviation of the noise of a photo, sRGB
     image = np.clip(image + rng.normal(0, sensor_noise, image.shape), 0, 1).astype(np.float32)
     return np.round(image * 255) / np.float32(255)
@@ -246,6 +252,7 @@ def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> 
     return out
 
 
-def _cameras(poses: Sequence[Array], lens: Pinhole) -> Cameras:
+def _to_cameras(poses: Sequence[Array], lens: Pinhole) -> Cameras:
+    """Return cameras with one lens at camera-to-world poses."""
     viewmats = np.stack([invert_motion(pose) for pose in poses])
     return Cameras(viewmats, np.repeat(lens.intrinsics[None], len(poses), 0), lens.width, lens.height)

@@ -1,6 +1,6 @@
 """Draw textures from random numbers: square colour pictures that repeat without a seam.
 
-Every function of ``KINDS`` is ``(rng, size) -> [size,size,3]`` float32, sRGB in [0, 1].
+Every function of ``KINDS`` takes a generator of random numbers and a side in pixels, and returns a texture.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from gsmerge.kernels import pictures
 from gsmerge.kernels.elementary import cos, power, sin
 from gsmerge.research.generate.shapes import Material
 
-Picture: TypeAlias = NDArray[Any]  # float32
-Color: TypeAlias = NDArray[Any]
-Grey: TypeAlias = NDArray[Any]  # float32: square, repeating without a seam, 0 to 1
+Texture: TypeAlias = NDArray[Any]  # [size,size,3] float32 that repeats without a seam, sRGB in [0, 1]
+Color: TypeAlias = NDArray[Any]  # [3] sRGB in [0, 1]
+Grey: TypeAlias = NDArray[Any]  # [size,size] float32 that repeats without a seam, 0 to 1
 
 
 def enlarge_texture(cells: NDArray[np.float64], size: int) -> Grey:
@@ -27,10 +27,10 @@ def enlarge_texture(cells: NDArray[np.float64], size: int) -> Grey:
     return pictures.enlarge(cells, size, size, periodic=True)
 
 
-def noise(
+def draw_octaves(
     rng: np.random.Generator, size: int, *, first: int = 4, fade: float = 0.6, stretch: int = 1, ridged: bool = False
 ) -> Grey:
-    """Draw noise as a sum of octaves. Each octave is ``fade`` times as strong as the one before.
+    """Draw noise as a sum of octaves. Each octave has half the cell size and ``fade`` times the strength of the last.
 
     A ``fade`` of 0.3 gives clouds, 0.9 gives grit. ``first`` is the number of cells of the coarsest octave along a
     side. ``stretch`` is the ratio of a cell's length to its height. ``ridged`` gives sharp crests, as in rock and bark.
@@ -44,14 +44,14 @@ def noise(
     return np.clip((out - low) / (high - low), 0, 1).astype(np.float32)
 
 
-def grid(size: int) -> tuple[Grey, Grey]:
-    """Return x and y of every pixel, 0 to 1."""
+def pixel_places(size: int) -> tuple[Grey, Grey]:
+    """Return x and y of the centre of every pixel, in sides of the picture."""
     centres = (np.arange(size, dtype=np.float32) + 0.5) / size
     x, y = np.meshgrid(centres, centres)
     return x, y
 
 
-def courses(
+def draw_courses(
     rng: np.random.Generator, size: int, rows: int, columns: int, *, joint: float, offset: float
 ) -> tuple[Grey, Grey]:
     """Draw ``rows`` courses of ``columns`` bricks or tiles; return each pixel's random tone, and a mask of the joints.
@@ -59,17 +59,17 @@ def courses(
     ``joint`` is the width of the joints as a share of a stone's height, and ``offset`` the shift of every second course
     as a share of a stone's width.
     """
-    x, y = grid(size)
+    x, y = pixel_places(size)
     row = np.floor(y * rows).astype(int)
-    along = x * columns + offset * (row % 2)
-    down, across = y * rows - row, along - np.floor(along)
+    along = x * columns + offset * (row % 2)  # place along the row, in bricks
+    down, across = y * rows - row, along - np.floor(along)  # place within the brick, 0 to 1
     tones = rng.uniform(0, 1, (rows, columns)).astype(np.float32)
     width = joint * columns / rows
     lines = np.minimum(np.minimum(down, 1 - down) / joint, np.minimum(across, 1 - across) / width)
     return tones[row, np.floor(along).astype(int) % columns], np.clip(1.5 - 2 * lines, 0, 1).astype(np.float32)
 
 
-def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
+def draw_pebbles(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
     """Draw ``count``² pebbles; return the random tone of each pixel's pebble, and the distance to the pebble's edge.
 
     Pebbles are the Voronoi cells of random points, one point in each square of a grid.
@@ -78,7 +78,7 @@ def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
         np.stack(np.meshgrid(np.arange(count), np.arange(count)), -1) + rng.uniform(0, 1, (count, count, 2))
     ) / count
     tones = rng.uniform(0, 1, (count, count)).astype(np.float32)
-    x, y = grid(size)
+    x, y = pixel_places(size)
     column, row = np.floor(x * count).astype(int), np.floor(y * count).astype(int)
     nearest, second = np.full((size, size), 9.0, np.float32), np.full((size, size), 9.0, np.float32)
     tone = np.zeros((size, size), np.float32)
@@ -93,8 +93,8 @@ def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
     return tone, np.clip((second - nearest) * count, 0, 1).astype(np.float32)
 
 
-def glyphs(rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
-    """Draw letters ``[count,7,5]`` of an invented alphabet, a few strokes each."""
+def draw_letters(rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
+    """Draw masks ``[count,7,5]`` of the letters of an invented alphabet, a few strokes each."""
     out = np.zeros((count, 7, 5), np.uint8)
     for letter in out:
         for _ in range(rng.integers(2, 5)):
@@ -105,8 +105,8 @@ def glyphs(rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
     return out
 
 
-def text_line(rng: np.random.Generator, alphabet: NDArray[np.uint8], height: int, width: int) -> Grey:
-    """Draw the ink ``[height,width]`` of one line of words."""
+def draw_text_line(rng: np.random.Generator, alphabet: NDArray[np.uint8], height: int, width: int) -> Grey:
+    """Draw one line of words; return the ink ``[height,width]``, from 0 for paper to 1."""
     line = np.zeros((7, max(6, 7 * width // height)), np.uint8)
     column = 0
     pitch, word_space = 6, 4  # pixels from letter to letter, and additional pixels between words
@@ -119,244 +119,274 @@ def text_line(rng: np.random.Generator, alphabet: NDArray[np.uint8], height: int
     return cv2.resize(line.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
 
-def color(
+def draw_color(
     rng: np.random.Generator,
     *,
     hue: tuple[float, float] | None = None,
     strength: tuple[float, float] = (0.05, 0.6),
     light: tuple[float, float] = (0.2, 0.85),
 ) -> Color:
-    """Draw a random colour ``[3]`` from ranges of hue (0 to 1; None: all, mostly warm), saturation and value."""
+    """Draw a random colour from ranges of hue (0 to 1), saturation (``strength``) and value (``light``).
+
+    Without a range of hues, half of the colours are warm and the others have any hue.
+    """
     h = rng.uniform(*hue) % 1 if hue is not None else rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()
     s, v = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5, rng.uniform(*light)
     ramp = np.clip(np.abs(np.mod(6 * h + np.array([0, 4, 2]), 6) - 3) - 1, 0, 1)
     return (v * (1 - s * (1 - ramp))).astype(np.float32)
 
 
-def shades(rng: np.random.Generator, base: Color, contrast: float) -> tuple[Color, Color]:
-    """Draw a darker and a lighter neighbour of a colour."""
+def draw_shades(rng: np.random.Generator, base: Color, contrast: float) -> tuple[Color, Color]:
+    """Draw a darker and a lighter variant of a colour."""
     tint = rng.normal(0, 0.03, 3) * contrast
     return np.clip(base * (1 - contrast) - tint, 0, 1), np.clip(base + (1 - base) * contrast * 0.6 + tint, 0, 1)
 
 
-def mix(low: Color, high: Color, amount: Grey) -> Picture:
-    """Mix two colours by an ``amount`` per pixel."""
+def mix_colors(low: Color, high: Color, amount: Grey) -> Texture:
+    """Mix two colours; ``amount`` is the share of ``high`` at each pixel."""
     return low + (high - low) * amount[..., None].astype(np.float32)
 
 
-def plain(rng: np.random.Generator, size: int) -> Picture:
+def draw_plain(rng: np.random.Generator, size: int) -> Texture:
     """Draw paint: almost no texture."""
-    base = color(rng, light=(0.35, 0.95), strength=(0, 0.5))
-    return mix(*shades(rng, base, rng.uniform(0.01, 0.05)), noise(rng, size, first=2, fade=0.5))
+    base = draw_color(rng, light=(0.35, 0.95), strength=(0, 0.5))
+    return mix_colors(*draw_shades(rng, base, rng.uniform(0.01, 0.05)), draw_octaves(rng, size, first=2, fade=0.5))
 
 
-def plaster(rng: np.random.Generator, size: int) -> Picture:
-    """Draw rough paint, stone, concrete."""
-    low, high = shades(rng, color(rng, strength=(0, 0.3)), rng.uniform(0.1, 0.4))
-    clouds, grit = noise(rng, size, fade=0.6), noise(rng, size, first=64, fade=0.9)
-    return mix(low, high, 0.6 * clouds + 0.4 * grit)
+def draw_plaster(rng: np.random.Generator, size: int) -> Texture:
+    """Draw rough paint, stone or concrete."""
+    low, high = draw_shades(rng, draw_color(rng, strength=(0, 0.3)), rng.uniform(0.1, 0.4))
+    clouds, grit = draw_octaves(rng, size, fade=0.6), draw_octaves(rng, size, first=64, fade=0.9)
+    return mix_colors(low, high, 0.6 * clouds + 0.4 * grit)
 
 
-def granite(rng: np.random.Generator, size: int) -> Picture:
+def draw_granite(rng: np.random.Generator, size: int) -> Texture:
     """Draw speckles of three colours."""
-    base = color(rng, strength=(0, 0.25))
-    out = mix(*shades(rng, base, 0.3), noise(rng, size, first=64, fade=0.9))
-    speck = noise(rng, size, first=128, fade=0.7)[..., None]
-    dark, pale = (base + rng.uniform(0.2, 0.8) * (color(rng, light=v) - base) for v in ((0.05, 0.25), (0.75, 1)))
+    base = draw_color(rng, strength=(0, 0.25))
+    out = mix_colors(*draw_shades(rng, base, 0.3), draw_octaves(rng, size, first=64, fade=0.9))
+    speck = draw_octaves(rng, size, first=128, fade=0.7)[..., None]
+    dark, pale = (base + rng.uniform(0.2, 0.8) * (draw_color(rng, light=v) - base) for v in ((0.05, 0.25), (0.75, 1)))
     return np.where(speck > 0.75, pale, np.where(speck < 0.22, dark, out)).astype(np.float32)
 
 
-def marble(rng: np.random.Generator, size: int) -> Picture:
+def draw_marble(rng: np.random.Generator, size: int) -> Texture:
     """Draw the veins of marble."""
-    low, high = shades(rng, color(rng, strength=(0, 0.3), light=(0.4, 0.9)), 0.5)
-    bend = noise(rng, size, fade=0.55)
-    x, y = grid(size)
+    low, high = draw_shades(rng, draw_color(rng, strength=(0, 0.3), light=(0.4, 0.9)), 0.5)
+    bend = draw_octaves(rng, size, fade=0.55)
+    x, y = pixel_places(size)
     veins = power(np.abs(sin(np.pi * (2 * x + 2 * y + 3 * bend))), 0.4)
-    return mix(low, high, 0.8 * veins + 0.2 * noise(rng, size, first=16, fade=0.8))
+    return mix_colors(low, high, 0.8 * veins + 0.2 * draw_octaves(rng, size, first=16, fade=0.8))
 
 
-def wood(rng: np.random.Generator, size: int) -> Picture:
+def draw_wood(rng: np.random.Generator, size: int) -> Texture:
     """Draw planks with grain along x."""
-    low, high = shades(rng, color(rng, hue=(0.04, 0.11), strength=(0.3, 0.7), light=(0.3, 0.8)), 0.45)
+    low, high = draw_shades(rng, draw_color(rng, hue=(0.04, 0.11), strength=(0.3, 0.7), light=(0.3, 0.8)), 0.45)
     planks = int(rng.integers(2, 7))
-    tone, joint = courses(rng, size, planks, int(rng.integers(1, 3)), joint=rng.uniform(0.01, 0.03), offset=0.5)
-    rings = np.abs(sin(20 * noise(rng, size, first=16, fade=0.35, stretch=8) + 9 * tone))
-    fibres = noise(rng, size, first=128, fade=0.8, stretch=32)
-    out = mix(low, high, 0.35 * rings + 0.35 * fibres + 0.3 * tone)
+    tone, joint = draw_courses(rng, size, planks, int(rng.integers(1, 3)), joint=rng.uniform(0.01, 0.03), offset=0.5)
+    rings = np.abs(sin(20 * draw_octaves(rng, size, first=16, fade=0.35, stretch=8) + 9 * tone))
+    fibres = draw_octaves(rng, size, first=128, fade=0.8, stretch=32)
+    out = mix_colors(low, high, 0.35 * rings + 0.35 * fibres + 0.3 * tone)
     return (out * (1 - 0.7 * joint[..., None])).astype(np.float32)
 
 
-def tiles(rng: np.random.Generator, size: int) -> Picture:
+def draw_tiles(rng: np.random.Generator, size: int) -> Texture:
     """Draw tiles with joints, of one colour or chequered."""
     count = 2 * int(rng.integers(1, 5))
-    base = color(rng, strength=(0, 0.5))
-    low, high = shades(rng, base, rng.uniform(0.05, 0.3))
-    tone, joint = courses(rng, size, count, count, joint=rng.uniform(0.02, 0.05), offset=0.0)
+    base = draw_color(rng, strength=(0, 0.5))
+    low, high = draw_shades(rng, base, rng.uniform(0.05, 0.3))
+    tone, joint = draw_courses(rng, size, count, count, joint=rng.uniform(0.02, 0.05), offset=0.0)
     if rng.random() < 0.4:
-        x, y = grid(size)
+        x, y = pixel_places(size)
         tone = 0.2 * tone + 0.8 * ((np.floor(x * count) + np.floor(y * count)) % 2)
-    out = mix(low, high, 0.6 * tone + 0.4 * noise(rng, size, first=8, fade=0.75))
-    return out + (color(rng, strength=(0, 0.2)) - out) * joint[..., None]
+    out = mix_colors(low, high, 0.6 * tone + 0.4 * draw_octaves(rng, size, first=8, fade=0.75))
+    return out + (draw_color(rng, strength=(0, 0.2)) - out) * joint[..., None]
 
 
-def bricks(rng: np.random.Generator, size: int) -> Picture:
+def draw_bricks(rng: np.random.Generator, size: int) -> Texture:
     """Draw courses of bricks or hewn stones."""
     rows = 2 * int(rng.integers(3, 7))
     stone = rng.random() < 0.5
     hue = (0.05, 0.13) if stone else (0.0, 0.07)
-    base = color(rng, hue=hue, strength=(0.05, 0.3) if stone else (0.35, 0.7), light=(0.4, 0.75))
-    low, high = shades(rng, base, 0.35)
-    tone, joint = courses(rng, size, rows, rows // 2, joint=rng.uniform(0.05, 0.1), offset=0.5)
-    dx, dy = (noise(rng, size, first=16, fade=0.6) for _ in range(2))
-    x, y = grid(size)
+    base = draw_color(rng, hue=hue, strength=(0.05, 0.3) if stone else (0.35, 0.7), light=(0.4, 0.75))
+    low, high = draw_shades(rng, base, 0.35)
+    tone, joint = draw_courses(rng, size, rows, rows // 2, joint=rng.uniform(0.05, 0.1), offset=0.5)
+    dx, dy = (draw_octaves(rng, size, first=16, fade=0.6) for _ in range(2))
+    x, y = pixel_places(size)
     at_x, at_y = (((at + 0.01 * (shift - 0.5)) * size - 0.5) % size for at, shift in ((x, dx), (y, dy)))
     tone, joint = (
         cv2.remap(picture, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for picture in (tone, joint)
     )
-    out = mix(low, high, 0.5 * tone + 0.5 * noise(rng, size, first=8, fade=0.85))
-    return out + (color(rng, strength=(0, 0.15), light=(0.4, 0.8)) - out) * joint[..., None]
+    out = mix_colors(low, high, 0.5 * tone + 0.5 * draw_octaves(rng, size, first=8, fade=0.85))
+    return out + (draw_color(rng, strength=(0, 0.15), light=(0.4, 0.8)) - out) * joint[..., None]
 
 
-def cloth(rng: np.random.Generator, size: int) -> Picture:
+def draw_cloth(rng: np.random.Generator, size: int) -> Texture:
     """Draw a weave with stripes or checks."""
-    x, y = grid(size)
-    count, base = int(rng.integers(3, 12)), color(rng, strength=(0.1, 0.8))
-    other = color(rng, strength=(0.0, 0.7))
+    x, y = pixel_places(size)
+    count, base = int(rng.integers(3, 12)), draw_color(rng, strength=(0.1, 0.8))
+    other = draw_color(rng, strength=(0.0, 0.7))
     bands = [(np.mod(count * c, 1) < rng.uniform(0.2, 0.6)).astype(np.float32) for c in (x, y)]
     kind = rng.integers(0, 3)
     amount = bands[0] if kind == 0 else 0.5 * bands[0] + 0.5 * bands[1] if kind == 1 else np.zeros_like(x)
     threads = 2 ** int(rng.integers(5, 8))
     weave = 0.5 + 0.5 * sin(2 * np.pi * threads * x) * sin(2 * np.pi * threads * y)
-    shade = 0.75 + 0.15 * weave + 0.2 * (noise(rng, size, fade=0.7) - 0.5)
-    return np.clip(mix(base, other, amount) * shade[..., None], 0, 1).astype(np.float32)
+    shade = 0.75 + 0.15 * weave + 0.2 * (draw_octaves(rng, size, fade=0.7) - 0.5)
+    return np.clip(mix_colors(base, other, amount) * shade[..., None], 0, 1).astype(np.float32)
 
 
-def carpet(rng: np.random.Generator, size: int) -> Picture:
+def draw_carpet(rng: np.random.Generator, size: int) -> Texture:
     """Draw a carpet: plain pile, or an ornament of a few colours."""
-    base = color(rng, strength=(0.1, 0.7), light=(0.2, 0.6))
-    out = mix(*shades(rng, base, 0.4), noise(rng, size, first=32, fade=0.95))
+    base = draw_color(rng, strength=(0.1, 0.7), light=(0.2, 0.6))
+    out = mix_colors(*draw_shades(rng, base, 0.4), draw_octaves(rng, size, first=32, fade=0.95))
     if rng.random() < 0.5:
         motif = enlarge_texture(np.pad(rng.uniform(0, 1, (4, 4)), ((0, 4), (0, 4)), mode="symmetric"), size)
         mask = np.mod(3 * motif, 1)[..., None] > 0.5
-        out = np.where(mask, out, 0.3 * out + 0.7 * color(rng, strength=(0.2, 0.8)))
+        out = np.where(mask, out, 0.3 * out + 0.7 * draw_color(rng, strength=(0.2, 0.8)))
     return out.astype(np.float32)
 
 
-def bark(rng: np.random.Generator, size: int) -> Picture:
+def draw_bark(rng: np.random.Generator, size: int) -> Texture:
     """Draw bark with furrows along y."""
-    base = color(rng, hue=(0.04, 0.12), strength=(0.1, 0.5), light=(0.25, 0.55))
-    return mix(*shades(rng, base, 0.6), noise(rng, size, first=32, fade=0.75, stretch=4, ridged=True).T)
+    base = draw_color(rng, hue=(0.04, 0.12), strength=(0.1, 0.5), light=(0.25, 0.55))
+    return mix_colors(
+        *draw_shades(rng, base, 0.6), draw_octaves(rng, size, first=32, fade=0.75, stretch=4, ridged=True).T
+    )
 
 
-def foliage(rng: np.random.Generator, size: int) -> Picture:
+def draw_foliage(rng: np.random.Generator, size: int) -> Texture:
     """Draw one leaf: veins from a middle rib."""
-    base = color(rng, hue=(0.2, 0.38), strength=(0.4, 0.85), light=(0.2, 0.6))
+    base = draw_color(rng, hue=(0.2, 0.38), strength=(0.4, 0.85), light=(0.2, 0.6))
     if rng.random() < 0.25:  # petals
-        base = color(rng, hue=(0.8, 1.12), strength=(0.4, 0.9), light=(0.6, 0.95))
-    low, high = shades(rng, base, 0.45)
-    x, y = grid(size)
+        base = draw_color(rng, hue=(0.8, 1.12), strength=(0.4, 0.9), light=(0.6, 0.95))
+    low, high = draw_shades(rng, base, 0.45)
+    x, y = pixel_places(size)
     side = np.abs(x - 0.5)
     veins = np.clip(1 - np.abs(sin(np.pi * 12 * (y - side))) * 5, 0, 1) * 0.5
     rib = np.clip(1 - side * 30, 0, 1)
-    return mix(low, high, np.clip(0.35 * noise(rng, size, fade=0.7) + np.maximum(veins, rib) + 0.4 * (1 - y), 0, 1))
+    return mix_colors(
+        low, high, np.clip(0.35 * draw_octaves(rng, size, fade=0.7) + np.maximum(veins, rib) + 0.4 * (1 - y), 0, 1)
+    )
 
 
-def crown(rng: np.random.Generator, size: int) -> Picture:
+def draw_crown(rng: np.random.Generator, size: int) -> Texture:
     """Draw distant leaves, as seen through a window."""
-    tone, edge = cells(rng, size, int(rng.integers(24, 56)))
-    base = color(rng, hue=(0.18, 0.36), strength=(0.35, 0.8), light=(0.25, 0.55))
-    low, high = shades(rng, base, 0.6)
-    leaves = np.clip(0.5 * tone + 0.6 * noise(rng, size, first=4, fade=0.75) - 0.1, 0, 1)
-    return mix(low, high, leaves) * (0.25 + 0.75 * np.clip(4 * edge, 0, 1))[..., None]
+    tone, edge = draw_pebbles(rng, size, int(rng.integers(24, 56)))
+    base = draw_color(rng, hue=(0.18, 0.36), strength=(0.35, 0.8), light=(0.25, 0.55))
+    low, high = draw_shades(rng, base, 0.6)
+    leaves = np.clip(0.5 * tone + 0.6 * draw_octaves(rng, size, first=4, fade=0.75) - 0.1, 0, 1)
+    return mix_colors(low, high, leaves) * (0.25 + 0.75 * np.clip(4 * edge, 0, 1))[..., None]
 
 
-def gradient(rng: np.random.Generator, size: int) -> Picture:
+def draw_gradient(rng: np.random.Generator, size: int) -> Texture:
     """Fade from one colour into another and back."""
-    _, y = grid(size)
-    return mix(color(rng), color(rng), 0.5 - 0.5 * cos(2 * np.pi * y))
+    _, y = pixel_places(size)
+    return mix_colors(draw_color(rng), draw_color(rng), 0.5 - 0.5 * cos(2 * np.pi * y))
 
 
-def printed(rng: np.random.Generator, size: int) -> Picture:
-    """Draw a page: heading, columns of text, pictures."""
-    paper = color(rng, strength=(0, 0.12), light=(0.8, 1)) if rng.random() < 0.7 else color(rng)
-    ink = color(rng, light=(0.02, 0.3)) if paper.mean() > 0.45 else color(rng, light=(0.85, 1), strength=(0, 0.2))
-    page, letters = np.tile(paper, (size, size, 1)).astype(np.float32), glyphs(rng, 26)
+def draw_printed(rng: np.random.Generator, size: int) -> Texture:
+    """Draw a page with headings, lines of text and pictures."""
+    paper = draw_color(rng, strength=(0, 0.12), light=(0.8, 1)) if rng.random() < 0.7 else draw_color(rng)
+    ink = (
+        draw_color(rng, light=(0.02, 0.3))
+        if paper.mean() > 0.45
+        else draw_color(rng, light=(0.85, 1), strength=(0, 0.2))
+    )
+    page, letters = np.tile(paper, (size, size, 1)).astype(np.float32), draw_letters(rng, 26)
     margin, y = size // 16, size // 16
     page[: size // 64] = page[:, : size // 64] = 0.7 * paper
     while y < size - 2 * margin:
-        draw, left = rng.random(), margin
-        is_heading, is_picture = draw < 0.2, draw > 0.8
+        chance, left = rng.random(), margin
+        is_heading, is_picture = chance < 0.2, chance > 0.8
         height = size // int(rng.integers(6, 12)) if is_heading else size // int(rng.integers(22, 44))
         width = int(rng.uniform(0.5, 1) * (size - 2 * margin))
         if is_picture:  # with text beside it
             height, picture_width = int(rng.uniform(0.1, 0.25) * size), int(rng.uniform(0.2, 0.5) * size)
             area = page[y : y + height, left : left + picture_width]
-            area[:] = mix(color(rng), color(rng), noise(rng, size, first=4, fade=0.6))[: area.shape[0], : area.shape[1]]
+            area[:] = mix_colors(draw_color(rng), draw_color(rng), draw_octaves(rng, size, first=4, fade=0.6))[
+                : area.shape[0], : area.shape[1]
+            ]
             left, width = left + picture_width + margin // 2, size - 2 * margin - picture_width
             height //= 4
-        line = text_line(rng, letters, height, max(8, width))
+        line = draw_text_line(rng, letters, height, max(8, width))
         area = page[y : y + height, left : min(left + width, size - margin)]
         area += (ink - area) * line[: area.shape[0], : area.shape[1], None]
         y += int(height * rng.uniform(1.3, 1.7)) + (size // 8 if is_picture else 0)
     return page
 
 
-def label(rng: np.random.Generator, size: int) -> Picture:
-    """Draw a package: bands, discs, large and small letters."""
-    x, y = grid(size)
-    page = mix(color(rng, strength=(0.3, 0.95)), color(rng, strength=(0.2, 0.9)), np.abs(2 * y - 1))
+def draw_label(rng: np.random.Generator, size: int) -> Texture:
+    """Draw the front of a package: bands, discs, large and small letters."""
+    x, y = pixel_places(size)
+    page = mix_colors(draw_color(rng, strength=(0.3, 0.95)), draw_color(rng, strength=(0.2, 0.9)), np.abs(2 * y - 1))
     for _ in range(rng.integers(2, 6)):
         cx, cy, r = rng.uniform(0, 1), rng.uniform(0, 1), rng.uniform(0.06, 0.3)
         inside = np.square(x - cx) + np.square(y - cy) < r * r if rng.random() < 0.5 else np.abs(y - cy) < r / 3
-        page = np.where(inside[..., None], color(rng, strength=(0.1, 0.95)), page)
-    letters = glyphs(rng, 26)
+        page = np.where(inside[..., None], draw_color(rng, strength=(0.1, 0.95)), page)
+    letters = draw_letters(rng, 26)
     for _ in range(rng.integers(3, 9)):
         height = size // int(rng.integers(5, 30))
         top, left = int(rng.integers(0, size - height)), int(rng.integers(0, size // 2))
         area = page[top : top + height, left : left + int(rng.integers(size // 5, size // 2))]
-        ink = color(rng, strength=(0, 0.4), light=(0.85, 1) if rng.random() < 0.5 else (0, 0.2))
-        area += (ink - area) * text_line(rng, letters, height, area.shape[1])[..., None]
-    return np.clip(page * (0.97 + 0.06 * noise(rng, size, first=16)[..., None]), 0, 1).astype(np.float32)
+        ink = draw_color(rng, strength=(0, 0.4), light=(0.85, 1) if rng.random() < 0.5 else (0, 0.2))
+        area += (ink - area) * draw_text_line(rng, letters, height, area.shape[1])[..., None]
+    return np.clip(page * (0.97 + 0.06 * draw_octaves(rng, size, first=16)[..., None]), 0, 1).astype(np.float32)
 
 
-def spines(rng: np.random.Generator, size: int) -> Picture:
-    """Draw a row of books, or files, or planks of many colours."""
-    page, letters, x = np.zeros((size, size, 3), np.float32), glyphs(rng, 26), 0
+def draw_spines(rng: np.random.Generator, size: int) -> Texture:
+    """Draw the backs of a row of books of many colours."""
+    page, letters, x = np.zeros((size, size, 3), np.float32), draw_letters(rng, 26), 0
     while x < size:
         width = int(rng.uniform(0.02, 0.09) * size)
         book = page[:, x : x + width]
-        book[:] = color(rng, strength=(0.1, 0.8), light=(0.15, 0.95))
+        book[:] = draw_color(rng, strength=(0.1, 0.8), light=(0.15, 0.95))
         if book.shape[1] > size // 40:
-            line = text_line(rng, letters, book.shape[1], size)
-            book += (color(rng, strength=(0, 0.3), light=(0.8, 1)) - book) * line.T[:, : book.shape[1], None] * 0.8
+            line = draw_text_line(rng, letters, book.shape[1], size)
+            book += (draw_color(rng, strength=(0, 0.3), light=(0.8, 1)) - book) * line.T[:, : book.shape[1], None] * 0.8
         book *= np.sqrt(sin(np.linspace(0.5, 2.6, book.shape[1])))[None, :, None]
         book[: int(rng.uniform(0, 0.2) * size)] *= 0.12
         x += width
     return page
 
 
-def sky(rng: np.random.Generator, size: int) -> Picture:
-    """Draw a blue or grey sky with clouds; the horizon at y = 1/2."""
-    _, y = grid(size)
-    high = color(rng, hue=(0.56, 0.63), strength=(0.0, 0.6), light=(0.6, 0.95))
+def draw_sky(rng: np.random.Generator, size: int) -> Texture:
+    """Draw a blue or grey sky with clouds. The horizon is at y = 1/2."""
+    _, y = pixel_places(size)
+    high = draw_color(rng, hue=(0.56, 0.63), strength=(0.0, 0.6), light=(0.6, 0.95))
     low = np.array([0.9, 0.92, 0.95], np.float32)
-    clouds = np.clip(rng.uniform(0.8, 2.5) * (noise(rng, size, first=4, fade=0.55) - rng.uniform(0.3, 0.8)), 0, 1)
-    out = mix(high, low, np.clip(1 - 2.2 * np.abs(y - 0.5), 0, 1) ** 2)
+    clouds = np.clip(
+        rng.uniform(0.8, 2.5) * (draw_octaves(rng, size, first=4, fade=0.55) - rng.uniform(0.3, 0.8)), 0, 1
+    )
+    out = mix_colors(high, low, np.clip(1 - 2.2 * np.abs(y - 0.5), 0, 1) ** 2)
     return out + (0.97 - out) * clouds[..., None]
 
 
-KINDS: dict[str, Callable[[np.random.Generator, int], Picture]] = {
-    maker.__name__: maker
+KINDS: dict[str, Callable[[np.random.Generator, int], Texture]] = {
+    maker.__name__.removeprefix("draw_"): maker
     for maker in (
-        *(plain, plaster, granite, marble, wood, tiles, bricks, cloth, carpet, bark),
-        *(foliage, crown, gradient, printed, label, spines, sky),
+        draw_plain,
+        draw_plaster,
+        draw_granite,
+        draw_marble,
+        draw_wood,
+        draw_tiles,
+        draw_bricks,
+        draw_cloth,
+        draw_carpet,
+        draw_bark,
+        draw_foliage,
+        draw_crown,
+        draw_gradient,
+        draw_printed,
+        draw_label,
+        draw_spines,
+        draw_sky,
     )
 }
 
 
-def pyramid(texture: Picture) -> list[Picture]:
-    """Make mipmaps: halve a texture repeatedly, down to 8 pixels."""
-    out: list[Picture] = [np.ascontiguousarray(texture, np.float32)]
+def make_mipmaps(texture: Texture) -> list[Texture]:
+    """Return a texture and its mipmaps, each half as large as the one before, down to sides of 8 pixels."""
+    out: list[Texture] = [np.ascontiguousarray(texture, np.float32)]
     while len(out[-1]) > 8:
         half = len(out[-1]) // 2
         out.append(cv2.resize(out[-1], (half, half), interpolation=cv2.INTER_AREA))
@@ -368,18 +398,18 @@ MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4} 
 
 @dataclass
 class Palette:
-    """The textures of a scene, created on demand."""
+    """The textures of a scene, drawn when a material first needs them."""
 
     rng: np.random.Generator
     size: int  # side of the textures, pixels
-    textures: list[Picture] = field(default_factory=list)
+    textures: list[Texture] = field(default_factory=list)
     by_kind: dict[str, list[int]] = field(default_factory=dict)  # indices of the textures of each kind
 
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
-        """Make a material of one of the kinds. Its texture is new, or an existing one if the kind has enough textures.
+        """Make a material of a random one of ``kinds``. Its texture is new, unless the kind has enough textures.
 
-        ``repeat`` is the number of repeats per world unit; 0: once over every face. ``gloss`` is random by default, and
-        zero in about half of the cases.
+        ``repeat`` is the number of repeats per world unit; with 0 the texture covers every face once. ``gloss`` is
+        random by default, and zero in about half of the cases.
         """
         kind = kinds[self.rng.integers(len(kinds))]
         other_textures = 3  # most textures of any other kind

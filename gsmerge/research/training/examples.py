@@ -1,7 +1,7 @@
-"""Make training examples: scenes cut into superpixels and encoded without networks, with their photos.
+"""Make training examples: the Feature Gaussians of a scene's superpixels before any network, and the photos.
 
 The networks get some of the scene's views. The photos of all other views, and held-out photos, are novel views. The
-choice of views is fixed, or drawn again for every window (:func:`select_views`).
+choice of views is fixed, or drawn again for every window (:func:`draw_random_views`).
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class ColorMap:
     """A linear change of colours that is applied to a scene and its photos."""
 
     order: tuple[int, ...] = (0, 1, 2)  # source channel of each channel
-    gain: float = 1.0  # below 0: negative colours
-    offset: float = 0.0  # sRGB in [0, 1]
+    gain: float = 1.0  # factor; negative if colours are inverted
+    offset: float = 0.0  # added after the gain, sRGB in [0, 1]
 
     def change(self, colors: np.ndarray) -> np.ndarray:
         """Change colours ``[...,3]``, sRGB in [0, 1]."""
@@ -75,7 +75,7 @@ class Example:
 
 
 def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, Callable[[], Example]]]:
-    """Yield name and maker of each example of a scene; see :func:`make_example`.
+    """Yield the label of each example of a scene, and a function that makes it; see :func:`make_example`.
 
     There is an example for each number of views and each density in ``options``. Photos with cameras in a folder
     ``targets`` next to the ``.ply`` are novel views. Raises SceneError if the scene cannot be read, does not have one
@@ -104,14 +104,14 @@ def example_name(path: Path) -> str:
 
 
 def make_example(training: TrainingScene, options: TrainOptions, density: float, name: str) -> Example:
-    """Make an example: segment and encode a scene without networks; ``density`` is in superpixels per pixel."""
+    """Segment and encode a scene without networks, and return the example; ``density`` is in superpixels per pixel."""
     changes = {"superpixels": share_text(density), "segmentation": options.segmentation, "seed": options.seed}
     settings, scene, members = CompactOptions().with_settings(changes), training.scene, training.members
     features = encode(scene, members, segment(scene_pictures(scene), settings.segment))
     level = options.photo_level(scene.cameras.width, scene.cameras.height)
     images = (training.photos(level).images.clip(0, 1) * 255).round().astype(np.uint8)
     focals = np.sqrt(np.abs(scene.cameras.Ks[:, 0, 0] * scene.cameras.Ks[:, 1, 1]))
-    # a footprint is the size of a pixel in the own view of a Feature Gaussian
+    # A footprint times the focal length is a depth, since footprints are sizes of pixels in the Feature Gaussian's view
     unit = float(lower_median(features.footprints * focals.astype(np.float64)[features.views]))
     return Example(
         name, unit, members, scene.cameras, features, feature_to_gaussians(features),
@@ -121,24 +121,24 @@ def make_example(training: TrainingScene, options: TrainOptions, density: float,
 
 def select_example_views(example: Example, ids: Sequence[int]) -> Example:
     """Keep the views ``ids`` (ascending) of an example; photos of other views become novel views."""
-    views, own = len(example.cameras), example.members
-    if len(ids) == views:
+    num_views, members = len(example.cameras), example.members
+    if len(ids) == num_views:
         return example
-    place = np.full(views, -1)
-    place[list(ids)] = np.arange(len(ids))
-    rows = np.flatnonzero(place[example.features.views] >= 0)
+    new_views = np.full(num_views, -1)  # new number of each view; -1 if it is left out
+    new_views[list(ids)] = np.arange(len(ids))
+    rows = np.flatnonzero(new_views[example.features.views] >= 0)
     part = take(example.features, rows)
-    chosen, pixels = Pixels(own.pixels, own.fronts, own=True).select(ids)
-    numbers = np.full(len(own.pixels), -1, np.int32)
-    numbers[chosen] = np.arange(len(chosen), dtype=np.int32)
-    columns = {f.name: getattr(own, f.name)[chosen] for f in fields(Members) if f.name != "fronts"}
+    member_rows, pixels = Pixels(members.pixels, members.fronts, own=True).select(ids)
+    new_rows = np.full(len(members.pixels), -1, np.int32)  # new row of each member; -1 if it is left out
+    new_rows[member_rows] = np.arange(len(member_rows), dtype=np.int32)
+    columns = {f.name: getattr(members, f.name)[member_rows] for f in fields(Members) if f.name != "fronts"}
     order = [*ids, *(photo for photo in range(len(example.photos)) if photo not in set(ids))]
     photos = example.photos
     return replace(
         example,
         members=Members(**columns | {"pixels": pixels.homes, "fronts": pixels.fronts}),
         cameras=example.cameras[list(ids)],
-        features=replace(part, views=place[part.views], members=numbers[part.members]),
+        features=replace(part, views=new_views[part.views], members=new_rows[part.members]),
         base=example.base[rows],
         photos=replace(photos, viewmats=photos.viewmats[order], Ks=photos.Ks[order]),
         images=example.images[order],
@@ -147,7 +147,10 @@ def select_example_views(example: Example, ids: Sequence[int]) -> Example:
 
 
 def draw_random_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
-    """Draw a random subset of an example's views by ``options.random_views`` (paper supplement C)."""
+    """Restrict an example to random views, as many as ``options.random_views`` allows (paper supplement C).
+
+    Without this option the example keeps its views.
+    """
     if not options.random_views:
         return example
     num_views = len(example.cameras)
@@ -157,7 +160,7 @@ def draw_random_views(example: Example, options: TrainOptions, rng: np.random.Ge
 
 
 def recolor(example: Example, rng: np.random.Generator) -> Example:
-    """Change the colours of a scene and its photos at random: channels permuted, contrast reduced, or inverted."""
+    """Change the colours of an example at random: permute channels, reduce the contrast, and perhaps invert them."""
     gain = float(rng.uniform(0.6, 1))
     low, inverted = float(rng.uniform(0, 1 - gain)), bool(rng.random() < 0.5)
     colors = ColorMap(tuple(rng.permutation(3).tolist()), -gain if inverted else gain, low + gain * inverted)

@@ -37,22 +37,22 @@ from gsmerge.research.training.windows import Window, sample_window
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 VALIDATION = 2**32  # replaces the step in the seed of the random numbers of validation
-LossRow = dict[str, float]  # a row of the table of losses
+LossRow = dict[str, float]  # a row of the table of losses, by column
 Scores = list[tuple[float, float, float]]  # of each window: PSNR (dB) without and with networks, share merged
-OnTrainingStep = Callable[[int, int, float], None]  # step, steps, loss
-FORMAT = "gsmerge-training"
-REMEDY = "choose another --output, or remove it to start again"
+OnTrainingStep = Callable[[int, int, float], None]  # called with step, number of steps, loss
+RUN_FORMAT = "gsmerge-training"
+RUN_REMEDY = "choose another --output, or remove it to start again"
 
 
 def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions) -> LossRow:
-    """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians."""
-    scores = [window for i, shard in enumerate(shards) for window in _score(networks, shard, i, options)]
+    """Measure the mean PSNR (dB) of windows without and with networks, and the share of merged Feature Gaussians."""
+    scores = [window for i, shard in enumerate(shards) for window in _score_shard(networks, shard, i, options)]
     analytic, learned, matched = np.mean(scores, 0).tolist()
     return {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
 
 
-def _score(networks: Networks, shard: Shard, number: int, options: TrainOptions) -> Scores:
-    """Score a shard on random windows, which depend on its ``number``."""
+def _score_shard(networks: Networks, shard: Shard, number: int, options: TrainOptions) -> Scores:
+    """Score random windows of a shard; the windows depend on its ``number``."""
     rng = np.random.default_rng([options.seed, VALIDATION, number])
     example = read_shard(shard)
     windows = [
@@ -61,6 +61,7 @@ def _score(networks: Networks, shard: Shard, number: int, options: TrainOptions)
     ]
 
     def score_window(window: Window) -> tuple[float, float, float]:
+        """Return the PSNR (dB) without and with networks, and the share of merged Feature Gaussians."""
         plain, _ = render_window(window, None, options)
         image, matched = render_window(window, networks, options)
         return window_psnr(window, plain), window_psnr(window, image), matched
@@ -73,11 +74,11 @@ class TrainingState:
     """State of a training run: networks, running means of their weights, and moments of the optimiser."""
 
     networks: Networks
-    smooth: Networks
+    smooth: Networks  # has the running means as weights
     optimizer: torch.optim.Optimizer
 
     def pairs(self) -> Iterator[tuple[str, Parameter, Parameter]]:
-        """Yield the name, the parameter, and its running mean, for all parameters."""
+        """Yield the name, the value and the running mean of each parameter."""
         for (name, parameter), mean in zip(self.networks.named_parameters(), self.smooth.parameters(), strict=True):
             yield name, parameter, mean
 
@@ -134,6 +135,7 @@ def train(
 def _train(
     options: TrainOptions, shards: Sequence[Shard], validation: Sequence[Shard], out: Path, progress: OnTrainingStep
 ) -> TrainResult:
+    """Make or load the networks, and train them to the last step; see :func:`train`."""
     with torch.random.fork_rng(devices=[]):  # new networks depend only on the seed
         torch.manual_seed(options.seed)
         networks = Networks(options.network)
@@ -142,11 +144,11 @@ def _train(
     losses = list[Tensor]()
     hashes = {kind: [shard.sha256 for shard in part] for kind, part in (("data", shards), ("validation", validation))}
     head = {"options": options.to_dict(), **hashes}
-    step, rows = _resume(out, state, head)
+    step, rows = _load_run(out, state, head)
     resumed = step
     read = lru_cache(options.buffer)(read_shard)
     while step < options.steps:
-        losses.append(_step(state, shards, read, options, step))
+        losses.append(_take_step(state, shards, read, options, step))
         step += 1
         progress(step, options.steps, float(losses[-1]))
         if step % options.save_every == 0 or step == options.steps:
@@ -154,13 +156,13 @@ def _train(
             mean = float(torch.stack(losses).mean())
             rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
             losses = []
-            _save(out, state, rows, head, options)
+            _save_run(out, state, rows, head, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
     best_psnr = max(row["psnr_learned"] for row in rows)
     return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], best_psnr, resumed)
 
 
-def _save(
+def _save_run(
     out: Path, state: TrainingState, rows: Sequence[LossRow], head: Mapping[str, Any], options: TrainOptions
 ) -> None:
     """Write the checkpoints, the table of losses, and the state for resuming the run."""
@@ -180,26 +182,29 @@ def _save(
     save_training(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
 
 
-def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[LossRow]]:
-    """Read the step and the table of losses of the run in the folder; step 0 and no rows if there is no run."""
+def _load_run(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[LossRow]]:
+    """Load the run in the folder into ``state``; return its step and table of losses, step 0 and no rows without a run.
+
+    Raises SceneError if the run differs from what is ``expected``.
+    """
     path = out / "state.safetensors"
     if not path.exists():
         return 0, []
     facts = load_training(path, state)
     for name, value in expected.items():
         if facts.get(name) != value:
-            raise SceneError(path, f"expected a run with the same {name}, found another", REMEDY)
+            raise SceneError(path, f"expected a run with the same {name}, found another", RUN_REMEDY)
     return int(facts["step"]), list(facts["rows"])
 
 
-def _step(
+def _take_step(
     state: TrainingState, shards: Sequence[Shard], read: Callable[[Shard], Example], options: TrainOptions, step: int
 ) -> Tensor:
-    """Take one step on the mean gradient of all crops, each of a random example; return its loss."""
+    """Take one step on the mean gradient of all crops, each of a random example; return the mean loss."""
     parameters = list(state.networks.parameters())
 
     def crop_gradients(crop: int) -> Tensor:
-        """Compute the gradients of one crop in one vector, with the loss as its last element."""
+        """Compute the gradients of one crop as one vector, whose last element is the loss."""
         rng = np.random.default_rng([options.seed, step, crop])
         example = draw_random_views(read(shards[int(rng.integers(len(shards)))]), options, rng)
         if options.recolor:
@@ -222,7 +227,7 @@ def _step(
     for group in state.optimizer.param_groups:
         group["lr"] = options.rate_at(step)
     state.optimizer.step()
-    share = min(options.average, (1 + step) / (10 + step))
+    share = min(options.average, (1 + step) / (10 + step))  # less at first, so that the start is soon forgotten
     with torch.no_grad():
         for _, parameter, smooth in state.pairs():
             smooth.lerp_(parameter, 1 - share)
@@ -237,7 +242,7 @@ def save_training(path: Path, state: TrainingState, facts: Mapping[str, Any]) ->
         named = {"weight": parameter, "mean": mean, "first": moments["exp_avg"], "second": moments["exp_avg_sq"]}
         tensors |= {f"{kind}.{name}": tensor.detach() for kind, tensor in named.items()}
     with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(save(tensors, {FORMAT: json.dumps(dict(facts))}))
+        temporary.write_bytes(save(tensors, {RUN_FORMAT: json.dumps(dict(facts))}))
 
 
 def load_training(path: Path, state: TrainingState) -> dict[str, Any]:
@@ -247,7 +252,7 @@ def load_training(path: Path, state: TrainingState) -> dict[str, Any]:
     """
     try:
         with safe_open(path, "pt") as file:
-            facts = json.loads((file.metadata() or {})[FORMAT])
+            facts = json.loads((file.metadata() or {})[RUN_FORMAT])
             with torch.no_grad():
                 for name, parameter, mean in state.pairs():
                     parameter.copy_(file.get_tensor(f"weight.{name}"))
@@ -257,6 +262,6 @@ def load_training(path: Path, state: TrainingState) -> dict[str, Any]:
                     state.optimizer.state[parameter] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise SceneError(
-            path, "expected the state of a training run, found a damaged file or another", REMEDY
+            path, "expected the state of a training run, found a damaged file or another", RUN_REMEDY
         ) from error
     return dict(facts)

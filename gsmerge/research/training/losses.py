@@ -74,10 +74,10 @@ def _unit_features(image: Tensor, layers: tuple[Convolution, ...], kernels: list
 def window_loss(
     networks: Networks, window: Window, options: TrainOptions, step: int, rng: np.random.Generator
 ) -> Tensor:
-    """Compute the loss of a window: its renders on a random background against the photo, plus regularizers.
+    """Compute the loss of a window: the difference between its render and the photo, plus regularizers.
 
-    If all levels are trained jointly, the loss is the mean over the levels. The weight of the diversification is
-    relative to the photometric loss, because the scale of the diversification, which comes from volumes, is arbitrary.
+    The render has a random background. If all levels are trained jointly, the loss is the mean over the levels. The
+    weight of the diversity loss is relative to the photometric loss, because the diversity loss has no natural scale.
     """
     crop, background = window.crop, rng.random(3, dtype=np.float32)
     levels = options.levels if options.joint else (crop.k,)
@@ -191,7 +191,7 @@ def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
         return proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
 
 
-GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of the diversification
+GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of diversity_loss
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
@@ -212,7 +212,10 @@ def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tens
 
 
 def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
-    """List the rows of all pairs of children with the same parent, each once."""
+    """Return the rows of both children of all pairs with the same parent; the first row is the lower one.
+
+    ``parents`` are ascending, so siblings are next to each other. Pairs are found by the gap between their rows.
+    """
     count = int(torch.bincount(parents).max()) if len(parents) else 0
     rows = torch.arange(len(parents))
     firsts = [rows[: len(rows) - gap][parents[: len(rows) - gap] == parents[gap:]] for gap in range(1, count)]

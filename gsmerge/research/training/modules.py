@@ -106,7 +106,10 @@ class Pooling(nn.Module):
 
 
 class SetNetwork(nn.Module):
-    """Shared part of encoder and merger: MLP of tokens, attention blocks, pooling, MLP with the group's numbers."""
+    """The layers that encoder and merger share.
+
+    Tokens pass through an MLP, attention blocks and pooling. The result is joined with the group's numbers in an MLP.
+    """
 
     def __init__(self, token: int, out: int, options: NetworkOptions) -> None:
         super().__init__()
@@ -202,10 +205,10 @@ class Networks(nn.Module):
         self.refiner = Refiner(chosen) if chosen.refiner else None
         self.heads = nn.ModuleDict({str(slots): Head(slots, chosen) for slots in SLOTS})
 
-    in_parallel = False  # tables run one after another, for gradients
+    in_parallel = False  # tables of groups run one after another, because gradients are recorded
 
     def run(self, name: str, *inputs: Array) -> Tensor:
-        """Run a module as :meth:`NetworkWeights.run` does, with gradients."""
+        """Run the module ``name`` like :meth:`NetworkWeights.run`, with gradients."""
         outputs = self.get_submodule(name)(*map(as_tensor, inputs))
         raw = torch.cat(outputs, 1) if isinstance(outputs, tuple) else outputs
         return torch.tanh(raw.nan_to_num()).flatten(1)

@@ -3,8 +3,7 @@
 The geometry of the stages is computed on tensors here, so that gradients pass from the results of a stage to the
 results of earlier stages. The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`,
 :mod:`gsmerge.geometry.pooling`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours,
-clusters,
-order of axes, views, and the agreement of a group with other views.
+clusters, order of axes, views, and the agreement of a group with other views.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 from gsmerge.values.arrays import Array, as_array, as_tensor
 
 TINY = 1e-12  # world units
-CONSTANT = slice(6, 8)  # columns of a group without a gradient: log of the number of members, and their mean weight
+CONSTANT = slice(6, 8)  # columns of ``group`` without a gradient: log of the number of members, and their mean weight
 
 
 def features_to_tensors(features: FeatureGaussians) -> FeatureGaussians:
@@ -70,9 +69,8 @@ def groups_to_arrays(groups: GroupFeatures) -> GroupFeatures:
 def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     """Compute scales ``[g,3]``, ascending, and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
 
-    Values are those of :func:`gsmerge.geometry.pooling.principal_axes`; gradients follow from first-order perturbation
-    theory.
-    Axes of nearly equal scales have no clear direction, so the gradient of their rotation is damped.
+    Values are those of :func:`gsmerge.geometry.pooling.principal_axes`. Gradients follow from first-order perturbation
+    theory. Axes of nearly equal scales have no clear direction, so the gradient of their rotation is damped.
     """
     scales, quats = (torch.from_numpy(axes).float() for axes in principal_axes(as_array(covars)))
     if not covars.requires_grad:
@@ -97,7 +95,7 @@ def differentiate_base(features: FeatureGaussians) -> Gaussians:
 
 
 def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
-    """Compute the networks' inputs for groups, differentiable; ``inputs`` are the same as arrays."""
+    """Compute the networks' inputs for groups, differentiable; ``inputs`` has the same values as arrays."""
     group_viewmats = torch.from_numpy(viewmats[inputs.views]).float()
     base, frames = differentiate_base(features), _differentiate_frames(features.means, group_viewmats, inputs.frames)
     sizes = gaussian_sizes(base.scales).clamp_min(TINY)
@@ -155,14 +153,17 @@ def differentiate_tokens(
 
 
 def _log_scales(scales: Tensor, pixels: Tensor) -> Tensor:
+    """Return inputs for scales ``[n,3]``: their logarithms in units of ``pixels [n]``, clipped and scaled down."""
     return torch.log(scales.clamp_min(TINY) / pixels[:, None]).clamp(-12, 12) / 4
 
 
 def _logits(opacities: Tensor) -> Tensor:
+    """Return inputs for opacities ``[n]``: their logits, clipped and scaled down."""
     return torch.logit(opacities.clamp(1e-4, 1 - 1e-4)) / 3
 
 
 def _log_ratio(values: Tensor, units: Tensor) -> Tensor:
+    """Return inputs for masses or extinctions ``[g]``: their logarithms in ``units [g]``, clipped and scaled down."""
     return (torch.log(values.clamp_min(1e-30)) - torch.log(units)).clamp(-30, 30) / 10
 
 
@@ -202,9 +203,11 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     share = (weights / torch.zeros(len(cuts), dtype=torch.float64).index_add(0, run, weights)[run]).float()
 
     def total(values: Tensor) -> Tensor:
+        """Sum over the rows of each run."""
         return torch.zeros(len(cuts), *values.shape[1:]).index_add(0, run, values)
 
     def average(values: Tensor) -> Tensor:
+        """Average over the rows of each run, weighted by ``share``."""
         return total(values * share.reshape(-1, *[1] * (values.ndim - 1)))
 
     means = average(features.means[order])
@@ -216,9 +219,9 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
 
 
 def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, children: Gaussians) -> Gaussians:
-    """Make the round Gaussians that absolute heads correct; see :func:`gsmerge.networks.apply.prepare_children`.
+    """Make the round Gaussians that absolute heads correct, as tensors with gradients.
 
-    ``children`` are the same n Gaussians as arrays.
+    ``children`` are the same n Gaussians as arrays, see :func:`gsmerge.networks.apply.prepare_children`.
     """
     parent_ids, base, same = torch.from_numpy(parents), group_features.base, children.to("cpu")
     frames = group_features.frames[parent_ids]
@@ -247,7 +250,7 @@ class TrainingContext(NetworkContext):
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Make tokens of Gaussians as tensors; members are arrays, since no network precedes the encoder."""
+        """Make tokens of Gaussians as tensors. Tokens of members are arrays, since no network precedes the encoder."""
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
         return super().make_tokens(parts, ids, owners, groups_to_arrays(group_features))
@@ -265,7 +268,7 @@ class TrainingContext(NetworkContext):
     def correct_children(
         self, children: Gaussians | None, parents: np.ndarray, group_features: GroupFeatures
     ) -> Gaussians:
-        """Run the heads on children, or without analytic children if None; return the corrected children."""
+        """Run the heads on analytic children, or on round Gaussians if None; return the corrected children."""
         if children is None:
             arrays = groups_to_arrays(group_features)
             round_ones = prepare_children(arrays.base[parents], parents, arrays, self.options)
@@ -290,7 +293,7 @@ class RefinedCrop:
     """The Feature Gaussians of a crop after all stages before the heads, which are the same for every K."""
 
     context: TrainingContext
-    described: GroupFeatures  # merged and refined, tensors with gradients
+    described: GroupFeatures  # the heads' inputs for the merged and refined Feature Gaussians, tensors with gradients
     matches: Matches  # the crop's clusters
 
 
@@ -337,7 +340,10 @@ def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext
 def _make_children(
     crop: Crop, arrays: FeatureGaussians, described: GroupFeatures, context: TrainingContext, k: int
 ) -> tuple[Gaussians | None, np.ndarray]:
-    """Make the Gaussians of tensors that the heads correct, and the row ``[n]`` of the group of each, ascending."""
+    """Make the Gaussians of tensors that the heads correct, and the row ``[n]`` of the group of each, ascending.
+
+    The Gaussians are None if the networks make the children themselves.
+    """
     if context.makes_children:
         return None, np.repeat(np.arange(len(arrays)), k)
     if k == 1:

@@ -33,7 +33,10 @@ class TrainingScene:
 
 
 def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
-    """Choose evenly spread views for each of ``counts`` (0 or too many: all), without repeated selections."""
+    """Choose evenly spread views for each of ``counts``, without repeated selections.
+
+    A count of 0, or of more views than there are, stands for all views.
+    """
     chosen = [even_views(num_views, count if 0 < count < num_views else num_views) for count in counts]
     return [ids for i, ids in enumerate(chosen) if ids not in chosen[:i]]
 
@@ -58,7 +61,7 @@ def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None
 
 
 def measure_covered(training: TrainingScene, level: float = 1) -> np.ndarray:
-    """Measure the share of each photo's pixels that each chosen view covers, ``[v,p,h,w]`` uint8.
+    """Measure how far each chosen view covers every pixel of each photo, ``[v,p,h,w]`` uint8.
 
     Values are the opacity of the view's Gaussians times 255, and 0 on surfaces that the view does not see. The
     transmittances of views multiply, so the coverage of any subset of views follows. ``level`` divides the photos'
@@ -67,7 +70,8 @@ def measure_covered(training: TrainingScene, level: float = 1) -> np.ndarray:
     scene, photos = training.scene, training.photos(level)
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
 
-    def one_view(view: int) -> np.ndarray:
+    def measure_view(view: int) -> np.ndarray:
+        """Measure the coverage ``[p,h,w]`` of all photos by the Gaussians of one view."""
         part = subset(scene, [view])
         splats = make_splats(part.gaussians, np.zeros(3))
         views = (tile_view(splats, **photos.camera(photo), near=NEAR_PLANE) for photo in range(len(photos)))
@@ -76,13 +80,13 @@ def measure_covered(training: TrainingScene, level: float = 1) -> np.ndarray:
         seen[view] = True
         return np.where(seen, np.round(255 * opacities), 0).astype(np.uint8)
 
-    return np.stack(parallel_map(one_view, range(len(scene))))
+    return np.stack(parallel_map(measure_view, range(len(scene))))
 
 
 def covered_pixels(covers: np.ndarray) -> np.ndarray:
     """Return the mask of pixels that the views together cover, from ``covers [v,...]`` of :func:`measure_covered`."""
-    left = np.ones(covers.shape[1:], np.float32)
+    transmittance = np.ones(covers.shape[1:], np.float32)
     for cover in covers:
-        left *= 1 - cover.astype(np.float32) / 255
-    min_alpha = 0.5  # least alpha of a pixel that the Gaussians cover
-    return left <= 1 - min_alpha
+        transmittance *= 1 - cover.astype(np.float32) / 255
+    min_alpha = 0.5  # least alpha of a pixel that counts as covered
+    return transmittance <= 1 - min_alpha

@@ -1,15 +1,15 @@
-"""Store examples in files: they are written once, hashed, and read in random order, with few in memory at a time.
+"""Store examples in files, so that few of them are in memory at a time.
 
 A shard is a safetensors file with one example. The shards of a scene are listed in a record, a JSON file that is
-written after all of them. Its name is a hash of the scene's files and of the settings. So an interrupted call continues
-with the first scene that has no record.
+written after all of them. The record's name is a hash of the scene's files and of the settings. So an interrupted call
+continues with the first scene that has no record.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -25,17 +25,17 @@ from gsmerge.io.scene_files import find_scene_files
 from gsmerge.raster.photos import Photos
 from gsmerge.research.training.examples import Example, example_name, make_examples
 from gsmerge.research.training.train_options import TrainOptions
+from gsmerge.runtime.record import Progress
 from gsmerge.scene.content_hash import content_hash, digest, list_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.version import __version__
 
-Report = Callable[[str, int, int], None]  # description of the work, step, steps
 LAYOUT = 7  # version of the files and their contents
-FORMAT = "gsmerge-example"
-REMEDY = "remove it; the next call makes it again"
+EXAMPLE_FORMAT = "gsmerge-example"
+EXAMPLE_REMEDY = "remove it; the next call makes it again"
 # Settings that an example depends on
 EXAMPLE_SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
-STORED_PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}
+STORED_PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}  # whose fields are all arrays
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class Shard:
 
 
 def prepare_shards(
-    scenes: Sequence[Path], options: TrainOptions, folder: Path, report: Report = lambda *_: None
+    scenes: Sequence[Path], options: TrainOptions, folder: Path, progress: Progress = lambda *_: None
 ) -> list[Shard]:
     """Return the shards of all scenes in order; missing shards are made.
 
-    ``scenes`` are folders or ``.ply`` files. ``report`` is called with (words, step, steps). Raises SceneError if a
-    scene cannot be used, or if the folder cannot be written.
+    ``scenes`` are folders or ``.ply`` files. ``progress`` is called with (words, number of finished scenes, number of
+    scenes). Raises SceneError if a scene cannot be used, or if the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -61,15 +61,16 @@ def prepare_shards(
         raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
     shards: list[Shard] = []
     for number, scene in enumerate(scenes):
-        report(f"examples: {example_name(scene)}", number, len(scenes))
+        progress(f"examples: {example_name(scene)}", number, len(scenes))
         shards += _scene_shards(scene, options, folder)
     return shards
 
 
 def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shard]:
+    """Return the shards of one scene; make them and their record if there is no complete record."""
     key, name = scene_key(scene, options), example_name(scene)
     record = folder / f"{key[:32]}.json"
-    hashes = _read_record(record)
+    hashes = _read_hashes(record)
     if hashes is None:
         hashes = {}
         for label, make in make_examples(scene, options):
@@ -86,12 +87,13 @@ def scene_key(scene: Path, options: TrainOptions) -> str:
     head |= {name: getattr(options, name) for name in EXAMPLE_SETTINGS}
     files = find_scene_files(scene)
     targets = files.ply.parent / "targets"
-    held_out = content_hash([targets]) if targets.is_dir() else None  # separate, since names are relative to folders
+    # Held-out photos have a hash of their own, because the names in a hash are relative to the folder
+    held_out = content_hash([targets]) if targets.is_dir() else None
     return digest({**head, "content": content_hash(list_files(files)), "held_out": held_out})
 
 
-def _read_record(path: Path) -> dict[str, str] | None:
-    """Read the hash of each shard of a scene; None if the scene is not complete."""
+def _read_hashes(path: Path) -> dict[str, str] | None:
+    """Read the hash of each shard from a scene's record; None without a record, or if a shard is missing."""
     try:
         hashes = json.loads(path.read_text())
         return hashes if all(path.with_name(file).is_file() for file in hashes) else None
@@ -101,15 +103,18 @@ def _read_record(path: Path) -> dict[str, str] | None:
 
 def write_shard(path: Path, example: Example) -> str:
     """Write an example to a file, replacing it, and return the hash of its arrays; SceneError if that fails."""
-    arrays = dict(_arrays(example))
+    arrays = dict(_example_arrays(example))
     facts = {"layout": LAYOUT, "sha256": hash_arrays(arrays), "unit": example.unit, "eps2d": example.photos.eps2d}
     facts |= {"size": [example.cameras.width, example.cameras.height]}
     with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(save(arrays, {FORMAT: json.dumps(facts)}))  # save_file would change the file's mode
+        temporary.write_bytes(
+            save(arrays, {EXAMPLE_FORMAT: json.dumps(facts)})
+        )  # save_file would change the file's mode
     return str(facts["sha256"])
 
 
-def _arrays(example: Example) -> Iterator[tuple[str, np.ndarray]]:
+def _example_arrays(example: Example) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the name and the values of each array of an example, as they are stored."""
     for part, kind in STORED_PARTS.items():
         for f in fields(kind):
             yield f"{part}.{f.name}", np.ascontiguousarray(getattr(getattr(example, part), f.name))
@@ -136,14 +141,17 @@ def read_shard(shard: Shard) -> Example:
     """
     try:
         with safe_open(shard.path, "np") as file:
-            facts = json.loads((file.metadata() or {})[FORMAT])
+            facts = json.loads((file.metadata() or {})[EXAMPLE_FORMAT])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        raise SceneError(shard.path, "expected an example, found a damaged file or none", REMEDY) from error
+        raise SceneError(shard.path, "expected an example, found a damaged file or none", EXAMPLE_REMEDY) from error
     if hash_arrays(arrays) != shard.sha256:
-        raise SceneError(shard.path, "expected the example that was written, found a damaged file or another", REMEDY)
+        raise SceneError(
+            shard.path, "expected the example that was written, found a damaged file or another", EXAMPLE_REMEDY
+        )
 
     def part(name: str) -> dict[str, Any]:
+        """Return the arrays of a part of the example by field."""
         prefix = f"{name}."
         return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
 

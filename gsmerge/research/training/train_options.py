@@ -45,23 +45,23 @@ class TrainOptions(Settings):
     similarity: float = setting(0.8, "Least cosine of the latents of a match by `aabb`.", least=-1, most=1)
     levels: tuple[int, ...] = setting(SLOTS, "Numbers of children K whose heads are trained.", choices=SLOTS,
         filled=True, unique=True)  # fmt: skip
-    joint: bool = setting(False, "Train the heads of all levels on every window, as in the paper; otherwise that of "
-        "a random level.")  # fmt: skip
-    buffer: int = setting(10, "Examples that stay in memory. Every window is of a random one, and others are read.",
-        **COUNT_LIMITS)  # fmt: skip
+    joint: bool = setting(False, "Train the heads of all levels on every window, as in the paper; otherwise the head "
+        "of a random level.")  # fmt: skip
+    buffer: int = setting(10, "Number of examples that stay in memory. A window is of a random example, which is read "
+        "if it is not in memory.", **COUNT_LIMITS)  # fmt: skip
     steps: int = setting(6000, "Steps of the training.", **COUNT_LIMITS)
     warmup: int = setting(200, "Steps over which the learning rate increases.", **FROM_0_LIMITS)
     rate: float = setting(1e-3, "Highest learning rate.", **RATE_LIMITS)
     least_rate: float = setting(1e-5, "Rate at the end of the cosine.", **RATE_LIMITS)
     decay: float = setting(1e-4, "Weight decay (AdamW).", **WEIGHT_LIMITS)
     clip: float = setting(1.0, "Largest norm of the gradient.", **RATE_LIMITS)
-    average: float = setting(0.998, "Weight of the previous mean in the running mean of the weights, which is "
-        "validated and saved; less in the first steps.", **SHARE_LIMITS)  # fmt: skip
+    average: float = setting(0.998, "Share of the previous mean in the running mean of the networks' weights, which "
+        "is validated and saved; less in the first steps.", **SHARE_LIMITS)  # fmt: skip
     crops: int = setting(2, "Windows per step, computed in parallel.", **COUNT_LIMITS)
     novel: float = setting(0.75, "Share of the windows in novel views, if there are any.", **SHARE_LIMITS)
     photo_scale: int = setting(2, "Factor by which the sides of the photos are divided.", **COUNT_LIMITS)
-    photo_side: int = setting(0, "Longer side in pixels to which larger photos are reduced; it replaces `photo_scale`. "
-        "476 in the paper; 0: not used.", **FROM_0_LIMITS)  # fmt: skip
+    photo_side: int = setting(0, "Pixels of the longer side to which larger photos are reduced; it replaces "
+        "`photo_scale`. 476 in the paper; 0: not used.", **FROM_0_LIMITS)  # fmt: skip
     window: int = setting(96, "Side of a window of a photo that is rendered, pixels.", least=LOSS_WINDOW, most=10**9)
     most: int = setting(
         4000, "Feature Gaussians that may reach into a window; a window with more is halved.", **COUNT_LIMITS
@@ -75,10 +75,10 @@ class TrainOptions(Settings):
     teacher_weight: float = setting(0.0, "Weight of the distance from the moments of the groups (paper eq. "
         "teacher_mean, teacher_cov).", **WEIGHT_LIMITS)  # fmt: skip
     teacher_steps: int = setting(2000, "Steps over which `teacher_weight` falls to 0.", **COUNT_LIMITS)
-    diversity_weight: float = setting(0.0, "Weight of the diversification of several children, relative to the "
-        "photometric loss: the term is at most this times that loss.", **WEIGHT_LIMITS)  # fmt: skip
+    diversity_weight: float = setting(0.0, "Weight of the loss that keeps siblings apart. This loss is at most the "
+        "weight times the photometric loss.", **WEIGHT_LIMITS)  # fmt: skip
     diversity_steps: int = setting(50_000, "Steps over which `diversity_weight` falls to 0.", **COUNT_LIMITS)
-    opacity_shift: float = setting(0.0, "Added to the raw correction of the opacity in the heads of the checkpoints.",
+    opacity_shift: float = setting(0.0, "Number that saved heads add to the raw correction of the opacity.",
         "New captures have holes that scenes in training lack.", least=-8, most=8)  # fmt: skip
     save_every: int = setting(200, "Steps between checkpoints, validation and lines of the table.", **COUNT_LIMITS)
     validation_examples: int = setting(24, "Most examples for validation, spread evenly over all examples.",
@@ -120,8 +120,8 @@ class TrainOptions(Settings):
 
     def regularizer_weights(self, step: int) -> tuple[float, float]:
         """Return the weights of the teacher and diversity losses in a step, counted from 0."""
-        teacher, diversity = (max(0.0, 1 - step / steps) for steps in (self.teacher_steps, self.diversity_steps))
-        return self.teacher_weight * teacher, self.diversity_weight * diversity
+        teacher_share, diversity_share = (max(0.0, 1 - step / n) for n in (self.teacher_steps, self.diversity_steps))
+        return self.teacher_weight * teacher_share, self.diversity_weight * diversity_share
 
     def rate_at(self, step: int) -> float:
         """Return the learning rate of a step, counted from 0: linear warm-up, then a half cosine."""
@@ -135,8 +135,8 @@ class TrainOptions(Settings):
         return asdict(self) | {name: list(getattr(self, name)) for name in LIST_OPTIONS}
 
 
-# Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper. Settings that the paper does not state have their
-# defaults, except for the densities.
+# The paper's hyperparameters: its table, and sections 4.1, 4.4 and 5.1. Settings that the paper does not state have
+# their defaults, except for the densities.
 PAPER: Mapping[str, Any] = {
     "outputs": "absolute",
     "merger_start": "first",

@@ -19,10 +19,10 @@ MIN_SIDE = 16  # least side of a halved window, pixels
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """A subset of an example's Feature Gaussians, with K children each."""
+    """A subset of an example's Feature Gaussians, which are decoded into K children each."""
 
     example: Example
-    k: int  # number of children of each
+    k: int  # K
     rows: np.ndarray  # [r] rows of the example's Feature Gaussians, ascending
 
 
@@ -36,7 +36,7 @@ class Box:
     height: int
 
     def halved(self) -> Box:
-        """Return the box with its longer side halved about the middle, at least ``MIN_SIDE`` pixels."""
+        """Return the middle half of the box along its longer side, which keeps at least ``MIN_SIDE`` pixels."""
         if self.width >= self.height:
             width = max(min(MIN_SIDE, self.width), self.width // 2)
             return Box(self.left + (self.width - width) // 2, self.top, width, self.height)
@@ -70,6 +70,7 @@ class Window:
         return torch.from_numpy(self._part(self.crop.example.mask(self.photo)))
 
     def _part(self, picture: np.ndarray) -> np.ndarray:
+        """Return the box's part of a picture ``[h,w,...]``."""
         box = self.box
         return np.ascontiguousarray(picture[box.top : box.top + box.height, box.left : box.left + box.width])
 
@@ -80,27 +81,27 @@ def sample_window(
     """Sample a window around a random pixel that the example's views cover.
 
     K is drawn from ``levels``. The window has ``side`` pixels per side, or less in smaller photos. It is halved while
-    more than ``most`` Feature Gaussians reach into it. ``novel`` is the share of windows in novel views, if there are
-    any.
+    more than ``most`` Feature Gaussians reach into it. ``novel`` is the probability that novel views are tried first.
     """
     k = levels[int(rng.integers(len(levels)))]
-    photo, pixels = _draw_photo(example, novel, rng)
+    photo, pixels = _choose_photo(example, novel, rng)
     pixel = int(pixels[rng.integers(len(pixels))]) if len(pixels) else 0
     height, width = example.images.shape[1:3]
     w, h = min(side, width), min(side, height)
     left, top = max(0, pixel % width - w // 2), max(0, pixel // width - h // 2)
     box = Box(min(left, width - w), min(top, height - h), w, h)  # moved inside the photo
-    rows = _rows(example, photo, box)
+    rows = _reaching_rows(example, photo, box)
     while len(rows) > most and box.halved() != box:
         box = box.halved()
-        rows = _rows(example, photo, box)
+        rows = _reaching_rows(example, photo, box)
     return Window(photo, box, Crop(example, k, rows))
 
 
-def _draw_photo(example: Example, novel: float, rng: np.random.Generator) -> tuple[int, np.ndarray]:
-    """Draw a photo that the example's views cover in part; return its number and the indices of covered pixels.
+def _choose_photo(example: Example, novel: float, rng: np.random.Generator) -> tuple[int, np.ndarray]:
+    """Choose a random photo that the example's views cover in part; return its number and the covered pixels' indices.
 
-    ``novel`` is the probability that novel views are tried first. Without covered pixels the last photo is returned.
+    ``novel`` is the probability that novel views are tried first. If the views cover no photo, the last tried photo is
+    returned, without pixels.
     """
     num_views = len(example.cameras)
     own_photos, novel_photos = rng.permutation(num_views), num_views + rng.permutation(len(example.photos) - num_views)
@@ -113,9 +114,9 @@ def _draw_photo(example: Example, novel: float, rng: np.random.Generator) -> tup
     return photo, pixels
 
 
-def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
-    """Find the ascending rows of the Feature Gaussians that reach into the window or close to it."""
-    border = 4  # pixels around a window from which corrections may move Gaussians into it
+def _reaching_rows(example: Example, photo: int, box: Box) -> np.ndarray:
+    """Return the ascending rows of the Feature Gaussians that reach into a box of a photo, or near it."""
+    border = 4  # pixels around the box from which corrections may move Gaussians into it
     wide = Box(box.left - border, box.top - border, box.width + 2 * border, box.height + 2 * border)
     tiled = tile_view(
         make_splats(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR_PLANE

@@ -20,7 +20,7 @@ from gsmerge.cameras.registration.similarities import DIGITS, fit_similarities
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import Similarity, camera_centres
 from gsmerge.photos.views import subset
-from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_scene
+from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_synthetic_scene
 from gsmerge.types import NO_CAMERAS, Pixels
 
 VIEWS, WIDTH, HEIGHT = 6, 144, 96
@@ -32,7 +32,7 @@ def made_scene(seed: int, views: int = VIEWS) -> Scene:
     """A photographed room with the depth errors of a network."""
     ranges = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))
     options = GenerateOptions(views=views, width=WIDTH, height=HEIGHT, ranges=ranges)
-    made = make_scene(seed, 0, options)
+    made = make_synthetic_scene(seed, 0, options)
     ids = Pixels.of_grid(np.ones((views, HEIGHT, WIDTH), bool))
     return Scene(made.gaussians, made.cameras, np.stack(made.images), ids, tuple("abcdef"[:views]))
 

@@ -61,7 +61,7 @@ def test_wrong_poses_keep_every_gaussian_on_its_pixel(degrees: float, scene: Sce
 @pytest.mark.parametrize(("factor", "shift"), [(1e-4, (0, 0, 0)), (1e4, (0, 0, 0)), (1.0, (4e5, 5e6, 100))])
 def test_moved_scenes_move_their_judges(factor: float, shift: tuple[float, ...], scene: Scene) -> None:
     views = Views(scene.cameras, scene.images, scene.names)
-    move = module.move(StressScene(scene, views), factor, shift)
+    move = module.scale_and_shift(StressScene(scene, views), factor, shift)
     assert offsets(pixel_scene(move)) < 1e-2
     np.testing.assert_allclose(move.views.cameras.viewmats, move.scene.cameras.viewmats)
 

@@ -1,4 +1,4 @@
-"""Photos and depth of stages whose geometry is known by hand."""
+"""Photos and depth of rooms whose geometry is known by hand."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsmerge.research.generate.objects import room
+from gsmerge.research.generate.objects import build_room
 from gsmerge.research.generate.photograph import (
     Light,
     Pinhole,
-    Stage,
-    develop,
+    Room,
     find_exposure,
-    light_stage,
-    radiance,
+    light_room,
+    render_light,
     screen_boxes,
+    tone_map,
     trace,
 )
 from gsmerge.research.generate.shapes import LYING, Material, Shape, blob, box, pack_shapes, place_shapes, quad
@@ -29,8 +29,8 @@ WHITE = np.ones((32, 32, 3), np.float32)
 DOWN = Light(np.array([0.0, -1.0, 0.0]), np.array([0.0, -5.0, 0.0]), np.ones(3), 0.2 * np.ones(3), 0.01)
 
 
-def stage(*shapes: Shape) -> Stage:
-    return Stage(shapes, (WHITE,), DOWN, np.zeros(3), (1, 2))
+def make_room(*shapes: Shape) -> Room:
+    return Room(shapes, (WHITE,), DOWN, np.zeros(3), (1, 2))
 
 
 def test_no_rectangle_cuts_off_what_is_seen() -> None:
@@ -51,10 +51,10 @@ def test_no_rectangle_cuts_off_what_is_seen() -> None:
 
 def test_a_thing_throws_shade_on_the_ground() -> None:
     ground = replace(quad((0, 0, 0), (4, 4), LOOK, LYING), shell=True)
-    view = light_stage(stage(ground, box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK)))
+    view = light_room(make_room(ground, box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK)))
     from_side = look_at(np.array([0.0, -0.45, -3.0]), np.array([0.0, 0.0, 0.0]))
     lens = Pinhole(60, 60, 60.0)
-    image, hits = radiance(view, from_side, lens, 1), trace(view.shapes, from_side, lens, 1)
+    image, hits = render_light(view, from_side, lens, 1), trace(view.shapes, from_side, lens, 1)
     y, x = np.mgrid[:60, :60] + 0.5
     rays = np.stack([(x - 30) / 60, (y - 30) / 60, np.ones_like(x)], -1) @ from_side[:3, :3].T
     world = from_side[:3, 3] + rays * hits.depth[..., None]
@@ -68,7 +68,7 @@ def test_a_thing_throws_shade_on_the_ground() -> None:
 def test_exposure_meets_the_brightness() -> None:
     pictures = [np.random.default_rng(0).uniform(0, 30, (20, 20, 3)).astype(np.float32)]
     gain = find_exposure(pictures, 0.45)
-    assert develop(pictures[0] * gain).mean() == pytest.approx(0.45, abs=1e-3)
+    assert tone_map(pictures[0] * gain).mean() == pytest.approx(0.45, abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -92,7 +92,7 @@ def test_textures_have_no_seam(kind: str) -> None:
 
 @pytest.mark.slow
 def test_rooms_are_seen_from_their_paths() -> None:
-    built = room(Palette(np.random.default_rng(3), 64))
+    built = build_room(Palette(np.random.default_rng(3), 64))
     assert len(built.shapes) > 20
     view, rng = pack_shapes(built.shapes), np.random.default_rng(0)
     worth = []

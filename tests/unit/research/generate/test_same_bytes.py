@@ -12,9 +12,9 @@ from gsmerge.kernels.library import _runnable_targets
 
 SCENE = """
 import hashlib
-from gsmerge.research.generate.synthetic_scene import GenerateOptions, make_scene
+from gsmerge.research.generate.synthetic_scene import GenerateOptions, make_synthetic_scene
 for index in range(2):
-    scene = make_scene(5, index, GenerateOptions(views=2, width=64, height=48))
+    scene = make_synthetic_scene(5, index, GenerateOptions(views=2, width=64, height=48))
     arrays = [*vars(scene.gaussians).values(), scene.cameras.viewmats, scene.targets.viewmats, *scene.images]
     print(*(hashlib.sha256(array.tobytes()).hexdigest() for array in arrays))
 """

@@ -98,7 +98,7 @@ def test_complete_scenes_are_not_made_again(
     with pytest.raises(KeyboardInterrupt):
         prepare_shards(scenes, options, tmp_path)
     moves: list[tuple[str, int, int]] = []
-    shards = prepare_shards(scenes, options, tmp_path, report=lambda *move: moves.append(move))
+    shards = prepare_shards(scenes, options, tmp_path, progress=lambda *move: moves.append(move))
     assert (len(shards), made) == (4, [scenes[0], scenes[1], scenes[1]])
     assert moves == [(f"examples: {scene.name}", i, len(scenes)) for i, scene in enumerate(scenes)]
     assert prepare_shards(scenes, options, tmp_path) == shards
