@@ -63,7 +63,7 @@ def environment(folder: Path, flags: tuple[str, ...], *preloaded: str) -> dict[s
     """Build the library with a sanitizer -> the variables with which a process takes it."""
     usual = dict(os.environ)
     os.environ["GSMERGE_CC"] = "gcc"
-    build.build(folder, flags, link=("-shared",))
+    build.build_libraries(folder, flags, link=("-shared",))
     del os.environ["GSMERGE_CC"]  # or the tests would take it, too
     path = os.pathsep.join((str(ROOT), str(ROOT / "tools")))
     return usual | {"GSMERGE_NATIVE": str(folder), "LD_PRELOAD": " ".join(map(runtime, preloaded)), "PYTHONPATH": path}

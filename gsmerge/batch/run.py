@@ -172,9 +172,9 @@ def run_job(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str
     with lock_result(run.folder, job.output, wait=wait) as begun:
         if begun is None:
             return None
-        _clean(job, run, begun)
+        _remove_unfinished_files(job, run, begun)
         try:
-            line = _make(job, run, begun) if lost is None else _record_failure(job, run.folder, lost)
+            line = _make_result(job, run, begun) if lost is None else _record_failure(job, run.folder, lost)
         except Exception as error:  # a bad scene must not end the batch
             line = _record_failure(job, run.folder, error_line(error))
         if line["status"] != SKIPPED:
@@ -184,7 +184,7 @@ def run_job(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str
     return line
 
 
-def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
+def _make_result(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     """Make a locked result unless it is done or refused; return its record."""
     files = job.find_files()
     key, known = job.call.key(files), read_run_index(run.folder).read_on().results.get(job.output)
@@ -228,10 +228,10 @@ def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
     for job in jobs:
         with suppress(SceneError), lock_result(run.folder, job.output, wait=False) as begun:
             if begun is not None:
-                _clean(job, run, begun)
+                _remove_unfinished_files(job, run, begun)
 
 
-def _clean(job: Job, run: Run, begun: Path) -> None:
+def _remove_unfinished_files(job: Job, run: Run, begun: Path) -> None:
     """Remove the unfinished files of a killed process; keep the mark if the result exists and so may lack a record."""
     if begun.exists():
         paths = [run.folder / name for name in job.outputs]

@@ -137,7 +137,7 @@ def build_target(
     return path
 
 
-def build(
+def build_libraries(
     folder: Path = FOLDER, extra: tuple[str, ...] = (), platform: str | None = None, link: tuple[str, ...] = LINK
 ) -> list[Path]:
     """Build the libraries of all targets into a folder.
@@ -158,7 +158,7 @@ def build(
 
 if __name__ == "__main__":
     try:
-        for built in build():
+        for built in build_libraries():
             print(built)
     except OSError as error:
         sys.exit(str(error))

@@ -29,7 +29,7 @@ class Binary(Protocol):
         """Return a new array of the shape of both."""
 
 
-def _make(name: str, doc: str, arguments: tuple[str, ...] = ("values",), narrow: bool = False) -> Any:
+def _make_function(name: str, doc: str, arguments: tuple[str, ...] = ("values",), narrow: bool = False) -> Any:
     """Make a function of arrays from the library's ``name_each``, which takes flat float64 arrays.
 
     If ``narrow``, the library also has ``name_floats`` for float32 results.
@@ -62,20 +62,20 @@ def _make(name: str, doc: str, arguments: tuple[str, ...] = ("values",), narrow:
     return function
 
 
-exp: Unary = _make("exp", "Compute e to the power of an array.", narrow=True)
-expm1: Unary = _make("expm1", "Compute e to the power of an array, less 1, without cancellation near 0.")
-log: Unary = _make("log", "Compute the natural logarithm of an array; -inf at 0, NaN below.", narrow=True)
-log10: Unary = _make("log10", "Compute the decimal logarithm of an array; -inf at 0, NaN below.")
-log1p: Unary = _make("log1p", "Compute the natural logarithm of 1 plus an array; -inf at -1, NaN below.")
-sin: Unary = _make("sin", "Compute the sine of an array of radians, up to some 1e5.")
-cos: Unary = _make("cos", "Compute the cosine of an array of radians, up to some 1e5.")
-arccos: Unary = _make("arccos", "Compute the angles, radians from 0 to pi, of cosines; NaN outside -1 to 1.")
-arctan2: Binary = _make(
+exp: Unary = _make_function("exp", "Compute e to the power of an array.", narrow=True)
+expm1: Unary = _make_function("expm1", "Compute e to the power of an array, less 1, without cancellation near 0.")
+log: Unary = _make_function("log", "Compute the natural logarithm of an array; -inf at 0, NaN below.", narrow=True)
+log10: Unary = _make_function("log10", "Compute the decimal logarithm of an array; -inf at 0, NaN below.")
+log1p: Unary = _make_function("log1p", "Compute the natural logarithm of 1 plus an array; -inf at -1, NaN below.")
+sin: Unary = _make_function("sin", "Compute the sine of an array of radians, up to some 1e5.")
+cos: Unary = _make_function("cos", "Compute the cosine of an array of radians, up to some 1e5.")
+arccos: Unary = _make_function("arccos", "Compute the angles, radians from 0 to pi, of cosines; NaN outside -1 to 1.")
+arctan2: Binary = _make_function(
     "arctan2",
     "Compute the angle of points ``(x, y)``, -pi to pi; 0 for the origin, whatever its zeros' signs.",
     ("y", "x"),
 )
-power: Binary = _make(
+power: Binary = _make_function(
     "power",
     "Raise an array of numbers from 0 on to powers, an array or one number; NaN below 0.",
     ("bases", "exponents"),

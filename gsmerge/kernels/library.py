@@ -24,7 +24,7 @@ def load_library() -> ctypes.CDLL:
     name = os.environ.get("GSMERGE_TARGET") or list(targets)[-1]
     if name not in targets:
         raise UsageError(f"GSMERGE_TARGET: expected {' or '.join(targets)} on this processor, found {name!r}; unset it")
-    return _open(targets[name])
+    return _open_library(targets[name])
 
 
 def _runnable_targets() -> list[Target]:
@@ -32,7 +32,9 @@ def _runnable_targets() -> list[Target]:
     basic, *advanced = find_platform().targets
     if basic.name == "arm64":
         return [basic]
-    library = _open(basic)  # its function that identifies the processor uses only instructions of all processors
+    library = _open_library(
+        basic
+    )  # its function that identifies the processor uses only instructions of all processors
     level = library.processor_level()
     if level < 3:
         raise UsageError("expected a processor with AVX2 and FMA (x86-64-v3, from 2013 on), found an older one")
@@ -40,7 +42,7 @@ def _runnable_targets() -> list[Target]:
 
 
 @lru_cache
-def _open(target: Target) -> ctypes.CDLL:
+def _open_library(target: Target) -> ctypes.CDLL:
     folder = Path(os.environ.get("GSMERGE_NATIVE") or FOLDER)
     path = folder / find_platform().library_name(target)
     try:

@@ -66,7 +66,7 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
         raise SceneError(path, "expected a checkpoint, found no such file", REMEDY)
     budget = read_budget(path)
     header, tensors = read_tensors(path, "a safetensors file", REMEDY)
-    options, training, version = _header(header, budget)
+    options, training, version = _read_header(header, budget)
     return Checkpoint(build_networks(path, options, tensors), path, version, training)
 
 
@@ -92,7 +92,7 @@ def build_networks(path: Path, options: Mapping[str, Any], arrays: Mapping[str, 
     return NetworkWeights(sizes, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
-def _header(header: Mapping[str, str], budget: ReadBudget) -> tuple[dict[str, Any], dict[str, Any], str]:
+def _read_header(header: Mapping[str, str], budget: ReadBudget) -> tuple[dict[str, Any], dict[str, Any], str]:
     """Read the sizes of the networks, facts about the training, and the version that wrote the file."""
     path = budget.path
     if FORMAT not in header:

@@ -1,7 +1,8 @@
 """The record of a run: seconds of each stage, choices, notes for the user, and progress.
 
 A run begins a record with :func:`record_run`. Code within the run, on the same thread, writes to this record with
-:func:`stage`, :func:`note` and :func:`choose`, without passing it around. Outside a run these write to no record.
+:func:`stage`, :func:`note` and :func:`record_choices`, so the record is no argument of any function. Outside a run
+these functions write nothing.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ def note(text: str) -> None:
         logging.getLogger("gsmerge").info(text)
 
 
-def choose(**choices: Any) -> None:
+def record_choices(**choices: Any) -> None:
     """Add decisions of a stage to the current record, by name."""
     current_record().choices.update(choices)
 

@@ -96,7 +96,7 @@ class Cluster:
 
     def __init__(self, address: str | None, *, store_bytes: int | None = None) -> None:
         self.ray = require_ray()
-        _join(self.ray, address, store_bytes)
+        _connect(self.ray, address, store_bytes)
 
     @property
     def processors(self) -> int:
@@ -235,7 +235,7 @@ def require_ray() -> ModuleType:
     return ray
 
 
-def _join(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
+def _connect(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
     """Connect to the cluster, or start one on this machine."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # after Ray itself has ended a process

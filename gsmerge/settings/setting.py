@@ -116,18 +116,18 @@ class Setting:
         if value is self.default:
             return
         if not self.is_list:
-            self._check(value)
+            self._check_element(value)
             return
         if not isinstance(value, list | tuple):
             raise ValueError(f"{self.name}: expected a list of {self.values()}, got {value!r}")
         if self.filled and not value:
             raise ValueError(f"{self.name}: expected at least one value, got none")
         for element in value:
-            self._check(element)
+            self._check_element(element)
         if self.unique and len(set(value)) < len(value):
             raise ValueError(f"{self.name}: expected every value once, got {','.join(map(str, value))}")
 
-    def _check(self, value: Any) -> None:
+    def _check_element(self, value: Any) -> None:
         if self._fits(value) and self._in_range(value):
             return
         hint = suggest_name(value, self.words)

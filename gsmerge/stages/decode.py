@@ -40,7 +40,9 @@ def decode(
         counts = np.full(len(features), options.max_k)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
-    children, parents = repeat(features, counts) if networks.makes_children else divide(features, members, counts)
+    children, parents = (
+        repeat_groups(features, counts) if networks.makes_children else divide_groups(features, members, counts)
+    )
     gaussians = networks.decode(children, parents, features)
     return gaussians[gaussians.opacities >= options.min_opacity]
 
@@ -155,13 +157,13 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
     return min(segmentation.count, options.max_k * (len(merged.features) + num_empty))
 
 
-def repeat(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+def repeat_groups(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Repeat each Feature Gaussian as ``counts [g]`` equal Gaussians, which heads replace; also return their groups."""
     parents = np.repeat(np.arange(len(features)), counts)
     return feature_to_gaussians(features)[parents], parents
 
 
-def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+def divide_groups(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Divide Feature Gaussians into children, faint ones included; also return the group ``[n]`` of each child.
 
     ``counts [g]`` are the largest numbers of children.
@@ -169,7 +171,7 @@ def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> 
     is_divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if is_divided.any():
-        starts, ids, child_parents = halve(features, members, np.flatnonzero(is_divided), counts)
+        starts, ids, child_parents = halve_groups(features, members, np.flatnonzero(is_divided), counts)
         moments = pool_members(members, starts, ids)
         extinctions = moments.extinctions * features.gains[child_parents]
         children = to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
@@ -181,7 +183,7 @@ def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> 
     return gaussians, parents
 
 
-def halve(
+def halve_groups(
     features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Divide the Gaussians of groups into ``counts [g]`` children by halving.

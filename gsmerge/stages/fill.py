@@ -65,7 +65,7 @@ def fill_between(
     if len(between) == 0:  # all views look in different directions
         return added
     drawings = parallel_map(lambda view: _draw(splats, between, view), range(len(between)))
-    depths = parallel_map(lambda view: blend_depths(_tile(splats, cameras, view)), range(len(cameras)))
+    depths = parallel_map(lambda view: blend_depths(_tile_camera(splats, cameras, view)), range(len(cameras)))
     seen = _find_seen(cameras, depths), _find_seen(between, [drawing[:2] for drawing in drawings]).without_gaps()
 
     def continue_surfaces(view: int) -> Gaussians:
@@ -139,14 +139,14 @@ def _widen(cameras: Cameras) -> Cameras:
     return replace(cameras, Ks=Ks, width=cameras.width + 2 * right, height=cameras.height + 2 * down)
 
 
-def _tile(splats: Splats, cameras: Cameras, view: int) -> TiledView:
+def _tile_camera(splats: Splats, cameras: Cameras, view: int) -> TiledView:
     """Tile Gaussians in one of the cameras."""
     return tile_view(splats, cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height, near=NEAR_PLANE)
 
 
 def _draw(splats: Splats, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Draw the mean depths ``[h,w]``, transmittance ``[h,w]`` and colours ``[h,w,3]`` of one camera."""
-    tiled = _tile(splats, cameras, view)
+    tiled = _tile_camera(splats, cameras, view)
     return *blend_depths(tiled), blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0]
 
 

@@ -29,7 +29,7 @@ def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int)
 
     def score(power: float) -> float:
         with record_part(silent=True):
-            start = merge_pairs(count, power, prepared)
+            start = merge_scene(count, power, prepared)
             gaussians = fit_around(start, prepared, short, seed).gaussians
         psnrs = [score_photos(gaussians, photos, [view], every=4).psnr for view in range(len(photos))]
         return float(np.median(psnrs))
@@ -37,7 +37,7 @@ def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int)
     return max(POWERS, key=score) if count < len(prepared.scene.gaussians) else POWERS[0]
 
 
-def merge_pairs(count: int, power: float, prepared: Prepared) -> Decoded:
+def merge_scene(count: int, power: float, prepared: Prepared) -> Decoded:
     """Merge neighbours pair by pair into ``count`` Gaussians."""
     gaussians = merge_neighbors(prepared.scene.gaussians, count, power)
     return Decoded(gaussians, count, exact=True, is_input=gaussians is prepared.scene.gaussians)

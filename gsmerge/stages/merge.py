@@ -36,7 +36,7 @@ def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = AN
     if len(order) == 0:
         return features
     pooled = networks.merge(pool_runs(features, order, cuts), features, order, cuts)
-    return FeatureGaussians.concat([take(features, alone), pooled])
+    return FeatureGaussians.concat([take_features(features, alone), pooled])
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -50,7 +50,7 @@ def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.flatnonzero(alone), order, np.flatnonzero(begins_cluster)
 
 
-def take(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
+def take_features(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
     """Select Feature Gaussians by an integer ``index``, with their members."""
     starts, members = _gather(features, index)
     names = [n for n in features.__dataclass_fields__ if n not in ("starts", "members")]

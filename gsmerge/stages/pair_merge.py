@@ -83,7 +83,7 @@ def cloud_of(g: Gaussians) -> Cloud:
 
 def _merge_round(cloud: Cloud, count: int) -> Cloud:
     """Merge the cheapest pairs of all cells until ``count`` Gaussians remain, or until there are no pairs."""
-    order, starts = _divide(cloud.means)
+    order, starts = _divide_into_cells(cloud.means)
     pairs, costs = np.zeros((len(cloud), 2), np.int32), np.full(len(cloud), np.inf, np.float32)
     colors = np.ascontiguousarray(cloud.sh[:, :3])
 
@@ -111,7 +111,7 @@ def merge_rows(cloud: Cloud, pairs: np.ndarray) -> Cloud:
     return cloud[remains]
 
 
-def _divide(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _divide_into_cells(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Divide means ``[n,3]`` into cells of neighbours; return their order ``[n]`` and the cell starts ``[c+1]``."""
     count = len(means)
     starts = np.array([0, count])

@@ -35,7 +35,9 @@ def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children
     """
     num_groups = len(starts) - 1
     counts = np.array(np.broadcast_to(num_children, num_groups), np.int64)
-    return _split(starts, ids, means, sh0, opacities, centres, footprints, counts, np.empty((num_groups, 0)), 0.0)
+    return _split_into_children(
+        starts, ids, means, sh0, opacities, centres, footprints, counts, np.empty((num_groups, 0)), 0.0
+    )
 
 
 def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_children, plane_weight):
@@ -47,11 +49,11 @@ def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_ch
     """
     num_groups = len(starts) - 1
     counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)
-    _split(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight)
+    _split_into_children(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight)
     return errors
 
 
-def _split(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight):
+def _split_into_children(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight):
     """Return the children of every group as :func:`bisect` does, and write their errors to ``errors [g, any]``."""
     sizes = np.diff(starts)
     counts = np.minimum(counts, np.maximum(sizes, 1))

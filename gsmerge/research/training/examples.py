@@ -31,7 +31,7 @@ from gsmerge.scene.read import load_scene
 from gsmerge.settings.budget import share_text
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import encode
-from gsmerge.stages.merge import take
+from gsmerge.stages.merge import take_features
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Pixels
 
@@ -127,7 +127,7 @@ def select_example_views(example: Example, ids: Sequence[int]) -> Example:
     place = np.full(views, -1)
     place[list(ids)] = np.arange(len(ids))
     rows = np.flatnonzero(place[example.features.views] >= 0)
-    part = take(example.features, rows)
+    part = take_features(example.features, rows)
     chosen, pixels = Pixels(own.pixels, own.fronts, own=True).select(ids)
     numbers = np.full(len(own.pixels), -1, np.int32)
     numbers[chosen] = np.arange(len(chosen), dtype=np.int32)
