@@ -163,7 +163,7 @@ class NetworkWeights:
         return {name: self._layer(name) for name in names}
 
     def _layer(self, name: str) -> Layer:
-        """Return a packed linear layer. Those before and after attention are padded, so that each head fills vectors."""
+        """Return a packed linear layer; those before and after attention are padded, so that heads fill vectors."""
         weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
         width, heads = self.options.width, self.options.heads
         size = width // heads
