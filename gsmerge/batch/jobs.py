@@ -87,7 +87,7 @@ class CompactCall:
     hints: ReadHints
 
     def key(self, files: SceneFiles) -> str:
-        """Return the key of a result: a digest of the input's files and the version, a dot, a digest of all settings."""
+        """Return the key of a result: a digest of the input's files and the version, a dot, and one of the settings."""
         settings = self.settings.to_dict()
         del settings["threads"]
         checkpoint = Path(self.settings.checkpoint)

@@ -238,7 +238,7 @@ def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
 
 
 def _remove_unfinished_files(job: Job, run: Run, mark: Path) -> None:
-    """Remove what a killed process has left. Keep the file ``mark`` if the result exists, since it may lack a record."""
+    """Remove what a killed process has left. Keep the file ``mark`` if the result exists, perhaps unrecorded."""
     if mark.exists():
         paths = [run.folder / name for name in job.outputs]
         for folder in {path.parent for path in paths}:
