@@ -48,7 +48,7 @@ def _first_ceiling(pairs, rows, share):
     costs = np.empty(len(pairs) // step, np.float32)
     merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
     rank = min(int(share * len(costs)), len(costs) - 1)
-    # The kernel adds such a squared difference of colours to costs, so that flat pictures merge many pairs in a round
+    # The kernel adds at most this to a cost, so that costs differ and flat pictures merge many pairs in a round
     tie_break = 1e-7
     return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * tie_break))
 
