@@ -9,8 +9,9 @@ from gsmerge.types import FeatureGaussians, Gaussians
 
 
 class Corrector:
-    """Interface of the corrections. This one changes nothing; that with networks is
-    :class:`gsmerge.networks.apply.NetworkContext`.
+    """Interface of the corrections, which changes nothing itself.
+
+    The class with networks is :class:`gsmerge.networks.apply.NetworkContext`.
     """
 
     @property

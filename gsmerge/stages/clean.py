@@ -61,10 +61,10 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
 
 
 def _nearest_of(means: np.ndarray, sizes: np.ndarray, rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance ``[m]`` from each of ``rows [m]`` to its nearest neighbour, and a mask ``[m]`` of those that
-    touch one of their ``count`` nearest neighbours.
+    """Return the distance ``[m]`` from each of ``rows [m]`` to its nearest neighbour, and a mask ``[m]``.
 
-    ``means [n,3]`` and the largest scales ``sizes [n]`` are those of all Gaussians.
+    The mask is true for rows that touch one of their ``count`` nearest neighbours. ``means [n,3]`` and the largest
+    scales ``sizes [n]`` are those of all Gaussians.
     """
     ids, distances = find_nearest(means, count, rows)
     touch_factor = 3.0  # Gaussians touch if their distance is at most this many times the sum of their largest scales

@@ -45,7 +45,7 @@ x86_only = pytest.mark.skipif(find_platform().machine != "x86_64", reason="needs
 
 
 def set_level(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
-    monkeypatch.setattr(module, "_open", lambda target: (target.name, OldProcessor(level))[1])
+    monkeypatch.setattr(module, "_open_library", lambda target: (target.name, OldProcessor(level))[1])
     monkeypatch.setattr(module._open_library, "cache_clear", lambda: None, raising=False)
 
 
