@@ -30,7 +30,7 @@ class BuildNative(Command):
     def run(self):
         folder = native_build.FOLDER if self.editable_mode else Path(self.build_lib, "gsmerge", "kernels")
         wheel = self.distribution.command_obj.get("bdist_wheel")
-        built = native_build.build(folder, platform=wheel.plat_name if wheel else None)
+        built = native_build.build_libraries(folder, platform=wheel.plat_name if wheel else None)
         for path in set(folder.glob("kernels-*")) - set(built):  # of an earlier build for another platform
             path.unlink()
         self.announce(f"built {', '.join(map(str, built))}", level=2)

@@ -14,12 +14,12 @@ from gsmerge.geometry.pooling import Members
 from gsmerge.networks.corrector import Corrector
 from gsmerge.photos.row_colors import RENDERS
 from gsmerge.plan import Plan
-from gsmerge.runtime.record import choose
+from gsmerge.runtime.record import record_choices
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_corrector
 from gsmerge.stages.fill import fill_between
-from gsmerge.stages.fit_pairs import fit_around, merge_pairs
+from gsmerge.stages.fit_pairs import fit_around, merge_scene
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge
 from gsmerge.stages.prune import split_unseen
@@ -38,7 +38,7 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
 
 def decode_pairs(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
     """Merge neighbours pair by pair into ``count`` Gaussians."""
-    return merge_pairs(plan.limits.default if count is None else count, plan.power, prepared)
+    return merge_scene(plan.limits.default if count is None else count, plan.power, prepared)
 
 
 def decode_views(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
@@ -53,7 +53,7 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
     """Merge the superpixels of all views."""
     features, members, segmentation, networks = encode_views(prepared, plan, count)
     merged = networks.refine(merge(features, match(features, plan.match), networks))
-    choose(groups=len(features), clusters=len(merged), **plan.network_facts)
+    record_choices(groups=len(features), clusters=len(merged), **plan.network_facts)
     return MergedViews(merged, members, segmentation, len(features), networks)
 
 
@@ -99,5 +99,5 @@ def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Pla
     written = Gaussians.concat([seen, added])
     most = start.count if plan.fit.grows else len(start.gaussians)
     if plan.prunes:
-        choose(pruned=max(0, most - len(written)))
+        record_choices(pruned=max(0, most - len(written)))
     return replace(fitted, gaussians=written)

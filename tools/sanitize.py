@@ -67,7 +67,7 @@ def build_library(folder: Path, flags: tuple[str, ...], *preloaded: str) -> dict
     """Build the native library with a sanitizer; return the environment of processes that load it."""
     usual = dict(os.environ)
     os.environ["GSMERGE_CC"] = "gcc"
-    build.build(folder, flags, link=("-shared",))
+    build.build_libraries(folder, flags, link=("-shared",))
     del os.environ["GSMERGE_CC"]  # the tests must not use it
     path = os.pathsep.join((str(ROOT), str(ROOT / "tools")))
     return usual | {

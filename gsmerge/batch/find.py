@@ -23,43 +23,46 @@ from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, lis
 from gsmerge.runtime.record import list_some
 from gsmerge.values.words import count_words
 
-NamedScene = tuple[Path, Path | None]  # a scene, and the folder that the user named; None if that was the scene itself
-MAX_FOLDERS = 100_000  # folders without a scene after the last scene; a link into a system's folders leads to more
+NamedScene = tuple[Path, Path | None]  # a scene, and the folder in which it was found; None if the user named the scene
+MAX_FOLDERS = 100_000  # most folders in a row without a scene; a link into a system's folders leads to more
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
-# Names in a folder that looks like a scene, without .ply; a folder with such a name is part of one
+# Names, without .ply, that make a folder look like a scene if it contains them. A folder of such a name is part of one
 _LOOKS = {place.split("/")[0].removesuffix(".ply") for place in (*PLY_PLACES, *IMAGE_PLACES, *CAMERA_PLACES)}
 
 
 def scene_plys(scene: Path) -> list[Path]:
-    """List the Gaussian files of a scene, given one of them or their folder; empty if the folder cannot be read."""
+    """List the files of Gaussians of a scene, which is a file or a folder; empty if the folder cannot be read."""
     with suppress(SceneError, OSError):
         return list_plys(scene) if os.path.isdir(scene) else [scene]
     return []
 
 
 def main_file(scene: Path) -> Path:
-    """Find the file that identifies a scene; the folder itself if several files could, or if it cannot be read."""
+    """Return the file that identifies a scene; its folder if several files could, or if the folder cannot be read."""
     if not os.path.isdir(scene):
         return scene
-    with suppress(OSError):  # reading the scene reports the reason
+    with suppress(OSError):  # whoever reads the scene reports the reason
         plys = other_plys(scene)
         return named_ply(scene) or (plys[0] if len(plys) == 1 else scene)
     return scene
 
 
 def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
-    """Yield the scenes of :func:`find_named_scenes`."""
+    """Yield the scenes of :func:`find_named_scenes` without the folders in which they were found."""
     return (scene for scene, _ in find_named_scenes(arguments, out))
 
 
 def count_links(path: Path) -> int:
-    """Count the symbolic links in a path. Of several paths to a scene, that with the fewest names it."""
+    """Count the symbolic links in a path. If several paths lead to a scene, the one with the fewest links names it."""
     return sum(map(os.path.islink, (path.absolute(), *path.absolute().parents)))
 
 
 def describe_lost(looks: Sequence[str], scenes: Collection[str]) -> list[str]:
-    """Note the folders beside scenes with photos or cameras that look like them, but are none, nor have any below."""
+    """Return a note about folders that look like the scenes beside them, but have no Gaussians; empty without any.
+
+    ``looks`` are the folders that look like scenes, and ``scenes`` those that are.
+    """
     above = {str(folder) for scene in scenes for folder in (Path(scene), *Path(scene).parents)}
     beside = {os.path.dirname(folder) for folder in looks if folder in scenes}
     lost = [
@@ -75,9 +78,9 @@ def describe_lost(looks: Sequence[str], scenes: Collection[str]) -> list[str]:
 def find_named_scenes(arguments: Sequence[str], out: Path, looks: list[str] | None = None) -> Iterator[NamedScene]:
     """Yield the scenes of all arguments, in natural order within each argument; a scene may come twice.
 
-    A folder that cannot be read counts as a scene, so that reading it reports the reason. Links to folders come after
-    the folders. ``looks`` gets the folders that have photos, cameras or names of scenes. SceneError if an argument does
-    not exist, has no scene, or has too many folders without a scene; UsageError if it is the output folder.
+    A folder that cannot be read counts as a scene, so that the reason is reported when it is read. Folders behind links
+    come last. The folders that look like scenes are appended to ``looks``. Raises SceneError if an argument does not
+    exist, has no scene, or has too many folders without a scene, and UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in arguments:
@@ -99,7 +102,7 @@ def find_named_scenes(arguments: Sequence[str], out: Path, looks: list[str] | No
 
 
 def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> Iterator[NamedScene]:
-    """Yield the scenes; SceneError if there are none."""
+    """Yield the scenes of an argument; SceneError if there are none ``where`` the argument says."""
     first_scene = next(scenes, None)
     if first_scene is None:
         raise SceneError(argument, f"expected scenes {where}, found none", _remedy(Path(argument)))
@@ -108,29 +111,29 @@ def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> It
 
 
 def _remedy(folder: Path) -> str:
-    """Return the remedy for a folder in which no scene was found."""
+    """Return what helps if no scene was found in a folder; empty if it is no folder."""
     if not os.path.isdir(folder):
         return ""
     file = next(iter(list_plys(folder)), None)
     if file is None:
         return find_remedy(folder)
-    is_result = file.suffix == ".ply"  # the search lists all other .ply; it does not list the meta.json of a .sog
+    is_result = file.suffix == ".ply"  # the search leaves out a .ply only if it is a result
     return f"{file} is a result of gsmerge; name this file to compact it" if is_result else f"name {file}"
 
 
 @dataclass
 class _Search:
-    """Search of one argument; it enters each folder once, even if several links lead to it."""
+    """The search for the scenes of one argument. It enters each folder once, even if several links lead to it."""
 
     skip: str  # real path of the output folder, which is not searched
-    looks: list[str]  # folders with photos or cameras, and others with files named like those of scenes
+    looks: list[str]  # folders that look like scenes, because they have photos, cameras or files with usual names
     seen: set[str] = field(default_factory=set)  # real paths of the folders entered so far
-    num_empty: int = 0  # folders since the last scene
+    num_empty: int = 0  # number of folders since the last scene
 
     def walk(self, top: Path) -> Iterator[NamedScene]:
-        """Yield the scenes in a folder, or the folder itself if it has a scene file with a usual name."""
-        errors: list[OSError] = []  # reading such a folder reports the reason
-        starts = [top]  # links come after all folders
+        """Yield the scenes in a folder and below it, or the folder itself if it is a scene."""
+        errors: list[OSError] = []  # folders that cannot be read count as scenes
+        starts = [top]  # folders behind links are added at the end
         for folder, folders, files in (entry for start in starts for entry in os.walk(start, onerror=errors.append)):
             yield from ((Path(error.filename), top) for error in errors)
             errors.clear()
@@ -161,8 +164,8 @@ class _Search:
 
 
 def _is_packed(path: Path) -> bool:
-    """Return whether a file is a zip archive with Gaussians, which counts as a scene so that its reader refuses it."""
-    if path.suffix != ".zip" or path.with_suffix("").exists():  # it is unpacked already
+    """Return true if a file is a zip archive with Gaussians, which counts as a scene so that its reader refuses it."""
+    if path.suffix != ".zip" or path.with_suffix("").exists():  # the second: it was unpacked already
         return False
     with suppress(OSError, SceneError, BadZipFile), open_archive(path) as archive:
         return any(name.endswith(SCENE_SUFFIXES) for name in archive.namelist())
@@ -170,9 +173,9 @@ def _is_packed(path: Path) -> bool:
 
 
 def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
-    """List the scenes in a folder that is no scene itself; the folder if it cannot be read any more.
+    """List the files that are scenes in a folder that is no scene itself; the folder if it cannot be read any more.
 
-    ``names``: files and folders in the folder.
+    ``names`` are those of the files and folders in it.
     """
     if SCENE_NAMES.isdisjoint(names) and not any(name.endswith(SCENE_SUFFIXES) for name in names):
         return []
@@ -180,11 +183,11 @@ def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
         scenes = other_plys(folder)
         if scenes or os.path.isdir(folder):
             return scenes
-    return [folder]  # reading it reports the reason
+    return [folder]  # so that the reason is reported when it is read
 
 
 def _is_scene(folder: Path, names: list[str]) -> bool:
-    """Return whether a folder that contains these names is a scene."""
+    """Return true if a folder is a scene; ``names`` are those of the files and folders in it."""
     try:
         if SCENE_NAMES.isdisjoint(names):
             return False
@@ -192,17 +195,17 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
             return True
         if other_plys(folder):
             return False
-        # a file with a usual name but without Gaussians fails alone
+        # a single file with a usual name but without Gaussians is a scene, so that its error is reported
         return [header_content(path) for path in list_plys(folder)] == ["other"]
-    except (SceneError, OSError):  # reading the scene reports the reason
+    except (SceneError, OSError):  # so that the reason is reported when it is read
         return True
 
 
 def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
-    """Yield the scenes that match a pattern, and those in matching folders; links are not followed into folders."""
+    """Yield the scenes that match a pattern, and those in matching folders; the pattern does not pass through links."""
     anchor = Path(pattern).anchor
     found = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
-    named = Path(pattern).parts  # other parts with a dot in front are hidden
+    named = Path(pattern).parts  # other names with a dot in front are hidden
     shown = (str(p) for p in found if all(part[:1] != "." or part in named for part in p.parts))
     for path in sorted(map(Path, natural_order(shown)), key=count_links):
         if path.is_dir():
@@ -212,9 +215,9 @@ def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
 
 
 def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:
-    """Yield the scenes of a list, whose paths are relative to its folder; a missing scene fails when it is read."""
+    """Yield the scenes of a list with one path per line, relative to its folder; missing scenes are yielded too."""
     budget, lines = read_budget(file), dict[str, None]()
-    job_bytes = 700  # memory for each scene of a list
+    job_bytes = 700  # bytes of memory for each scene of a list
     for line in read_lines(file):
         if "\0" in line:
             raise SceneError(file, "expected a text file with one path per line, found no text")

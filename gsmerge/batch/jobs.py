@@ -1,4 +1,4 @@
-"""Make the jobs of a batch, each a scene with the call that makes its result."""
+"""Make the jobs of a batch. A job is a scene with the call that makes its result."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from gsmerge.types import StrPath
 from gsmerge.version import __version__
 
 FIELDS = ("stem", "parent", "index", "k")
-PLACE_OPTIONS = ("cameras", "images", "masks", "protect")  # options that name files and folders beside a scene
+PLACE_OPTIONS = ("cameras", "images", "masks", "protect")  # options that say where files of a scene are
 
 DISTINGUISH = "distinguish them with --name, such as '{parent}-{stem}.ply'"
 
@@ -81,18 +81,18 @@ class BatchOptions(Settings):
 
 @dataclass(frozen=True)
 class CompactCall:
-    """The call that ``gsmerge compact`` makes."""
+    """The call that makes a result, the same as that of ``gsmerge compact``."""
 
     settings: CompactOptions
     opacity: OpacityChoice
     hints: ReadHints
 
     def key(self, files: SceneFiles) -> str:
-        """Return a digest of the input's files and the version, a dot, and a digest of all settings."""
+        """Return the key of a result: a digest of the input's files and the version, a dot, and one of the settings."""
         settings = self.settings.to_dict()
         del settings["threads"]
         checkpoint = Path(self.settings.checkpoint)
-        if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # its content counts, not its path
+        if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # the content counts, not the path
             settings["checkpoint"] = file_sha256(checkpoint)
         without = [name for name in sorted(files.named) if getattr(files, name) is None]
         reading = {"opacity": self.opacity, **vars(self.hints), "without": without}
@@ -103,7 +103,10 @@ class CompactCall:
     def run(
         self, files: SceneFiles, out: Path, cameras: Path | None, threads: int
     ) -> tuple[dict[str, Any], list[Path]]:
-        """Compact the scene; return the report, and the result with its coarser levels and its ``cameras``."""
+        """Compact a scene; return its report, and the paths of the result, its coarser levels and its cameras.
+
+        ``out`` and ``cameras`` are where the result and its cameras are written; None writes no cameras.
+        """
         document = compact_files(
             files, replace(self.settings, threads=threads), Outputs(out, cameras, overwrite=True),
             opacity=self.opacity, hints=self.hints, hashed=True,
@@ -116,17 +119,17 @@ class CompactCall:
 class Job:
     """A scene of a batch, and the call that makes its result."""
 
-    scene: str  # a file of Gaussians, or its folder
+    scene: str  # path of a file of Gaussians or of its folder
     outputs: tuple[str, ...]  # names of the result and of its coarser levels in the output folder
     call: CompactCall
-    num_gaussians: int  # estimated by the header or the bytes of its files; 0 if they cannot be read
-    num_rest: int = 0  # columns of higher harmonics, estimated in the same way
-    cameras: StrPath | None = None  # None: those beside the scene
-    images: StrPath | None = None  # None: those beside the scene
-    masks: StrPath | None = None  # None: those beside the photos
-    protect: StrPath | None = None  # None: nothing has to stay sharper
-    within: Path | None = None  # folder that the user named; cameras and photos are searched up to it
-    clash: str | None = None  # why its result cannot have its name, unless the record says that the name is its own
+    num_gaussians: int  # estimated by the headers or the sizes of its files; 0 if they cannot be read
+    num_rest: int = 0  # values of higher harmonics of a Gaussian, estimated in the same way
+    cameras: StrPath | None = None  # None for those beside the scene
+    images: StrPath | None = None  # None for those beside the scene
+    masks: StrPath | None = None  # None for those beside the photos
+    protect: StrPath | None = None  # None if nothing has to stay sharper
+    within: Path | None = None  # folder that the user named; the search for cameras and photos goes up to it
+    clash: str | None = None  # why the result cannot have its name, unless a record says that this scene has it
 
     @property
     def output(self) -> str:
@@ -135,7 +138,7 @@ class Job:
 
     @property
     def memory(self) -> int:
-        """Estimated memory of the call in bytes, within a factor of about two."""
+        """Estimated memory of the call in bytes, right up to a factor of about two."""
         return memory_bytes(self.num_gaussians, num_rest=self.num_rest)
 
     def find_files(self) -> SceneFiles:
@@ -151,14 +154,14 @@ def find_jobs(
     results: Collection[str] = (),
     looks: list[str] | None = None,
 ) -> list[Job]:
-    """Find all scenes, each once, and name their results in the output folder.
+    """Find all scenes, and return a job for each, which names its result in the output folder ``out``.
 
-    ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
-    line. ``results`` has the real paths of former results, which are not scenes. ``looks`` gets the folders that look
-    like scenes, for :func:`describe_lost`. A scene to which several paths lead is named by that with the fewest links.
-    A result that would have the name of another result or of a scene's file is a ``clash`` of its job. SceneError if an
-    argument does not exist or has no scene, if cameras, photos or masks for all scenes do not exist, or if networks
-    cannot be used.
+    ``arguments`` are folders, patterns, ``.ply`` files, and text files with one of these per line. The output folder is
+    not searched. ``results`` has the real paths of former results, which are not scenes. The folders that look like
+    scenes are appended to ``looks``, for :func:`describe_lost`. If several paths lead to a scene, the one with the
+    fewest links names it. If a result would have the name of another result or of a scene's file, its job has a
+    ``clash``. Raises SceneError if an argument does not exist or has no scene, if cameras, photos or masks for all
+    scenes do not exist, or if networks cannot be used.
     """
     if options.settings.checkpoint not in CHECKPOINTS:
         load_checkpoint(options.settings.checkpoint)  # fail once, not for each scene
@@ -166,7 +169,7 @@ def find_jobs(
     for name in PLACE_OPTIONS:
         _check_place(name, getattr(options, name))
     jobs: list[Job] = []
-    owners: dict[str, list[str]] = {}  # scenes by the name of a result
+    owners: dict[str, list[str]] = {}  # scenes whose results would have a name, by this name
     inputs: set[str] = set()
     found = [(main_file(scene), scene, within) for scene, within in find_named_scenes(arguments, out, looks)]
     for file, scene, within in sorted(found, key=lambda entry: count_links(entry[0])):
@@ -186,7 +189,7 @@ def find_jobs(
 
 
 def _find_clash(job: Job, out: Path, owners: Mapping[str, Sequence[str]], inputs: Collection[str]) -> str | None:
-    """Return why a result cannot have its name: those of other scenes have it, or a scene itself has."""
+    """Return the message for a result that would have the name of another result or of a scene; None if it may."""
     for name in job.outputs:
         scenes = owners[os.path.normcase(name)]
         if len(scenes) > 1:
@@ -200,7 +203,7 @@ def _find_clash(job: Job, out: Path, owners: Mapping[str, Sequence[str]], inputs
 
 
 def _check_place(option: str, place: str | None) -> None:
-    """Raise SceneError if a path for all scenes does not exist, since each scene would fail."""
+    """Raise SceneError if the path that an option gives for all scenes does not exist, because each would fail."""
     if place in (None, NONE) or "{" in place or os.path.exists(place):
         return
     remedy = f"for one beside each scene pass --{option} '{{parent}}/{place}'"

@@ -1,4 +1,4 @@
-"""Records of a batch, a line of JSON for each result that was made or failed."""
+"""Read and make the records of a batch: a line of JSON for each result that was made or failed."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from gsmerge.measure.documents import document_head, file_sha256
 
 RECORDS = "batch.jsonl"
 DONE, FAILED = "done", "failed"  # values of `status` in records
-SKIPPED = "skipped"  # `status` of a result that was done before; it is reported, but not recorded again
+SKIPPED = "skipped"  # `status` of a result that was done before, which is reported but not recorded again
 
 
 @dataclass(frozen=True)
 class DoneResult:
-    """A result that is done, as its record describes it."""
+    """What the record of a result that is done says."""
 
     key: str  # digest of the scene's files, the settings and the version
-    files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each file
-    scene: str  # its path, as it was given
-    doubts: tuple[str, ...] = ()  # notes that make it doubtful
-    unmet: str | None = None  # why a target is not met
+    files: list[dict[str, Any]]  # of each file: `path` in the output folder, `sha256` and `bytes`
+    scene: str  # path of the scene, as the user gave it
+    doubts: tuple[str, ...] = ()  # notes that say why the result may be bad
+    unmet: str | None = None  # why the result misses its target, or None
 
     def holds(self, folder: Path, key: str) -> bool:
-        """Return whether the result has this key and all its files are unchanged."""
+        """Return true if the result has this key, and all its files in ``folder`` are unchanged."""
         if self.key != key or not self.files:
             return False
         try:
             paths = [folder / file["path"] for file in self.files]
-            if not all(path.is_file() for path in paths):  # a pipe would never end
+            if not all(path.is_file() for path in paths):  # reading a pipe would never end
                 return False
             return [file_sha256(path) for path in paths] == [file["sha256"] for file in self.files]
         except (OSError, ValueError):  # ValueError: no file can have this name
@@ -48,10 +48,13 @@ class RecordIndex:
 
     folder: Path
     end: int = 0  # byte up to which the records have been read
-    results: dict[str, DoneResult] = field(default_factory=dict)  # by name of the output
+    results: dict[str, DoneResult] = field(default_factory=dict)  # by name of the result in the folder
 
     def read_on(self) -> RecordIndex:
-        """Read the records that this or another process has added since the last call; skip damaged lines."""
+        """Read the records that were added since the last call, also by other processes; return this index.
+
+        Damaged lines are skipped.
+        """
         for end, line in each_line(self.folder / RECORDS, self.end):
             self.end = end
             with suppress(KeyError, TypeError, AttributeError):  # the line is not a record
@@ -77,20 +80,20 @@ def _read_result(line: Mapping[str, Any]) -> DoneResult:
 
 
 def _text(value: Any) -> str:
-    """Return a text; TypeError for another value."""
+    """Return the value if it is a text; TypeError otherwise."""
     if not isinstance(value, str):
         raise TypeError
     return value
 
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
-    """Make a record of ``facts`` with all keys that a record has."""
+    """Return a record with all its keys; those that ``facts`` do not have get empty values."""
     blank: dict[str, Any] = {"key": None, "files": [], "error": None, "doubts": [], "unmet": None, "report": None}
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **facts}
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make the output folder; SceneError if its records cannot be written."""
+    """Make the output folder and its file of records; SceneError if records cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         records = folder / RECORDS
@@ -98,8 +101,8 @@ def prepare_folder(folder: Path) -> None:
             problem = "expected a file of records, found a link"
             raise SceneError(records, problem, "remove it, or name another folder with --output")
         if records.exists():
-            check_file(records)  # not a pipe, which would wait for its reader
-        if os.access(folder, os.W_OK) or not records.exists():  # results that are done are skipped in any folder
+            check_file(records)  # raises for a pipe, which would wait for its reader
+        if os.access(folder, os.W_OK) or not records.exists():  # a read-only folder may hold results that are done
             records.touch()
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"

@@ -1,7 +1,8 @@
 """Run a batch: make the result of every job that is not done, and record how each ended.
 
-The run may be killed at any moment. A result is written completely or not at all, and is recorded right after. A killed
-process also leaves a file that marks its result as begun. This file shows that a batch made a result without a record.
+The run may be killed at any moment. A result is written completely or not at all, and its record follows at once. If a
+process is killed in between, the result has no record. Then a file that marks the result as begun shows that a batch
+made it.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from gsmerge.runtime.threads import available_threads
 from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, LostProcess, RayPool, WorkerPool
 from gsmerge.values.words import count_words
 
-FREE_MEMORY_SHARE = 0.8  # of the free memory, for all scenes that run at the same time by default
+FREE_MEMORY_SHARE = 0.8  # scenes that run at the same time may by default take this share of the free memory
 
 
 @dataclass(frozen=True)
 class Concurrency:
     """Number of scenes that are compacted at the same time, and number of threads for each."""
 
-    jobs: int  # 0: as many as the cluster has processors for
-    threads: int
-    memory: float = math.inf  # bytes for all scenes at the same time; one that needs more runs alone
+    jobs: int  # 0 for as many as the cluster has processors for
+    threads: int  # of each scene
+    memory: float = math.inf  # bytes for all scenes at the same time; a scene that needs more runs alone
 
     def __str__(self) -> str:
         jobs = self.jobs or "as many as the cluster has room for"
@@ -51,17 +52,18 @@ class Concurrency:
 
 @dataclass(frozen=True)
 class Run:
-    """Values that all jobs of a run share."""
+    """What all jobs of a run share."""
 
-    folder: Path  # of the results
-    threads: int  # of each call
-    overwrite: bool
+    folder: Path  # output folder
+    threads: int  # of each job
+    overwrite: bool  # True to make all results again
 
 
 def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrency:
-    """Divide the processors among scenes, with as many scenes at once as there are processors and free memory.
+    """Choose how many scenes run at the same time, by the processors and the free memory, and the threads of each.
 
-    Memory is reckoned for scenes of the median size. While larger ones run, fewer run at once.
+    The number of scenes is that of the scenes of median size that fit into the memory. While larger ones run, fewer run
+    at the same time.
     """
     threads, processors = options.settings.threads, available_threads()
     if options.engine == "ray":
@@ -73,7 +75,7 @@ def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrenc
 
 
 def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> list[tuple[Job, str | None]]:
-    """List the jobs to do, each with the reason if it will be refused; with ``overwrite`` these are all."""
+    """List the jobs whose results are not done, each with the reason if it will be refused; with ``overwrite`` all."""
     results, pending = RecordIndex(folder).read_on().results, list[tuple[Job, str | None]]()
     for job in jobs:
         known = results.get(job.output)
@@ -81,13 +83,13 @@ def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> li
             key = job.call.key(job.find_files())
             if options.overwrite or known is None or not known.holds(folder, key):
                 pending.append((job, refusal(job, folder, known, key, overwrite=options.overwrite)))
-        except Exception as error:  # as in the run, it fails alone
+        except Exception as error:  # a bad scene must not end the list, as in the run
             pending.append((job, _record_failure(job, folder, error_line(error))["error"]))
     return pending
 
 
 def _record_failure(job: Job, folder: Path, reason: str) -> dict[str, Any]:
-    """Make the record of a failure, which says if an earlier result of the scene stays."""
+    """Return the record of a failure, which says if an earlier result of the scene stays in the folder."""
     known = read_run_index(folder).read_on().results.get(job.output)
     is_kept = known is not None and known.scene == job.scene and os.path.lexists(folder / job.output)
     return record(
@@ -98,7 +100,11 @@ def _record_failure(job: Job, folder: Path, reason: str) -> dict[str, Any]:
 def refusal(
     job: Job, folder: Path, known: DoneResult | None, key: str, *, overwrite: bool, begun: bool = False
 ) -> str | None:
-    """Return why a result must not be made, or None; ``begun``: the existing file may be from a killed run."""
+    """Return why a result must not be made, or None if it may.
+
+    ``known`` is the result in the record, and ``key`` that of the result to make. ``begun`` is true if a file without a
+    record may come from a run that was killed.
+    """
     names = () if known is None else [file["path"] for file in known.files]
     foreign = [folder / name for name in job.outputs if os.path.lexists(folder / name) and name not in names]
     (scene, _, settings), former = key.partition("."), ("" if known is None else known.key).partition(".")
@@ -166,33 +172,33 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
 def run_job(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str, Any] | None:
     """Make a result unless it is done, record the outcome, and return the record.
 
-    If another process works on the result, ``wait`` for it or return None. ``lost``: why the process that made the
-    result has ended; only the failure is recorded. SceneError if the record cannot be written.
+    If another process works on the result, ``wait`` for it or return None. ``lost`` says why the process that should
+    make the result has ended; then only this failure is recorded. SceneError if the record cannot be written.
     """
-    with lock_result(run.folder, job.output, wait=wait) as begun:
-        if begun is None:
+    with lock_result(run.folder, job.output, wait=wait) as mark:
+        if mark is None:
             return None
-        _clean(job, run, begun)
+        _remove_unfinished_files(job, run, mark)
         try:
-            line = _make(job, run, begun) if lost is None else _record_failure(job, run.folder, lost)
+            line = _make_result(job, run, mark) if lost is None else _record_failure(job, run.folder, lost)
         except Exception as error:  # a bad scene must not end the batch
             line = _record_failure(job, run.folder, error_line(error))
         if line["status"] != SKIPPED:
             append_line(run.folder / RECORDS, line)
         if lost is None:
-            begun.unlink(missing_ok=True)
+            mark.unlink(missing_ok=True)
     return line
 
 
-def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
-    """Make a locked result unless it is done or refused; return its record."""
+def _make_result(job: Job, run: Run, mark: Path) -> dict[str, Any]:
+    """Make a result, which this process has locked, unless it is done or refused; return its record."""
     files = job.find_files()
     key, known = job.call.key(files), read_run_index(run.folder).read_on().results.get(job.output)
     if known is not None and not run.overwrite and known.holds(run.folder, key):
         return record(
             SKIPPED, job.scene, job.output, key=key, files=known.files, doubts=known.doubts, unmet=known.unmet
         )  # fmt: skip
-    refused = refusal(job, run.folder, known, key, overwrite=run.overwrite, begun=begun.exists())
+    refused = refusal(job, run.folder, known, key, overwrite=run.overwrite, begun=mark.exists())
     if refused:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
     out, cameras = run.folder / job.output, viewer_cameras_path(run.folder / job.output)
@@ -200,7 +206,7 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     is_free = os.path.realpath(cameras) not in map(os.path.realpath, files.paths) and (
         is_own or run.overwrite or not os.path.lexists(cameras)  # results in other formats share them
     )
-    with atomic_output(begun, overwrite=True) as temporary:  # on the disk before the result
+    with atomic_output(mark, overwrite=True) as temporary:  # on the disk before the result
         temporary.write_text(f"{os.getpid()}\n")
     with warnings.catch_warnings(record=True) as caught_warnings:
         warnings.simplefilter("default")
@@ -219,34 +225,34 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def read_run_index(folder: Path) -> RecordIndex:
-    """Return the index of a folder's records; each process keeps it between the calls of a run."""
+    """Return the index of a folder's records, which each process keeps for all jobs of a run."""
     return RecordIndex(folder)
 
 
 def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
-    """Remove the unfinished files of jobs whose processes this run has ended."""
+    """Remove the unfinished files of jobs that no process makes any more."""
     for job in jobs:
-        with suppress(SceneError), lock_result(run.folder, job.output, wait=False) as begun:
-            if begun is not None:
-                _clean(job, run, begun)
+        with suppress(SceneError), lock_result(run.folder, job.output, wait=False) as mark:
+            if mark is not None:
+                _remove_unfinished_files(job, run, mark)
 
 
-def _clean(job: Job, run: Run, begun: Path) -> None:
-    """Remove the unfinished files of a killed process; keep the mark if the result exists and so may lack a record."""
-    if begun.exists():
+def _remove_unfinished_files(job: Job, run: Run, mark: Path) -> None:
+    """Remove what a killed process has left. Keep the file ``mark`` if the result exists, perhaps unrecorded."""
+    if mark.exists():
         paths = [run.folder / name for name in job.outputs]
         for folder in {path.parent for path in paths}:
             remove_stale(folder)
         if not any(map(os.path.lexists, paths)):
-            begun.unlink()
+            mark.unlink()
 
 
 @contextmanager
 def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[Path | None]:
     """Lock a result against other processes in the block; SceneError if that fails.
 
-    Yields the path of the file that marks the result as begun. If another process has locked the result, ``wait`` for
-    it or yield None. A folder that cannot be written needs no lock: what is done in it is skipped.
+    Yields the path of the file that marks the result as mark. If another process has locked the result, ``wait`` for
+    it or yield None. A folder that cannot be written needs no lock, because no result is made in it.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
     lock = lock_file(folder / f".batch-{name}.lock", wait=wait) if os.access(folder, os.W_OK) else nullcontext(True)

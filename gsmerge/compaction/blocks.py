@@ -36,10 +36,10 @@ from gsmerge.runtime.record import (
     RunPart,
     add_seconds,
     begin_part,
-    choose,
     current_record,
     expect_parts,
     note,
+    record_choices,
     stage,
 )
 from gsmerge.runtime.work import start_work
@@ -120,7 +120,7 @@ def compact_in_blocks(
         }
         for start, (_, block_choices), score in zip(starts, fitted, scores, strict=True)
     ]  # fmt: skip
-    choose(blocks=facts)
+    record_choices(blocks=facts)
     return CompactResult(result, join_reports(scene, result, starts, scores, options), scene.cameras).to(device)
 
 
@@ -148,7 +148,7 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
         for text in record.notes:
             note(text)
         if stray := record.choices.get("photos_left_out"):
-            choose(photos_left_out=[*current_record().choices.get("photos_left_out", ()), *stray])
+            record_choices(photos_left_out=[*current_record().choices.get("photos_left_out", ()), *stray])
         yield value, record.choices
 
 
@@ -211,7 +211,7 @@ def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, l
     seen, unseen = split_unseen(joined, cameras)
     room = len(unseen) if limit is None else limit - len(seen)
     unseen = unseen[: max(0, room) if options.budget.is_filled else 0]
-    choose(pruned=len(joined) - len(seen) - len(unseen))
+    record_choices(pruned=len(joined) - len(seen) - len(unseen))
     return Gaussians.concat([seen, unseen])
 
 

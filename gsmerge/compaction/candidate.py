@@ -11,7 +11,7 @@ from gsmerge.geometry.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.photos.row_colors import RENDERS
 from gsmerge.plan import Plan, own_views
-from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
+from gsmerge.runtime.record import Record, current_record, note, record_choices, record_part, stage
 from gsmerge.types import Cameras, Gaussians
 
 
@@ -55,12 +55,14 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tup
     if moved.reference.name == RENDERS:
         fidelity = _measure_fidelity(moved.frame.enter(written(gaussians, plan)), moved, plan)
         views, placed = len(plan.scored_views), moved.reference.placed
-        choose(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
+        record_choices(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
         return fidelity, fidelity
     measured = measure_result(gaussians, moved, plan, None if plan.before is None else plan.before.covered)
     if measured is None:
         return None, None
-    choose(scored_views=len(plan.scored_views), scored_all=not plan.samples and plan.scored_views == own_views(moved))
+    record_choices(
+        scored_views=len(plan.scored_views), scored_all=not plan.samples and plan.scored_views == own_views(moved)
+    )
     return measured.psnr, measured.psnr if covers_all(plan.before) else measured.covered_psnr
 
 
@@ -86,5 +88,5 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
     cause = "poses are free" if plan.free_poses else "the photos of some views agree only under other poses"
     depth = scene_depth(prepared.scene) * prepared.frame.unit
     moves = list_moves(input_scene.names, input_scene.cameras.viewmats, cameras.viewmats, depth)
-    choose(poses=moves)
+    record_choices(poses=moves)
     note(f"{cause}: cameras were moved by {describe_moves(moves)}")

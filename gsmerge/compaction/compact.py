@@ -37,9 +37,9 @@ from gsmerge.runtime.record import (
     add_seconds,
     adopt,
     begin_part,
-    choose,
     expect_parts,
     note,
+    record_choices,
     record_part,
     record_run,
 )
@@ -266,7 +266,7 @@ def _note_clean(dropped: dict[str, int], remaining: int, count: int | None, prep
     """Note which Gaussians clean-up dropped, and whether fewer than ``count`` remain."""
     from gsmerge.stages.clean import describe_counts
 
-    choose(clean=dropped)
+    record_choices(clean=dropped)
     # the scene itself was cropped before: Gaussians count as cropped here if the fit moved them over the border
     shown = {name: number for name, number in dropped.items() if number or name != "cropped"}
     if shown:

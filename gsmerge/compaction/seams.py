@@ -16,7 +16,7 @@ from gsmerge.raster.composite import list_contributions
 from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.tiled_view import Splats
 from gsmerge.runtime.memory import free_pages, make_array
-from gsmerge.runtime.record import add_seconds, begin_part, choose, record_part, stage
+from gsmerge.runtime.record import add_seconds, begin_part, record_choices, record_part, stage
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
@@ -58,7 +58,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
     with record_part(title="seams") as record:
         fitted = fit_scene(decoded, scene, options, seed)
     add_seconds(record.seconds)
-    choose(seams={"views": len(scene), "num_gaussians": int(at_seam.sum()), "steps": options.steps})
+    record_choices(seams={"views": len(scene), "num_gaussians": int(at_seam.sum()), "steps": options.steps})
     columns = {f.name: np.array(getattr(joined, f.name)) for f in fields(Gaussians)}
     moved = at_seam[rows]  # the fit also returns the fixed Gaussians, but rounded
     for name, column in columns.items():

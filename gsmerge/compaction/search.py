@@ -16,7 +16,7 @@ from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.photos.row_colors import PHOTOS, RENDERS
 from gsmerge.pipeline import Build
 from gsmerge.plan import FIDELITY_LOSS, Plan
-from gsmerge.runtime.record import begin_part, choose, current_record, note, record_part, stage
+from gsmerge.runtime.record import begin_part, current_record, note, record_choices, record_part, stage
 from gsmerge.stages.segment import knee_count
 
 # dB of PSNR per doubling of the count, assumed until two counts were tried: against photos, and against renders
@@ -262,7 +262,9 @@ def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut
     with stage("curve"):
         counts, steps = curve_counts(drop, limits.default, limits.min_count, most)
         points = measure_curve(prepared, plan, build, steps, counts, left_out)
-    choose(curve=[asdict(point) for point in points], curve_left_out=0 if left_out is None else len(left_out.photos))
+    record_choices(
+        curve=[asdict(point) for point in points], curve_left_out=0 if left_out is None else len(left_out.photos)
+    )
     return curve_knee(points) if drop is None else count_within(points, drop)
 
 

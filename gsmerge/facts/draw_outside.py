@@ -20,7 +20,7 @@ from gsmerge.photos.views import concat_cameras, even_views
 from gsmerge.raster import render
 from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import blank_photos, photo_errors
-from gsmerge.runtime.record import choose, note
+from gsmerge.runtime.record import note, record_choices
 from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels, make_scene
 
 # Cameras are placed if views miss at least this share of the Gaussians. A placed camera is used if at least this share
@@ -57,7 +57,7 @@ def draw_outside(scene: PicturedScene) -> PicturedScene:
         f"no view sees {100 * outside.mean():.0f} % of the Gaussians; pictures of the input from {len(placed)} places"
         " beside the views stand for photos there"
     )
-    choose(placed_views=len(placed))
+    record_choices(placed_views=len(placed))
     return _with_drawings(scene, placed, counting)
 
 

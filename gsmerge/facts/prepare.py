@@ -29,7 +29,7 @@ from gsmerge.photos.compare import compare_photos
 from gsmerge.photos.exposure import equalise_exposure
 from gsmerge.photos.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
 from gsmerge.photos.views import distinct_views, subset
-from gsmerge.runtime.record import choose, note, record_part, stage
+from gsmerge.runtime.record import note, record_choices, record_part, stage
 from gsmerge.settings.stages import Look, PrepareOptions
 from gsmerge.types import Cameras, PicturedScene, Scene
 
@@ -138,7 +138,7 @@ def prepare(
     prepared = replace(prepared, reference=replace(prepared.reference, photo_files=files))
     agreement = confirm_depths(prepared.scene)
     if agreement is not None:
-        choose(agreement=agreement.to_dict())
+        record_choices(agreement=agreement.to_dict())
         if agreement.advice:
             note(agreement.advice)
         prepared = replace(prepared, agreement=agreement)

@@ -1,13 +1,13 @@
-"""Gaussians -> fitted Gaussians: all parameters, against the input photos."""
+"""Gaussians -> fitted Gaussians: optimise all parameters, so that renders look like the input photos."""
 
 from gsmerge.fit.photo_sizes import fit_photos, photo_scale
 from gsmerge.fit.report import FitReport, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob
-from gsmerge.fit.stage import fit, fit_scene, start_share
+from gsmerge.fit.stage import fit_gaussians, fit_scene, start_share
 from gsmerge.fit.survey import peak_weights
 from gsmerge.settings.fit import FitOptions
 
 __all__ = [
-    "FitJob", "FitOptions", "FitReport", "Fitted", "fit", "fit_photos", "fit_scene",
+    "FitJob", "FitOptions", "FitReport", "Fitted", "fit_gaussians", "fit_photos", "fit_scene",
     "peak_weights", "photo_scale", "record_fit", "report_steps", "start_share",
 ]  # fmt: skip

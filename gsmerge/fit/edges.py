@@ -1,7 +1,9 @@
 """Cut the Gaussians of a fit at the edges of the views, because no photo shows how far they reach beyond.
 
-Gaussians across the edges of all views look like a soft rim and clouds around the scene to a viewer who steps back. A
-cut leaves a Gaussian as soft as it is large, so large ones are split along the edge after the fit.
+The edges are here the four borders of each picture. In space, an edge is the plane through the camera and that border.
+A viewer who steps back sees Gaussians that reach across the edges as a soft rim and as clouds around the scene. The
+cut makes a Gaussian smaller, but its border stays soft, the softer the larger it is. So large ones are split along the
+edge after the fit.
 """
 
 from __future__ import annotations
@@ -23,21 +25,21 @@ from gsmerge.raster import Splats
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
-# Distance by which the edges are moved out. Its unit is the distance between neighbouring Gaussians, if the result were
-# spread evenly over all photos. Border pixels also show Gaussians with centres outside of the picture
+# The edges are moved out, because pixels at a border also show Gaussians with centres outside of the picture. The unit
+# is the distance between neighbouring Gaussians if the result were spread evenly over all photos
 MARGIN = 2.0
 ROWS = 16384  # Gaussians per task
-REACH = 2.0  # standard deviations to which a Gaussian reaches, as in the kernel
-SOFT = 0.01  # widest soft part of a split Gaussian, as a share of the width of the view
-FALL = 1.69  # its unit: standard deviations in which the opacity of an opaque Gaussian falls from .9 to .1
-# Opacity at the edge above which a Gaussian is split. Fainter ones are haze before the scene: splitting them changes
-# the photos by up to 1 dB, and narrows the rim little
+REACH = 2.0  # a Gaussian ends at this many standard deviations, as in kernels/gaussians/edges.c
+SOFT = 0.01  # a Gaussian is split if its soft border is wider than this, as a share of the width of the view
+FALL = 1.69  # standard deviations over which the opacity of an opaque Gaussian falls from .9 to .1: its soft border
+# A Gaussian is split if its opacity at the edge is above this. Fainter Gaussians are haze in front of the scene. To
+# split them would change the photos by up to 1 dB, and hardly narrow the rim
 SHOWN = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Planes through the cameras of v views and the four edges of each, moved out."""
+    """Planes through the cameras of v views and the four borders of each picture, moved out by ``MARGIN``."""
 
     normals: np.ndarray  # [v,4,3] outward, of unit length
     offsets: np.ndarray  # [v,4] points x inside have normal @ x <= offset
@@ -45,7 +47,7 @@ class Edges:
 
 
 def find_edges(cameras: Cameras, count: int) -> Edges:
-    """Return the edges of the pictures of cameras, moved out by ``MARGIN`` for a result of ``count`` Gaussians."""
+    """Return the edges of the views of ``cameras``, moved out by ``MARGIN`` for a result of ``count`` Gaussians."""
     size, num = np.array([cameras.width, cameras.height]), len(cameras)
     margin = MARGIN * math.sqrt(num * cameras.width * cameras.height / max(1, count))
     Ks, viewmats = cameras.Ks.astype(np.float64), cameras.viewmats.astype(np.float64)
@@ -63,22 +65,29 @@ def find_edges(cameras: Cameras, count: int) -> Edges:
 def cut_state(state: FitState, edges: Edges) -> None:
     """Cut the Gaussians of a state at the edges of all views, in place, except fixed Gaussians.
 
-    The limits of means move to the means after the cut. The limits of scales stay.
+    The box in which a mean may move is then centred at the mean after the cut. The limits of the scales do not change.
     """
     splats, x = state.splats, state.x
-    means, covars, is_cut = _cut(splats, edges)
+    means, covars, is_cut = _compute_cuts(splats, edges)
     rows = np.flatnonzero(is_cut & ~state.fixed)
     scales, quats = principal_axes(covars[rows])
     sizes = np.maximum(log(scales), state.min_sizes[rows, None])
     x[rows, :SIZE], x[rows, SIZE:QUAT], x[rows, QUAT:LOGIT] = means[rows], sizes, quats
     state.x0[rows, :SIZE] = means[rows]
-    state.x0[rows, SIZE:QUAT] = np.sort(state.x0[rows, SIZE:QUAT], 1)  # as the scales of the new axes rise
-    state.m[rows, :LOGIT] = 0  # momentum was along the old axes
+    state.x0[rows, SIZE:QUAT] = np.sort(
+        state.x0[rows, SIZE:QUAT], 1
+    )  # because the scales along the new axes are in rising order
+    state.m[rows, :LOGIT] = 0  # because the momentum was along the old axes
     splats.means[rows], splats.scales[rows], splats.quats[rows] = means[rows], exp(x[rows, SIZE:QUAT]), quats
 
 
-def _cut(splats: Splats, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut Gaussians; return means ``[n,3]``, covariances ``[n,3,3]`` of those that are cut, and their mask ``[n]``."""
+def _compute_cuts(splats: Splats, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut Gaussians with the C kernel, without changing them.
+
+    Returns the means ``[n,3]`` after the cut, the covariances ``[n,3,3]`` after the cut, which are written only for
+    Gaussians that are cut, and a mask ``[n]`` of these Gaussians. The kernel does not return the edge at which it cuts
+    a Gaussian. :func:`split_at_edges` needs this edge, so it takes only the mask and calls :func:`_find_nearest_edges`.
+    """
     count = len(splats.means)
     means, covars, is_cut = splats.means.copy(), np.empty((count, 3, 3)), np.zeros(count, np.uint8)
 
@@ -91,38 +100,45 @@ def _cut(splats: Splats, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def split_at_edges(state: FitState, edges: Edges, count: int) -> FitState:
-    """Split Gaussians along the edges and drop what lies beyond, until the rim is narrow or there are ``count``.
+    """Split Gaussians along the edges and drop halves beyond them, until the rim is narrow or there are ``count``.
 
-    The returned state is for the end of a fit; it has no moments. The softest Gaussians are split first. If none is
-    split, the given state is returned.
+    The Gaussians with the widest soft borders are split first, and their halves again. Returns a new state without
+    moments, for the end of a fit. If no Gaussian is split, returns the given state.
     """
-    x, fresh = state.x, np.flatnonzero(_cut(state.splats, edges)[2])
-    rows, is_split = np.arange(len(x)), np.zeros(len(x), bool)
+    # Rows of x that may have to be split: at first all Gaussians across an edge, then the halves of the last round.
+    # `sources` are the rows of the state from which all rows of x come
+    x, candidates = state.x, np.flatnonzero(_compute_cuts(state.splats, edges)[2])
+    sources, is_split = np.arange(len(x)), np.zeros(len(x), bool)
     while len(x) < count:
-        covars = covariances(x[fresh, QUAT:LOGIT].astype(np.float64), exp(x[fresh, SIZE:QUAT].astype(np.float64)))
-        normals, rooms, widths = _find_nearest(x[fresh, :SIZE].astype(np.float64), covars, edges)
-        opacities = exp(-np.square(np.maximum(rooms, 0)) / 2) / (1 + exp(-x[fresh, LOGIT].astype(np.float64)))
-        soft = np.flatnonzero((np.abs(rooms) < REACH) & (widths > SOFT) & ((opacities > SHOWN) | is_split[fresh]))
+        covars = covariances(
+            x[candidates, QUAT:LOGIT].astype(np.float64), exp(x[candidates, SIZE:QUAT].astype(np.float64))
+        )
+        normals, rooms, widths = _find_nearest_edges(x[candidates, :SIZE].astype(np.float64), covars, edges)
+        opacities = exp(-np.square(np.maximum(rooms, 0)) / 2) / (1 + exp(-x[candidates, LOGIT].astype(np.float64)))
+        soft = np.flatnonzero((np.abs(rooms) < REACH) & (widths > SOFT) & ((opacities > SHOWN) | is_split[candidates]))
         soft = soft[np.argsort(-widths[soft], kind="stable")[: count - len(x)]]
         if len(soft) == 0:
             break
-        inner, outer = _split_across(x[fresh[soft]], covars[soft], normals[soft])
-        shown = rooms[soft] > 0  # at most a sixth of the other outer halves lies inside
-        x = np.concatenate([x, outer[shown]])
-        x[fresh[soft]], is_split[fresh[soft]] = inner, True
-        rows = np.concatenate([rows, rows[fresh[soft[shown]]]])
-        fresh = np.concatenate([fresh[soft], np.arange(len(is_split), len(x))])
+        inner, outer = _split_across(x[candidates[soft]], covars[soft], normals[soft])
+        stays = rooms[soft] > 0  # otherwise at most a sixth of the outer half lies inside, and it is dropped
+        x = np.concatenate([x, outer[stays]])
+        x[candidates[soft]], is_split[candidates[soft]] = inner, True
+        sources = np.concatenate([sources, sources[candidates[soft[stays]]]])
+        candidates = np.concatenate([candidates[soft], np.arange(len(is_split), len(x))])
         is_split = np.concatenate([is_split, np.ones(len(x) - len(is_split), bool)])
     if not is_split.any():
         return state
-    split = state_of(x, state.splats.shN[rows])
-    split.origins, split.min_sizes, split.fixed = state.origins[rows], state.min_sizes[rows], ~is_split
+    split = state_of(x, state.splats.shN[sources])
+    split.origins, split.min_sizes, split.fixed = state.origins[sources], state.min_sizes[sources], ~is_split
     cut_state(split, edges)
     return split
 
 
 def _split_across(parents: np.ndarray, covars: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split parameters ``[m,14]`` of Gaussians across planes; return those of the halves inside and outside."""
+    """Split Gaussians across planes; return the parameters ``[m,14]`` of the inner halves and of the outer halves.
+
+    ``parents [m,14]`` are their parameters, ``covars [m,3,3]`` their covariances, and ``normals [m,3]`` point outward.
+    """
     steps = matmul(covars, normals[..., None])[..., 0]
     steps *= OFFSET / np.sqrt((steps * normals).sum(1, keepdims=True))
     scales, quats = principal_axes(covars - steps[:, :, None] * steps[:, None, :])
@@ -134,11 +150,17 @@ def _split_across(parents: np.ndarray, covars: np.ndarray, normals: np.ndarray) 
     return inner, outer
 
 
-def _find_nearest(means: np.ndarray, covars: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the nearest edge of the view in which each of n Gaussians lies deepest.
+def _find_nearest_edges(
+    means: np.ndarray, covars: np.ndarray, edges: Edges
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find, for each of n Gaussians, the nearest edge of the view in which the Gaussian lies deepest.
 
-    Returns the normal ``[n,3]`` of its plane, the distance ``[n]`` inside the plane in standard deviations across it,
-    and the width ``[n]`` of the soft part of the Gaussian as a share of the view's width.
+    This is the rule of ``nearest_plane`` in kernels/gaussians/edges.c. It stands here a second time, because the kernel
+    finds the edge for its own cut and returns only the Gaussian that is left. A split needs the edge itself, and only
+    for the few Gaussians that are cut or split.
+
+    Returns the outward normal ``[n,3]`` of the edge's plane, the distance ``[n]`` of the mean inside the plane in
+    standard deviations across it, and the width ``[n]`` of the Gaussian's soft border as a share of the view's width.
     """
     rows, rooms, cameras = np.arange(len(means)), np.full(len(means), -np.inf), edges.cameras
     nearest, widths = np.zeros((len(means), 3)), np.zeros(len(means))

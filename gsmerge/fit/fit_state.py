@@ -12,7 +12,7 @@ from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.raster import Splats
 from gsmerge.types import SH_C0, Gaussians, Region
 
-# Columns of a state that do not follow from its parameters, so they are copied with its rows
+# Fields of a state that do not follow from its parameters, so they are copied when rows are taken from it
 CARRIED = ("x0", "m", "v", "units", "box_shares", "min_sizes", "origins", "fixed")
 
 
@@ -21,42 +21,45 @@ class FitState:
     """Parameters under optimisation, and the same values as arrays for the rasterizer."""
 
     x: np.ndarray  # [n,14] float32: mean, log scale, quaternion, opacity logit, colour
-    x0: np.ndarray  # Values at the start
-    m: np.ndarray  # First moment
-    v: np.ndarray  # Second moment
-    units: np.ndarray  # [n] size: geometric mean of the two largest scales at the start
+    x0: np.ndarray  # [n,14] parameters at the start, about which the moves are limited
+    m: np.ndarray  # [n,14] first moments of Adam
+    v: np.ndarray  # [n,14] second moments of Adam
+    units: np.ndarray  # [n] size of each Gaussian: geometric mean of its two largest scales at the start
     box_shares: np.ndarray  # [n] share of the box about the start within which means and scales may move
     min_sizes: np.ndarray  # [n] least log scale of each Gaussian
-    origins: np.ndarray  # [n] row of the start from which each Gaussian comes
+    origins: np.ndarray  # [n] row of the Gaussian at the start of the fit from which each Gaussian comes
     fixed: np.ndarray  # [n] bool, Gaussians that stay unchanged
     splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
     colors: np.ndarray  # [n,3] base colours, sRGB
 
     def __getitem__(self, rows: np.ndarray) -> FitState:
-        """Return the state of some Gaussians, by mask or by row."""
+        """Return the state of some Gaussians, which ``rows`` selects as a mask or by number."""
         state = state_of(self.x[rows], self.splats.shN[rows])
         for name in CARRIED:
             setattr(state, name, getattr(self, name)[rows])
         return state
 
     def keep_inside(self, region: Region) -> None:
-        """Move centres outside of a region to its border, in place; fixed Gaussians stay."""
+        """Move the centres of Gaussians outside of a region to its border, in place, except fixed Gaussians."""
         rows = np.flatnonzero(~lies_inside(region, self.x[:, :SIZE]) & ~self.fixed)
         self.x[rows, :SIZE] = self.splats.means[rows] = clamp_inside(region, self.x[rows, :SIZE])
 
     def update_harmonics(self) -> None:
-        """Bring ``splats.sh0`` up to date with the base colours, in place, if there are higher harmonics."""
+        """Write the base colours to ``splats.sh0``, if there are higher harmonics; otherwise nothing reads ``sh0``."""
         if self.splats.shN.shape[1] > 0:
             np.divide(self.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=self.splats.sh0)
 
     def view_colors(self) -> np.ndarray | None:
-        """Return the colours for the rasterizer; None if it evaluates the harmonics, which are updated first."""
+        """Return the colours to draw, or None if there are higher harmonics.
+
+        For None the rasterizer evaluates ``splats.sh0`` and ``splats.shN``, so ``sh0`` is updated first.
+        """
         self.update_harmonics()
         return self.colors if self.splats.shN.shape[1] == 0 else None
 
 
 def start_state(gaussians: Gaussians) -> FitState:
-    """Start the optimiser's state from Gaussians: their parameters, zero moments."""
+    """Return the state at the start of a fit: the parameters of the Gaussians, and moments of zero."""
     x = np.empty((len(gaussians), COLUMNS), np.float32)
     opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)
     x[:, :3] = gaussians.means
@@ -68,7 +71,7 @@ def start_state(gaussians: Gaussians) -> FitState:
 
 
 def state_of(x: np.ndarray, shN: np.ndarray) -> FitState:
-    """Start the optimiser's state at parameters ``x [n,14]`` and higher harmonics ``[n,k-1,3]``."""
+    """Return a new state with parameters ``x [n,14]``, which are not copied, and harmonics ``shN [n,k-1,3]``."""
     sizes = np.sort(x[:, SIZE:QUAT], 1)
     colors = np.ascontiguousarray(x[:, COLOR:])
     splats = Splats(
@@ -87,7 +90,7 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> FitState:
 
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
-    """Convert parameters ``x [n,14]`` and higher harmonics ``[n,k-1,3]`` to Gaussians."""
+    """Convert parameters ``x [n,14]`` and higher harmonics ``shN [n,k-1,3]`` to Gaussians."""
     return Gaussians(
         means=x[:, :3].copy(),
         quats=x[:, QUAT:LOGIT].copy(),

@@ -1,9 +1,9 @@
-"""Fit all parameters of Gaussians to photos, by a short optimisation that is confined to a box about the start.
+"""Fit all parameters of Gaussians to photos by a short optimisation, in which each parameter stays near its start.
 
 Each step draws one view over a random background. Its loss combines the L1 error of pixels, the L1 error of differences
 between neighbouring pixels, and structural similarity. Adam's rates are in units of each Gaussian's own size. The first
-steps draw samples of the photos' pixels. Long runs begin with fewer Gaussians than they may have, and add the rest at
-large errors.
+steps draw only a sample of each photo's pixels. Long runs begin with fewer Gaussians than they may have, and add the
+rest where errors are large.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning
 from gsmerge.types import Gaussians
 
-SPLIT_LOSS = 1.01  # most mean squared error of the photos after splits at their edges, relative to that before
+SPLIT_LOSS = 1.01  # splits at the edges may multiply the mean squared error of the photos by at most this factor
 
 
 def fit_full(
@@ -39,8 +39,8 @@ def fit_full(
     Args:
         gaussians: The n Gaussians to start from.
         run: Photos and options.
-        survey: Survey of the Gaussians; None: it is made here.
-        fixed: ``[n]`` bool, Gaussians that stay unchanged; None: none.
+        survey: Survey of the Gaussians; if None, it is made here.
+        fixed: ``[n]`` bool, true for Gaussians that must not change; if None, all may change.
 
     Returns:
         The fitted Gaussians and a report.
@@ -67,15 +67,15 @@ class FullFit:
     state: FitState
     before: float  # PSNR (dB) of the held-out patches at the start
     steps: int  # Steps to take
-    after: float | None = None  # PSNR (dB) of the held-out patches after the first steps; None: not scored
+    after: float | None = None  # PSNR (dB) of the held-out patches after the first steps; None before it is measured
     step: int = 0  # Steps taken
-    last: float = -1.0  # Progress at which the last step was taken; -1 before the first step
-    error: RecentMean = field(default_factory=RecentMean)  # Mean squared error, which progress shows
-    tail: TailMean = field(default_factory=TailMean)  # Parameters over the last steps
+    last: float = -1.0  # Value of `progress` before the last step; -1 before the first step
+    error: RecentMean = field(default_factory=RecentMean)  # Mean squared error of the last steps, which a user is shown
+    tail: TailMean = field(default_factory=TailMean)  # Mean parameters over the last steps
 
     @property
     def progress(self) -> float:
-        """Share of the steps taken so far."""
+        """Share of the steps that are taken, in [0, 1]."""
         return self.step / self.steps
 
     @property
@@ -84,7 +84,7 @@ class FullFit:
         return self.optimiser.photos[1]
 
     def reaches(self, *milestones: float) -> bool:
-        """Return whether the next step is the first at or after one of the ``milestones``, shares of the steps."""
+        """Return true if the next step is the first one at or after one of the ``milestones``, shares of the steps."""
         return any(self.last < milestone <= self.progress for milestone in milestones)
 
 
@@ -99,7 +99,7 @@ def start_fit(gaussians: Gaussians, run: FitRun, survey: Survey | None, fixed: n
 
 
 def score_fit(fit: FullFit) -> None:
-    """Score a fit on held-out patches, unless it is scored already or none are held out."""
+    """Score a fit on held-out patches, unless it has a score already, or the options ask for none."""
     if fit.after is None and fit.run.job.options.scored:
         fit.after = score_state(fit.state, fit.run, fit.half)
 
@@ -107,8 +107,8 @@ def score_fit(fit: FullFit) -> None:
 def renew_state(fit: FullFit) -> None:
     """Grow the state, drop its faint Gaussians, or cut it at the edges of the views, if one of these is due.
 
-    The rows and axes of the state change their meaning, so the mean of the last steps begins anew. Beside fixed
-    Gaussians no row is dropped or added: who fixes some puts the others back by their rows.
+    These change the meaning of the state's rows and axes, so the mean of the last steps begins anew. If some Gaussians
+    are fixed, no row is dropped or added, because the caller finds its other Gaussians by their rows.
     """
     job, options = fit.run.job, fit.run.job.options
     if not options.grows or not fit.reaches(GROWTH, *CLEARS, *CUTS):
@@ -123,10 +123,10 @@ def renew_state(fit: FullFit) -> None:
 
 
 def take_step(fit: FullFit) -> None:
-    """Take a step on a photo, and also a step on a view from outside if one is due."""
+    """Take a step on a photo, and also a step on a view from outside if one is due; count the step in ``fit``."""
     run, progress = fit.run, fit.progress
     step = fit.schedule.draw(fit.step + 1, progress, len(fit.state.x))
-    if fit.reaches(run.half_part):  # whole photos have another error than samples
+    if fit.reaches(run.half_part):  # from here on steps draw whole photos, whose errors differ from those of samples
         fit.error = RecentMean()
     fit.error.add(fit.optimiser.step(fit.state, step))
     outside_view = run.outside_view(step.number, progress)
@@ -140,11 +140,12 @@ def take_step(fit: FullFit) -> None:
 
 
 def end_fit(fit: FullFit) -> FitResult:
-    """Return the result of a fit and a report."""
+    """Return the fitted Gaussians, split at the edges of the views if the photos allow it, and a report."""
     after = fit.before if fit.after is None else fit.after
     job, ended, viewmats = fit.run.job, state_of(fit.tail.of(fit.state.x), fit.state.splats.shN), fit.optimiser.viewmats
     ended.origins, ended.min_sizes = fit.state.origins, fit.state.min_sizes
-    is_limit = job.options.grows and not job.options.fills  # else the number is met, or renders show what lies beyond
+    # Otherwise splits would exceed an exact number of Gaussians, or renders stand for photos and show what lies beyond
+    is_limit = job.options.grows and not job.options.fills
     if is_limit and job.edges is not None and job.fixed is None:
         split = split_at_edges(ended, job.edges, job.count)
         if split is not ended:
@@ -158,10 +159,10 @@ def end_fit(fit: FullFit) -> FitResult:
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
     """Return the share ``[n]`` of its box that each Gaussian may use, and its least log scale ``[n]``.
 
-    The share is the effective number of photos of the Gaussian minus 1, clipped to ``single_view_share`` and 1. The
-    effective number is (sum w)^2 / sum w^2, where w are the sums of the Gaussian's blending weights in each photo. The
-    least scale is ``min_scale`` times the finest pixel that shows the Gaussian (the 3D filter of Mip-Splatting). If no
-    photo shows the Gaussian, there is no least scale.
+    The share is the effective number of photos that show the Gaussian, minus 1, but at least ``single_view_share`` and
+    at most 1. The effective number is (sum w)^2 / sum w^2, where w is the sum of the Gaussian's blending weights in a
+    photo. The least scale is ``min_scale`` times the finest pixel that shows the Gaussian (the 3D filter of
+    Mip-Splatting). If no photo shows the Gaussian, its scale has no lower limit.
     """
     num_photos = survey.sums**2 / np.maximum(survey.squares, 1e-12)
     box_shares = np.clip(num_photos - 1, rates.single_view_share, 1).astype(np.float32)

@@ -12,21 +12,21 @@ from gsmerge.raster import composite, splat_adjoint, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import in_turn
 
-# Distance of a half from the middle of its parent, in standard deviations of the parent. The standard deviations of
-# halves shrink, so that the pair together has the standard deviation of the parent
+# Distance of a half from the centre of its parent, in standard deviations of the parent. The halves are narrower than
+# the parent, so that both together have the parent's standard deviation
 OFFSET = 0.7
-FADED = 0.005  # opacity that counts as none; halves of more opaque Gaussians have 1 / 255 or more, so they are drawn
-FAINT = 0.02  # opacity of Gaussians that late in a run will fade away; without them the run takes .9 of the time
-# Most Gaussians after a growth, as a multiple of those that are left when it begins. Where many views show the same
-# surfaces, most Gaussians of the start are hidden, and the usual share of all pixels is far more than the surfaces can
-# use: further halves are smaller than the details of the photos, and most of them fade. Real scenes of 60 and 84 views
-# gain .1 to .2 dB over growth to the share, in .7 to .8 of the time; a fourfold growth costs a made room .06 dB. With
-# up to a dozen views growth is about twofold
+FADED = 0.005  # fainter Gaussians are dropped, because their halves would be fainter than 1 / 255 and not be drawn
+FAINT = 0.02  # late in a run, fainter Gaussians only fade away; without them the run takes .9 of the time
+# Most Gaussians after a growth, as a multiple of those that are left when it begins. The usual number of Gaussians is a
+# share of all pixels. Where many views show the same surfaces, this is far more than the surfaces can use. Most
+# Gaussians of the start are hidden there, further halves are smaller than the details of the photos, and most of them
+# fade. With this limit, real scenes of 60 and 84 views gain .1 to .2 dB in .7 to .8 of the time. A limit of 4 costs a
+# rendered room .06 dB. With up to a dozen views the number only doubles, so this limit is not reached
 MOST_GROWTH = 8
 
 
 def drop_faint(state: FitState, least: float) -> FitState:
-    """Drop the Gaussians with an opacity below ``least``, or below the median if that is less, as in a faint scene."""
+    """Drop the Gaussians with an opacity below ``least``; in a faint scene, at most the fainter half of them."""
     opacities = state.splats.opacities
     return state[opacities >= min(least, float(lower_median(opacities)))] if len(opacities) else state
 
@@ -36,8 +36,9 @@ def grow_to(
 ) -> FitState:
     """Drop Gaussians with an opacity below ``least``, then split others until there are ``count``.
 
-    There are fewer if no visible Gaussian is left to split, and at most ``most_growth`` times as many as remained
-    (None: any number). The errors of the half-size photos ``half`` decide which Gaussians are split.
+    The number of Gaussians that remain after the drop grows at most by the factor ``most_growth``; None sets no limit.
+    There are also fewer than ``count`` if no photo shows a Gaussian that could be split. The errors of the half-size
+    photos ``half`` decide which Gaussians are split.
     """
     state = drop_faint(state, least)
     count = count if most_growth is None else min(count, most_growth * len(state.x))
@@ -53,8 +54,9 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     """Split the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
 
     Each Gaussian is split at most once, so the number at most doubles. Gaussians that no photo shows are not split.
-    Both halves inherit momentum, share of the box and least size. First halves keep the rows of their parents, second
-    halves are appended. Returns the state and its masses; a half has half of its parent's mass.
+    Both halves inherit the momentum, the share of the box and the least size of their parent. First halves take the
+    rows of their parents, and second halves are appended. Returns the new state and its masses; the mass of a half is
+    half of its parent's mass.
     """
     num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:
@@ -68,7 +70,7 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     is_half = np.zeros(len(x), bool)
     is_half[worst] = is_half[len(state.x) :] = True
     unsplit = ~is_half[: len(state.x)]
-    # halves start anew: the centre of their box and their unit of size follow from their own parameters
+    # the centre of the box and the unit of size of a half follow from its own parameters, not from its parent's
     grown.x0[~is_half], grown.units[~is_half] = state.x0[unsplit], state.units[unsplit]
     for name in set(CARRIED) - {"x0", "units"}:
         getattr(grown, name)[:] = getattr(state, name)[parents]
@@ -78,7 +80,7 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
 
 
 def split_parameters(parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split parameters ``[m,14]`` across the longest axis; return the parameters of the first and the second halves."""
+    """Split Gaussians with parameters ``[m,14]`` across their longest axes; return the parameters of both halves."""
     rows, longest = np.arange(len(parents)), parents[:, SIZE:QUAT].argmax(1)
     reach = OFFSET * exp(parents[rows, SIZE + longest])
     rotations = quat_to_rotmat(parents[:, QUAT:LOGIT])
@@ -93,18 +95,18 @@ def split_parameters(parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fade_halves(logits: np.ndarray) -> np.ndarray:
-    """Return the opacity logits ``[m]`` of the halves of Gaussians with opacity ``logits [m]``."""
+    """Return the opacity logits ``[m]`` of the halves of Gaussians whose own opacity ``logits [m]`` are given."""
     transmittances = 1 / (1 + exp(logits.astype(np.float64)))  # 1 - opacity
-    # Optical depth of a half, as a share of the parent's depth. Halves are narrower than the parent, so two halves of
-    # 0.7 cover as much as the parent; a little more closes gaps
+    # Optical depth of a half, as a share of the parent's. Halves are narrower than the parent, so with a share of 0.7
+    # both halves would cover as much as the parent; a little more closes gaps between them
     depth_share = 0.8
     return np.asarray(log(1 / power(transmittances, depth_share) - 1))
 
 
 def error_masses(state: FitState, half: Photos) -> np.ndarray:
-    """Sum each Gaussian's blending weight times the absolute pixel error over half-size photos: ``[n]``.
+    """Return the error mass ``[n]`` of each Gaussian: blending weight times absolute error, summed over all pixels.
 
-    Errors are multiplied by the importance of their pixels.
+    The pixels are those of the half-size photos ``half``. Errors are multiplied by the importance of their pixels.
     """
 
     def one_view(view: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Read the photos of a scene for a fit: at full size, at half size, and larger ones if its photos are larger."""
+"""Make the photos of a fit at the size of the views, at half of it, and larger if the files are larger."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from gsmerge.kernels.elementary import exp, log
 from gsmerge.raster.metrics import decibels
 from gsmerge.raster.photos import Photos, scene_photos, with_pixel_values
 from gsmerge.raster.tiled_view import EPS2D
-from gsmerge.runtime.record import choose, note
+from gsmerge.runtime.record import note, record_choices
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import PicturedScene, Scene
 
-MIN_AUTO_SCALE = 1.25  # least scale that "auto" uses; below it photos have the size of the views
-MAX_GAIN = 2.0  # largest exposure factor that scores compensate
-PATCH_PIXELS = 32  # side of a held-out patch, pixels, at most
-HIDDEN_WEIGHT = np.float32(1e-9)  # weight of pixels that neither count nor are held out
+MIN_AUTO_SCALE = 1.25  # if photos are larger than the views by a smaller factor, "auto" keeps the size of the views
+MAX_GAIN = 2.0  # largest factor of exposure that a score compensates
+PATCH_PIXELS = 32  # largest side of a held-out patch, pixels
+HIDDEN_WEIGHT = np.float32(1e-9)  # weight of pixels that do not count, because 0 marks held-out pixels
 
 
 def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
-    """Return the photos at full and half size, and larger ones if ``photo_scale``, which is recorded, is above 1."""
+    """Return the photos of ``views`` (None: all) at full size, at half size, and larger if ``photo_scale`` is above 1.
+
+    The larger size is recorded, and a note says that it takes time.
+    """
     views = range(len(scene)) if views is None else views
     photos = _with_empty(scene_photos(scene), scene)[views], _with_empty(scene_photos(scene, 2), scene)[views]
     scale = 1.0 if options.photo_scale == "auto" else options.photo_scale
@@ -32,7 +35,7 @@ def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] |
         return photos
     large = _with_empty(large_photos(scene, scale), scene)[views]
     size = f"{large.width} x {large.height}"
-    choose(photo_scale=round(scale, 4))
+    record_choices(photo_scale=round(scale, 4))
     note(
         f"the photos are larger than the views of {photos[0].width} x {photos[0].height}: the fit looks at them at"
         f" {size} as well, which takes time; --set photo_scale=1 does without"
@@ -41,7 +44,7 @@ def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] |
 
 
 def _with_empty(photos: Photos, scene: PicturedScene) -> Photos:
-    """Return the photos with the pixels that show the background, which count in a fit."""
+    """Return the photos with a mask of the pixels in which the scene is empty; these count in a fit as background."""
     if scene.empty is None:
         return photos
     size = photos.width, photos.height
@@ -52,12 +55,17 @@ def _with_empty(photos: Photos, scene: PicturedScene) -> Photos:
 
 
 def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:
-    """Choose the size of photos in a fit as a multiple of the views' size, at least 1; also say why it is reduced."""
+    """Choose the size of the photos in a fit as a multiple of the views' size, at least 1.
+
+    Also returns why this is less than the option asks for, or None. ``auto`` permits the option "auto" to enlarge.
+    """
     requested, largest = options.photo_scale, largest_scale(scene)
     can_enlarge = options.fit == "full" and options.half_res_part < 1
     if requested == "auto":
         enlarges = can_enlarge and auto and largest >= MIN_AUTO_SCALE
-        auto_scale = 2.0  # largest scale of "auto": a step takes time by its pixels, and larger photos are rarely sharp
+        auto_scale = (
+            2.0  # largest scale of "auto", because more pixels take more time, and larger photos are rarely sharp
+        )
         return (min(largest, auto_scale) if enlarges else 1.0), None
     if requested == 1:
         return 1.0, None
@@ -66,14 +74,14 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
             1.0,
             f"photo_scale {requested:g} is 1: larger photos need the full fit, with steps on photos of full size",
         )
-    tolerance = 0.01  # share of a scale that rounding of sizes may change
+    tolerance = 0.01  # rounding of sizes to whole pixels may change a scale by this share
     if requested > largest * (1 + tolerance):
         return largest, f"photo_scale {requested:g} is {largest:.3g}: the photos are no larger"
     return float(min(requested, largest)), None
 
 
 def largest_scale(scene: Scene) -> float:
-    """Return the size of the photos as a multiple of the views' size, at least 1."""
+    """Return the size of the photo files as a multiple of the views' size, at least 1."""
     large = scene.large_photos
     if large is None or len(scene) == 0:
         return 1.0
@@ -82,10 +90,10 @@ def largest_scale(scene: Scene) -> float:
 
 
 def large_photos(scene: Scene, scale: float) -> Photos:
-    """Read the photos at ``scale`` times the views' size, at most :func:`largest_scale`, one by one.
+    """Read the photos at ``scale`` times the views' size; ``scale`` is at most :func:`largest_scale`.
 
-    They are uint8, because they may take as much memory as the scene. They have the low-pass filter of a viewer at this
-    size. Raises ValueError if the scene has no larger photos.
+    The pictures are uint8, because they may take as much memory as the scene. They are compared with renders that have
+    the low-pass filter of a viewer at this size. Raises ValueError if the scene has no larger photos.
     """
     large, cameras = scene.large_photos, scene.cameras
     if large is None:
@@ -103,9 +111,10 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 
 
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
-    """Return training weights ``[h,w]`` float32 per view: 0 on held-out patches, the photo's weights elsewhere.
+    """Return the weights ``[h,w]`` float32 of the pixels of each view in training: 0 on held-out patches.
 
-    Pixels with a weight below 1 are not held out; a weight of 0 is replaced by ``HIDDEN_WEIGHT``.
+    ``share`` is the share of the patches that is held out. Elsewhere the weights are those of the photo. Pixels with a
+    weight below 1 are not held out, and a weight of 0 is replaced by ``HIDDEN_WEIGHT``.
     """
     return [training_weight(photos, view, share, seed) for view in range(len(photos))]
 
@@ -113,7 +122,7 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
 def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.ndarray:
     """Return the training weights ``[h,w]`` float32 of one view; see :func:`training_weights`.
 
-    If the photo counts in several patches, at least one of them is held out.
+    If several patches of the photo have pixels that count, at least one of these patches is held out.
     """
     size = max(1, min(PATCH_PIXELS, min(photos.height, photos.width) // 4))
     rows, columns = -(-photos.height // size), -(-photos.width // size)
@@ -132,7 +141,7 @@ def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.nd
 
 
 def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:
-    """Return a mask ``[r,c]`` of the patches with a pixel that counts fully and shows the scene."""
+    """Return a mask ``[r,c]`` of the patches of ``size`` pixels that have a pixel of weight 1 that shows the scene."""
     assert photos.weights is not None
     counts = photos.weights[view] == 1
     if photos.empty is not None:
@@ -142,14 +151,14 @@ def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:
 
 
 def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
-    """Subsample weights of full-size photos to half size."""
+    """Return weights of full-size photos at half size: those of every second pixel, in the size of ``photos``."""
     return [np.ascontiguousarray(weight[::2, ::2][: photos.height, : photos.width]) for weight in weights]
 
 
 def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
     """Return the PSNR (dB) of renders on the held-out patches, where ``weights [h,w]`` are 0.
 
-    If exposures of the photos differ by a factor of ``min_gain`` or more, they are compensated.
+    The exposures of renders are adapted to those of the photos, if any of them differ by the factor ``min_gain``.
     """
     views = range(len(photos))
     clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
@@ -157,7 +166,7 @@ def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.
 
     def one_view(view: int) -> tuple[float, float]:
         red, green, blue = np.moveaxis((clipped[view] * gains[view] - photos.images[view]) ** 2, -1, 0)
-        error = red + green + blue  # a tenth of the time of the sum along the last axis
+        error = red + green + blue  # takes a tenth of the time of a sum along the last axis
         mask = weights[view] == 0
         return float(error[mask].sum(dtype=np.float64)), float(mask.sum())
 
@@ -168,11 +177,11 @@ def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.
 def exposure_gains(
     images: Sequence[np.ndarray], photos: np.ndarray, weights: Sequence[np.ndarray], min_gain: float
 ) -> np.ndarray:
-    """Return factors ``[v,3]`` float32 from renders to the photos' exposure, with geometric mean one.
+    """Return factors ``[v,3]`` float32 that bring the renders of all views to the exposure of their photos.
 
-    They are least-squares solutions on the weighted pixels, for each view and channel. They are clipped to the range
-    from ``1 / MAX_GAIN`` to ``MAX_GAIN`` and then divided by their geometric mean, so they may leave this range. If all
-    factors are between ``1 / min_gain`` and ``min_gain``, they are set to 1.
+    Each factor is the least-squares solution on the weighted pixels of one view and channel, clipped to the range from
+    ``1 / MAX_GAIN`` to ``MAX_GAIN``. Then the factors of a channel are divided by their geometric mean, after which
+    they may lie outside this range. If all factors are between ``1 / min_gain`` and ``min_gain``, all are set to 1.
     """
 
     def one_view(view: int) -> np.ndarray:

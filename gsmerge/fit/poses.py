@@ -1,4 +1,4 @@
-"""Poses of cameras under optimisation."""
+"""Move cameras during a fit."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from gsmerge.settings.fit import Tuning
 
 @dataclass(eq=False)
 class PoseState:
-    """Motions of the cameras under optimisation. Their mean stays zero, so that the scene does not drift."""
+    """Motions of the cameras during a fit. Their mean stays zero, so that the scene does not drift."""
 
     start: np.ndarray  # [v,4,4] viewmats before the fit
     viewmats: np.ndarray  # [v,4,4] float64; steps update it in place, and all sizes of the photos share it
-    # [v,6] motion of each camera, see transforms.motion_vectors. The centre of its rotation is the middle of the
-    # scene, where rotations and shifts of a camera look different
+    # [v,6] motion of each camera, see transforms.motion_vectors. Cameras rotate about the middle of the scene, because
+    # a rotation of a camera about its own centre looks like a shift
     x: np.ndarray
-    m: np.ndarray  # First moment
-    v: np.ndarray  # Second moment
-    counts: np.ndarray  # [v] steps that each camera has taken
-    pixel: float  # Angle of a pixel, radians; also its size at the scene's depth
+    m: np.ndarray  # [v,6] first moments of Adam
+    v: np.ndarray  # [v,6] second moments of Adam
+    counts: np.ndarray  # [v] number of steps that each camera has taken
+    pixel: float  # Angle of a pixel in radians, which is also its size at the middle depth of the scene
 
     def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
-        """Take one Adam step (Nadam) of a view along the gradient ``[4,4]`` of its viewmat.
+        """Move a view by one Adam step (Nadam) down the gradient ``[4,4]`` of its viewmat, and update all viewmats.
 
-        The size of steps falls to zero at the end of the fit.
+        ``progress`` is the share of the fit that is done. The size of the steps falls to zero at the end of the fit.
         """
         local = matmul(self.viewmats[view, :3, :3].T, gradient[:3])
         (_, xy, xz), (yx, _, yz), (zx, zy, _) = local[:, :3]
-        slope = np.array([zy - yz, xz - zx, yx - xy, *local[:, 3]])  # of rotation and shift
+        slope = np.array([zy - yz, xz - zx, yx - xy, *local[:, 3]])  # derivatives by the rotation vector and the shift
         self.counts[view] += 1
         betas = first_decay(rates, self.counts[view]), rates.beta2
         for moments, beta, sample in zip((self.m, self.v), betas, (slope, slope**2), strict=True):
@@ -50,7 +50,7 @@ class PoseState:
 
 
 def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ...]]:
-    """Return motions of zero for the photos' cameras, and the photos with viewmats that the motions update."""
+    """Return motions of zero for the photos' cameras, and the photos with one array of viewmats that steps update."""
     start = photos[0].viewmats.astype(np.float64)
     zero, shared = np.zeros((len(start), 6)), start.copy()
     pixel = 1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean())

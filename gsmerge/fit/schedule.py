@@ -1,4 +1,4 @@
-"""Plan the steps of a full fit: the view, background, Gaussians, draw mode and rates of each step."""
+"""Plan each step of a full fit: its view, background, Gaussians, draw mode and rates."""
 
 from __future__ import annotations
 
@@ -16,27 +16,31 @@ from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
 from gsmerge.types import Region
 
 GROWTH = 0.5  # share of the steps after which Gaussians are added
-# Shares of the steps after which Gaussians are cut at the edges of the views. The first cuts come early, so that photos
-# are fitted without Gaussians beyond the edges. Gaussians grow again after a cut, so there are cuts until the mean of
-# the last steps begins
+# Shares of the steps after which Gaussians are cut at the edges of the views. The first cuts come early, so that the
+# Gaussians are fitted without their parts beyond the edges. Gaussians become larger again after a cut, so the last cut
+# comes shortly before the steps over which parameters are averaged
 CUTS = (0.0, 0.15, 0.3, 0.5, 0.7)
-CLEARS = (0.6, 0.7, 0.8)  # shares of the steps after which runs that grow drop faint Gaussians
-FEW_VIEWS = 5  # with at most this many views a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
-MANY_STEPS = 150  # least steps of such a run
-# Most of the first steps draw a sample of a photo's pixels, each time a different sample. A sample costs as much as the
-# photo at half size, and shows details that are lost at half size.
+CLEARS = (0.6, 0.7, 0.8)  # shares of the steps after which a run that grows drops its faint Gaussians
+FEW_VIEWS = 5  # with no more views, a run of MANY_STEPS or more memorises the photos, unless it has a dropout
+MANY_STEPS = 150
+# Most of the first steps draw a sample of a photo's pixels, each time a different sample: every STRIDE-th pixel in both
+# directions. It costs as much as the photo at half size, and shows details that are lost at half size
 STRIDE = 2
-OFFSETS = ((0, 0), (1, 1), (1, 0), (0, 1))  # columns and rows of the samples, one after the other
-DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
-LONG_DROPOUT = 0.05  # the same share in runs of LONG_STEPS that draw each view LONG_ROUNDS times
+OFFSETS = ((0, 0), (1, 1), (1, 0), (0, 1))  # first column and first row of each sample, one sample after the other
+DROPOUT = 0.1  # share of the Gaussians that each step leaves out if there are at most FEW_VIEWS
+LONG_DROPOUT = (
+    0.05  # the same share with more views, in runs of LONG_STEPS or more that draw each view LONG_ROUNDS times
+)
 LONG_ROUNDS = 30  # steps for each view
-LARGE_CYCLE = 5  # of this many steps, the steps LARGE_STEPS draw larger photos; more would worsen the views' own size
-LARGE_STEPS = (0, 2)  # numbers of steps within a cycle, from 0
-# Draw modes of steps, one after the other. A mode is 1 for half size or 0 for full size, the low-pass as a share of the
-# viewers' own low-pass, and whether small Gaussians are made fainter to offset the low-pass, as some viewers do. In a
-# view that is enlarged twice, the low-pass is a quarter; from afar, it covers more of the scene. Gaussians that are
-# fitted to one mode alone look thin or fat in the other modes (Mip-Splatting, Yu et al. 2024). The first steps, in
-# which Gaussians find their sizes, have several modes too.
+# If there are larger photos, of each LARGE_CYCLE steps those with the numbers LARGE_STEPS, from 0, draw them. With more
+# such steps, renders at the size of the views would become worse
+LARGE_CYCLE = 5
+LARGE_STEPS = (0, 2)
+# Draw modes of steps, one after the other. A mode has three parts: 1 for half size or 0 for full size; the low-pass
+# filter, as a share of that of viewers; and true if small Gaussians are made fainter to offset the low-pass, as some
+# viewers do. In a view that is enlarged twice, the low-pass has a quarter of its usual share of the picture. From afar,
+# it covers more of the scene. Gaussians that are fitted to one mode alone look thin or fat in the other modes
+# (Mip-Splatting, Yu et al. 2024). The first steps, in which Gaussians find their sizes, have several modes too
 FIRST_MODES = (0, 1.0, False), (0, 0.25, False), (0, 1.0, False), (1, 1.0, False)
 DRAW_MODES = (
     (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
@@ -45,29 +49,33 @@ DRAW_MODES = (
     (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
 )  # fmt: skip
 
-OnStep = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos, share of the first steps
+# Takes the number of the step, the number of steps, the PSNR (dB) of the last photos, and the share of the first steps
+OnStep = Callable[[int, int, float, float], None]
 
 
 @dataclass(frozen=True, eq=False)
 class FitJob:
-    """Photos to fit to, with options and start conditions."""
+    """What a fit is asked to do: photos, options, and limits of the result."""
 
-    photos: tuple[Photos, ...]  # At full size, at half size, and larger ones if the fit uses them
+    photos: tuple[Photos, ...]  # At full size, at half size, and larger if the fit uses larger photos
     options: FitOptions
-    count: int = 0  # Gaussians to grow to, where the run is long enough
-    most_growth: int | None = None  # Most Gaussians after the growth, relative to those before it; None: any number
+    count: int = 0  # Number of Gaussians to grow to, if the run is long enough to grow
+    most_growth: int | None = None  # Largest factor by which the number of Gaussians grows; None for no limit
     seed: int = 0
     progress: OnStep | None = None  # Called after each step
-    fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay unchanged; None: none
-    # If renders stand for photos, the result is scored on this number of first photos; None: on all photos
+    fixed: np.ndarray | None = None  # [n] bool, true for Gaussians that must not change; None if all may
+    # If renders stand for photos, the result is scored on the first `num_scored` photos. None if there are photos; then
+    # the result is scored on all of them
     num_scored: int | None = None
-    held_out: Photos | None = None  # Photos that the result is scored on in place of these, and no step draws
-    outside: Outside | None = None  # Views from outside, in which some steps clear fog and veils; None: no such steps
-    edges: Edges | None = None  # Edges of the views, at which Gaussians are cut; None: no cuts
-    region: Region | None = None  # Region in which centres stay; None: everywhere
+    held_out: Photos | None = None  # If given, the result is scored on these photos instead; no step draws them
+    outside: Outside | None = (
+        None  # Views from outside, in which some steps clear fog and veils; None for no such steps
+    )
+    edges: Edges | None = None  # Edges of the views, at which Gaussians are cut; None for no cuts
+    region: Region | None = None  # Region that no centre may leave; None for no limit
 
     def scored_photos(self, size: int) -> Photos:
-        """Return the photos that a result is scored on, at a size as of :class:`DrawMode`."""
+        """Return the photos that a result is scored on if none are held out; ``size`` is that of :class:`DrawMode`."""
         photos = self.photos[size]
         return photos[range(len(photos))[: self.num_scored]]
 
@@ -76,38 +84,38 @@ class FitJob:
 class DrawMode:
     """Size of the photos and low-pass with which a step draws the scene."""
 
-    size: int  # Of the photos: 0 full, 1 half, 2 larger
-    eps2d: float  # Low-pass, pixels squared of this size
-    antialiased: bool = False  # Make small Gaussians fainter, to offset that the low-pass widens them
-    stride: int = 1  # Distance of the pixels that are drawn; pixels in between are left out
+    size: int  # Index of the size among the photos of the job: 0 full, 1 half, 2 larger
+    eps2d: float  # Variance of the low-pass filter, in squared pixels of this size
+    antialiased: bool = False  # True to make small Gaussians fainter, because the low-pass widens them
+    stride: int = 1  # Distance from one drawn pixel to the next; those in between are left out
 
 
 @dataclass(frozen=True, eq=False)
 class FitRun:
-    """A prepared full fit: weights of the pixels, dropout, and the share of the first steps."""
+    """A fit that is ready to run: its job, the weights of the pixels, the dropout, and how the first steps draw."""
 
     job: FitJob
-    # [h,w] float32 weights of each photo at half size: 0 on held-out patches, if the fit is scored on them,
-    # `HIDDEN_WEIGHT` on pixels that neither steps nor scores use, 1 elsewhere
+    # [h,w] float32 weights of each photo at half size, for the score: 0 on held-out patches, which are scored;
+    # `HIDDEN_WEIGHT` on pixels that neither steps nor scores use; 1 elsewhere
     weights: list[np.ndarray]
-    # [h,w] float32 weights in steps, of each photo at each size: 0 on hidden pixels, elsewhere the importance of the
-    # pixel. Held-out patches are 0 only at half size
+    # [h,w] float32 weights of each photo at each size, for the steps: 0 on hidden pixels, elsewhere the importance of
+    # the pixel. On held-out patches they are 0 at half size only
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
-    half_part: float  # Share of the first steps, which draw a quarter of the pixels
-    samples: bool = True  # Whether most of the first steps draw samples of photos; otherwise all draw half-size photos
-    # [h,w] bool of each photo at full size: pixels that count in the first steps; None: the same as in all other steps
+    half_part: float  # Share of the steps that are the first steps, which draw a quarter of the pixels
+    samples: bool = True  # True if most of the first steps draw samples of photos; otherwise all draw half-size photos
+    # [h,w] bool of each photo at full size: pixels that count in the first steps; None if these are the same as later
     first_pixels: tuple[np.ndarray, ...] | None = None
 
     def weight(self, step: Step) -> np.ndarray:
-        """Return the weights ``[h,w]`` of the pixels that a step draws; held-out patches are 0 in the first steps."""
+        """Return the weights ``[h,w]`` of the pixels that a step draws; in the first steps, held-out patches have 0."""
         weight = self.step_weights[step.mode.size][step.view][step.sample.pixels]
         if step.mode.stride == 1 or self.first_pixels is None:
             return np.ascontiguousarray(weight)
         return np.where(self.first_pixels[step.view][step.sample.pixels], weight, np.float32(0))
 
     def outside_view(self, step: int, progress: float) -> int | None:
-        """Return the index of the view from outside that is fitted after step ``step`` (from 1); None: none."""
+        """Return the index of the view from outside that is drawn after step ``step`` (from 1), or None if none is."""
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
@@ -116,28 +124,28 @@ class FitRun:
     def draw_mode(self, step: int, progress: float) -> DrawMode:
         """Return how step ``step`` (from 1) draws the scene.
 
-        The first steps draw samples of the photos, later steps draw whole photos, both in the modes of different
-        viewers. If there are larger photos, some of the later steps draw these, as an enlarged view does.
+        The first steps draw samples of the photos, and later steps draw whole photos. Both take turns in the modes of
+        different viewers. If there are larger photos, some of the later steps draw these, as a viewer does who moves
+        closer.
         """
         photos, is_early, has_larger = self.job.photos, progress < self.half_part, len(self.job.photos) > 2
         if is_early and not self.samples:
             return DrawMode(1, photos[1].eps2d)
-        if has_larger and is_early:  # larger photos will show the scene from near
+        if has_larger and is_early:  # later, the larger photos have the effect of a smaller low-pass
             return DrawMode(0, photos[0].eps2d, stride=STRIDE)
         if has_larger and step % LARGE_CYCLE in LARGE_STEPS:
             return DrawMode(2, photos[2].eps2d)
         modes = FIRST_MODES if is_early else DRAW_MODES
         size, low_pass, antialiased = modes[step % len(modes)]
-        half_cycle = 3  # with larger photos, one of this many half-size steps remains
-        # Half-size photos cost short runs more than they gain. If larger photos show the scene from near, a third of
-        # the half-size steps is enough
+        # Half-size photos cost short runs more than they gain. With larger photos, a third of these steps is enough
+        half_cycle = 3
         if not self.job.options.grows or (has_larger and step % half_cycle):
             size = 0
         return DrawMode(size, low_pass * photos[0].eps2d, antialiased, STRIDE if is_early and size == 0 else 1)
 
 
 def prepare_fit(job: FitJob) -> FitRun:
-    """Prepare a fit: held-out patches, pixels outside masks, and dropout where there are few views."""
+    """Prepare a fit: choose held-out patches, the weights of pixels, the dropout, and how the first steps draw."""
     photos, options = job.photos, job.options
     dropout = default_dropout(options.steps, len(photos[0])) if options.dropout is None else options.dropout
     everywhere, *larger = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
@@ -155,26 +163,26 @@ def prepare_fit(job: FitJob) -> FitRun:
 
 
 def default_dropout(steps: int, num_photos: int) -> float:
-    """Return the share of the Gaussians that a step leaves out, for a run of ``steps`` on ``num_photos``."""
+    """Return the share of the Gaussians that each step leaves out, if a run has ``steps`` steps and ``num_photos``."""
     if num_photos <= FEW_VIEWS and steps >= MANY_STEPS:
         return DROPOUT
     return LONG_DROPOUT if steps >= max(LONG_STEPS, LONG_ROUNDS * num_photos) else 0.0
 
 
 def _can_sample(job: FitJob) -> bool:
-    """Return whether the first steps may draw samples of photos.
+    """Return true if the first steps may draw samples of photos, false if they have to draw half-size photos.
 
-    The samples of all photos need at least as many pixels as there are Gaussians. While cameras move, photos have to be
-    blurred instead, so that a pose with an error of a pixel still has a gradient.
+    The samples of all photos together need at least as many pixels as there are Gaussians. Cameras that move need
+    half-size photos, whose blur gives a gradient even to a pose with an error of a pixel.
     """
     photos, options = job.photos[0], job.options
     pixels = len(photos) * (photos.width // STRIDE) * (photos.height // STRIDE)
-    min_steps = 30  # shorter runs draw too few samples to see all pixels: .07 dB less at 20 steps, 1 dB at 7
+    min_steps = 30  # shorter runs draw too few samples to see all pixels: they lose .07 dB at 20 steps, 1 dB at 7
     return options.steps >= min_steps and not options.move_cameras and max(1, job.count) <= pixels
 
 
 def _weights_of(photos: Photos) -> list[np.ndarray]:
-    """Return the weights ``[h,w]`` of all pixels of each photo."""
+    """Return the weights ``[h,w]`` of each photo, all 1 if the photos have none."""
     if photos.weights is None:
         return [np.ones((photos.height, photos.width), np.float32)] * len(photos)
     return list(photos.weights)
@@ -189,22 +197,22 @@ def _weigh(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of the fit: view, background, draw mode, and the Gaussians that are drawn."""
+    """What one step of a fit draws: a view, a background, a draw mode, and the Gaussians that take part."""
 
     number: int  # From 1
-    progress: float  # Share of the steps before it
+    progress: float  # Share of the steps that come before this one
     mode: DrawMode
     view: int
     background: np.ndarray  # [3] float32
-    mask: np.ndarray | None  # [n] bool, Gaussians that are drawn; dropout leaves out the rest; None: all are drawn
+    mask: np.ndarray | None  # [n] bool, false for Gaussians that dropout leaves out; None if all are drawn
     sample: Sample = WHOLE_PHOTO  # Pixels of the photo that are drawn
 
 
 class Schedule:
     """Draw the order of views, the backgrounds and the dropped Gaussians of all steps from one seed.
 
-    One generator draws everything, and a step's dropout after its background. A second generator for dropout would
-    change the results of few views and of long runs.
+    One generator draws everything, for each step first its background and then its dropout. With a second generator for
+    dropout, scenes of few views and long runs would have other results than before.
     """
 
     def __init__(self, run: FitRun):
@@ -214,11 +222,16 @@ class Schedule:
         self.samples = list(range(len(run.job.photos[0])))
 
     def draw(self, number: int, progress: float, count: int) -> Step:
-        """Draw step ``number`` (from 1) for ``count`` Gaussians; a round over all views has each view once."""
+        """Choose at random what step ``number`` (from 1) draws of ``count`` Gaussians.
+
+        The views come in rounds, each of which has every view once, in random order.
+        """
         if not self.views_left:
             self.views_left = self.rng.permutation(len(self.run.job.photos[0])).tolist()
         view, background, mask = self.views_left.pop(), self.rng.random(3, dtype=np.float32), None
-        if self.run.job.num_scored is not None and number % 2:  # renders, which most viewers show before black
+        if (
+            self.run.job.num_scored is not None and number % 2
+        ):  # renders stand for photos; most viewers have a black background
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
             mask = self.rng.random(count, dtype=np.float32) >= self.run.dropout
@@ -231,7 +244,7 @@ class Schedule:
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     """Return the step size of each of the fourteen parameters; it decays geometrically, and further in longer runs."""
-    usual_steps = 300  # in longer runs the last step sizes shrink in proportion to the number of steps
+    usual_steps = 300  # in a longer run, the last step size is smaller by the ratio of the numbers of steps
     decay = rates.decay * min(1.0, usual_steps / steps)
     start_rates = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
     widths = [3, 3, 4, 1, 3]  # columns of means, log scales, quaternions, opacity logit and colours
@@ -239,9 +252,9 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
 
 
 def first_decay(rates: Tuning, rounds: float) -> float:
-    """Return the decay of Adam's first moment after a number of rounds over all views.
+    """Return the decay of Adam's first moment after a number of ``rounds`` over all views.
 
-    Momentum grows during the fit. At first it averages two steps that show a Gaussian, and one step more after every
-    four rounds. Early gradients change from step to step; later gradients differ most between views.
+    The moment averages about two steps at first, and one step more after every four rounds, up to ``rates.beta1``.
+    Early gradients change quickly, so few are averaged. Later gradients differ most between views.
     """
     return min(rates.beta1, 1 - 1 / (2 + rounds / 4))

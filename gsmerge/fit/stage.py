@@ -1,4 +1,4 @@
-"""The stage of the fit: drop Gaussians that no photo shows, and choose which parameters of the rest are fitted."""
+"""Run the stage of the fit: drop Gaussians that no photo shows, fit the rest, and keep the result if it is better."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from gsmerge.fit.survey import photo_mses, survey_photos
 from gsmerge.geometry.transforms import clamp_inside
 from gsmerge.raster import make_splats
 from gsmerge.raster.photos import Photos, scene_photos
-from gsmerge.runtime.record import choose, stage
+from gsmerge.runtime.record import record_choices, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-CLOSE = 1.0  # gain of the held-out patches, dB, below which whole photos decide
-START = 0.57  # share of the final number of Gaussians at the start of a run that grows
+CLOSE = 1.0  # if held-out patches gain less than this, in dB, whole photos decide whether a fit is accepted
+START = 0.57  # a run that grows starts with this share of its final number of Gaussians
 
 
 def fit_scene(
@@ -36,28 +36,28 @@ def fit_scene(
     num_scored: int | None = None,
     held_out: Sequence[int] = (),
 ) -> Fitted:
-    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene (None: all), if a fit is asked for.
+    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene (None: all), unless the fit is "none".
 
-    If renders stand for photos, the result is scored on the views ``held_out``; without any, on the first
-    ``num_scored`` views. None: there are photos, and the result is scored on all of them.
+    ``num_scored`` is None if the scene has photos; the result is then scored on all of them. If renders stand for
+    photos, the result is scored on the views ``held_out``, or if there are none, on the first ``num_scored`` views.
     """
     if options.fit == "none":
         return Fitted(decoded.gaussians, scene.cameras, None)
     views = range(len(scene)) if views is None else views
     with stage("fit"):
         photos = fit_photos(scene, options, views)
-        choose(start_count=len(decoded.gaussians))
-        if decoded.exact and not options.grows:  # then no Gaussian is dropped either
+        record_choices(start_count=len(decoded.gaussians))
+        if decoded.exact and not options.grows:  # no drop may change the exact number, because nothing grows back
             options = replace(options, min_contribution=0.0)
-        is_met = decoded.exact or options.fills  # then the count is met, whatever it gains
+        is_met = decoded.exact or options.fills  # the run grows to the whole count, even where that gains little
         growth = None if is_met else MOST_GROWTH
         job = FitJob(photos, options, decoded.count, growth, seed, report_steps, decoded.fixed, num_scored)
         outside = place_outside_views(scene, decoded.gaussians, job.scored_photos(1), options)
         edges = None if options.beyond else find_edges(scene.cameras, decoded.count)
         unseen = scene_photos(scene)[held_out] if held_out else None
         job = replace(job, held_out=unseen, outside=outside, edges=edges, region=scene.region)
-        gaussians, report = fit(decoded.gaussians, job)
-        if scene.region is not None:  # Gaussians that grew last took no step since
+        gaussians, report = fit_gaussians(decoded.gaussians, job)
+        if scene.region is not None:  # splits after the last step may have moved centres out of the region
             gaussians = replace(gaussians, means=clamp_inside(scene.region, gaussians.means).astype(np.float32))
         record_fit(report)
     cameras = scene.cameras
@@ -68,8 +68,8 @@ def fit_scene(
     return Fitted(gaussians, cameras, report, job.outside)
 
 
-def fit(gaussians: Gaussians, job: FitJob) -> FitResult:
-    """Drop Gaussians that no photo shows, and fit the rest to the photos."""
+def fit_gaussians(gaussians: Gaussians, job: FitJob) -> FitResult:
+    """Drop Gaussians that no photo shows, fit the rest, and measure the fog of the result; return it with a report."""
     fitted, report = _choose_fit(gaussians, job)
     if job.outside is not None:
         report = replace(report, fog=score_fog(make_splats(fitted), job.outside))
@@ -77,7 +77,7 @@ def fit(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
-    """Fit the Gaussians that some photo shows; return them unfitted if most photos got worse."""
+    """Fit the Gaussians that some photo shows; return these Gaussians without the fit if most photos became worse."""
     options = job.options
     run, scored = prepare_fit(job), job.scored_photos(0) if job.held_out is None else job.held_out
     survey = survey_photos(gaussians, run)
@@ -92,16 +92,16 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport) -> FitResult:
-    """Return the fitted Gaussians, or their start if most photos got worse.
+    """Return the Gaussians ``after`` the fit, or those ``before`` it if most photos became worse.
 
-    Whole photos are compared only if held-out patches gained less than ``CLOSE`` dB. If Gaussians are fitted already, a
-    further fit with steps of the default size only scatters them. Held-out patches alone refuse nothing: where few
-    views see a place, they get worse in fits that gain up to 10 dB in views that were left out.
+    A fit makes photos worse if the Gaussians were fitted before, because steps of the default size scatter them. Whole
+    photos are compared only if held-out patches gained less than ``CLOSE`` dB. Held-out patches alone are no reason to
+    refuse a fit. Where few views see a place, they become worse in fits that gain up to 10 dB in views left out.
     """
     if report.holdout_after - report.holdout_before >= CLOSE:
         return after, report
     moved = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats[: len(photos)])
-    # most, and not the mean: where a placed camera stands close to a Gaussian, it may see nothing else
+    # the median and not the mean, because a placed camera close to a Gaussian may see nothing else
     if np.median(photo_mses(after, moved) / photo_mses(before, photos)) <= 1:
         return after, report
     why = "most photos were shown worse"

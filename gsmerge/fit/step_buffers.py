@@ -1,4 +1,4 @@
-"""Buffers of the steps of a fit, with which a step is a few calls of the native library.
+"""Take the steps of a fit with few calls of the native library, in buffers that many steps share.
 
 Memory is allocated and arguments are checked once for many steps. A slow twin in the tests takes the same steps by
 single calls of the kernels, with the same bits.
@@ -20,9 +20,10 @@ from gsmerge.raster.gradient import viewmat_gradient
 from gsmerge.raster.tiled_view import cache_line_rows, hides_most
 from gsmerge.runtime.threads import parallel_map
 
+# Names of arrays in the table that the native library reads, by where the arrays come from
 OF_STATE = ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors")
 OF_SPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-# Arrays that each step sets, with their lengths
+# Arrays whose values each step sets, with their lengths
 OF_STEP = {
     "camera": CAMERA, "eye": 3, "background": 3, "loss_weights": 2, "rates": 14, "limits": 5, "betas": 2, "regs": 2,
 }  # fmt: skip
@@ -30,13 +31,14 @@ OF_STEP = {
 
 @dataclass(eq=False)
 class StepBuffers:
-    """Buffers for the steps of a state, with a filled table for each size of the photos."""
+    """Buffers for the steps of one state, and for each size of the photos a table of their addresses."""
 
     state: FitState
     threads: int
-    moves_camera: bool = False  # Whether steps compute the gradient of the viewmat
-    gaussians: dict[str, np.ndarray] = field(default_factory=dict)  # Buffers over Gaussians, and arrays of a step
-    room: dict[str, np.ndarray] = field(default_factory=dict)  # Buffers over intersections
+    moves_camera: bool = False  # True if steps compute the gradient of the viewmat
+    gaussians: dict[str, np.ndarray] = field(default_factory=dict)  # Arrays with a row for each Gaussian, and OF_STEP
+    room: dict[str, np.ndarray] = field(default_factory=dict)  # Arrays with a row for each intersection with a tile
+    # By size of the photo: a table, and for each phase of a step the call of the library with this table
     tables: dict[tuple[int, int], tuple[FilledTable, list[Callable[[], None]]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -56,47 +58,47 @@ class StepBuffers:
         self.gaussians |= {"fixed": self.state.fixed.view(np.uint8)}
         self.gaussians |= {name: getattr(self.state, name) for name in OF_STATE}
         self.gaussians |= {name: getattr(self.state.splats, name) for name in OF_SPLATS}
-        self._make_room(1)
+        self._allocate_intersections(1)
 
-    def take(
+    def take_step(
         self, number: int, photo: np.ndarray, weight: np.ndarray, drawn: np.ndarray, numbers: dict[str, np.ndarray]
     ) -> tuple[float, np.ndarray | None]:
-        """Take step ``number`` on a photo ``[h,w,3]`` whose pixels weigh ``weight [h,w]``.
+        """Take step ``number`` on a photo ``[h,w,3]`` whose pixels weigh ``weight [h,w]``, and update the state.
 
         Args:
             drawn: ``[n]`` float32, the opacities to draw.
-            numbers: The arrays of ``OF_STEP``: camera and its centre, background, constants of loss and optimiser.
+            numbers: Values of the arrays of ``OF_STEP``: camera, its centre, background, constants of loss and Adam.
 
         Returns:
-            The sum of squared errors, and the gradient ``[4,4]`` of the viewmat; None if the camera does not move.
+            The sum of squared errors, and the gradient ``[4,4]`` of the viewmat, or None if the camera does not move.
         """
         self.state.update_harmonics()
         for name, values in numbers.items():
             self.gaussians[name][:] = values
-        table = self._table(photo, weight, drawn)
+        table = self._fill_table(photo, weight, drawn)
         table["failed"], table["step"] = 0, number
-        self._run(weight.shape, "cull", "project", "count")
+        self._run_phases(weight.shape, "cull", "project", "count")
         is_open = hides_most(table["num_intersections"], table["num_visible"])
-        if is_open:  # lists end where their tiles are opaque, or they would be too long
-            self._run(weight.shape, "count_open")
+        if is_open:  # many Gaussians are hidden, so the list of each tile ends where the tile is opaque
+            self._run_phases(weight.shape, "count_open")
         if table["num_intersections"] > len(self.room["flatten_ids"]):
-            room_factor = 1.25  # allocated room, as a multiple of the intersections of a view that needs more room
-            self._make_room(int(room_factor * table["num_intersections"]))
-            return self.take(number, photo, weight, drawn, numbers)
-        self._run(weight.shape, "deal_open" if is_open else "deal", "blend", "loss", "backward", "update")
+            room_factor = 1.25  # room for more intersections than this view has, so that few views need new buffers
+            self._allocate_intersections(int(room_factor * table["num_intersections"]))
+            return self.take_step(number, photo, weight, drawn, numbers)
+        self._run_phases(weight.shape, "deal_open" if is_open else "deal", "blend", "loss", "backward", "update")
         error = float(table.arrays["errors"].sum(dtype=np.float64))
         if not self.moves_camera:
             return error, None
         poses = self.gaussians["g_poses"][: -(-table["num_visible"] // BLOCK)]
         return error, viewmat_gradient(poses, self.state.splats.origin)
 
-    def _make_room(self, count: int) -> None:
-        """Allocate buffers for ``count`` intersections, and drop the tables with the old ones."""
+    def _allocate_intersections(self, count: int) -> None:
+        """Allocate buffers for ``count`` intersections, and drop the tables, which point to the old buffers."""
         self.tables.clear()
         self.room = {"flatten_ids": np.empty(count, np.int32), "slots": np.empty((count, SUMS), np.float32)}
 
-    def _table(self, photo: np.ndarray, weight: np.ndarray, drawn: np.ndarray) -> FilledTable:
-        """Return the table for the size of a photo, filled with the photo, its weights and the drawn opacities."""
+    def _fill_table(self, photo: np.ndarray, weight: np.ndarray, drawn: np.ndarray) -> FilledTable:
+        """Return the table for photos of this size; it points to the photo, its weights and the drawn opacities."""
         of_step = {"photo": photo, "weight": weight, "drawn": drawn}
         if weight.shape not in self.tables:
             table = STEP.fill(self.gaussians | self.room | self._pixel_buffers(*weight.shape) | of_step)
@@ -108,7 +110,7 @@ class StepBuffers:
         return table
 
     def _pixel_buffers(self, height: int, width: int) -> dict[str, np.ndarray]:
-        """Allocate buffers over the pixels and the tiles of a photo."""
+        """Allocate the arrays of a table that depend on the size of the photo, by name."""
         columns, lines, line = -(-width // TILE), -(-height // TILE), image_loss.room_of(width)
         spans, tiles, corners = 2 * self.threads, columns * lines, (columns + 1) * (lines + 1)
         shapes: dict[str, tuple[int, ...]] = {
@@ -120,8 +122,8 @@ class StepBuffers:
         pictures = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
         return pictures | {name: np.empty(shape, np.int64) for name, shape in counts.items()}
 
-    def _run(self, size: tuple[int, int], *phases: str) -> None:
-        """Run phases one after the other on a photo of a size, each on all threads."""
+    def _run_phases(self, size: tuple[int, int], *phases: str) -> None:
+        """Run ``phases`` of a step one after the other, each on all threads, with the table for photos of ``size``."""
         calls = self.tables[size][1]
         for phase in phases:
             parallel_map(lambda call: call(), [calls[PHASES.index(phase)]] * self.threads)

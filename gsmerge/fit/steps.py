@@ -1,4 +1,4 @@
-"""Steps of a full fit: draw a view, differentiate the loss, and take an Adam step."""
+"""Take the steps of a full fit: draw a view, differentiate the loss, and take an Adam step."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ ADAM_ROWS = 16384  # Gaussians per task of an Adam step
 
 @dataclass(eq=False)
 class Optimiser:
-    """Optimiser of a full fit: takes its steps, and moves cameras where the options ask for it."""
+    """The optimiser of a full fit, which changes Gaussians, and also cameras if the options ask for it."""
 
     run: FitRun
-    photos: tuple[Photos, ...]  # Photos of the run's job, at the poses that the fit has reached
-    poses: PoseState | None  # Motions of the cameras; None: cameras are fixed
-    buffers: StepBuffers | None = None  # Of the state that took the last step
+    photos: tuple[Photos, ...]  # Photos of the job at each size, at the poses that the fit has reached
+    poses: PoseState | None  # Motions of the cameras; None if cameras are fixed
+    buffers: StepBuffers | None = None  # Buffers of the last step, which fit only its state
 
     @property
     def viewmats(self) -> np.ndarray | None:
@@ -40,7 +40,7 @@ class Optimiser:
         return None if self.poses is None else self.poses.viewmats
 
     def step(self, state: FitState, step: Step) -> float:
-        """Take one Adam step on one view, in place; return the mean squared error of its training pixels."""
+        """Change a state by one Adam step on one view; return the mean squared error of the pixels that count."""
         rates, weight = self.run.job.options.tuning, self.run.weight(step)
         photo, camera = self.view(step)
         numbers = self.constants(state, step) | {
@@ -51,7 +51,7 @@ class Optimiser:
         }
         with use_threads() as threads:
             buffers = self._buffers_of(state, threads)
-            error, viewmat_gradient = buffers.take(
+            error, viewmat_gradient = buffers.take_step(
                 step.number, photo, weight, self.drawn_opacities(state, step), numbers
             )
         if self.poses is not None and viewmat_gradient is not None:
@@ -59,12 +59,12 @@ class Optimiser:
         return error / max(3 * float(weight.sum()), 1)
 
     def clear_veils(self, state: FitState, step: Step, view: int) -> None:
-        """Take one Adam step, in place, against fog and veils in a view from outside."""
+        """Change a state by one Adam step against fog and veils in a view from outside."""
         assert self.run.job.outside is not None
         self.move(state, veil_gradients(state.splats, self.run.job.outside, view), step)
 
     def move(self, state: FitState, g: Gradients, step: Step) -> None:
-        """Take one Adam step along gradients, in place."""
+        """Change the Gaussians of a state that have gradients ``g`` by one Adam step."""
         s, fixed, constants = state.splats, state.fixed.view(np.uint8), tuple(self.constants(state, step).values())
 
         def move_rows(start: int) -> None:
@@ -78,21 +78,21 @@ class Optimiser:
         parallel_map(move_rows, range(0, len(g.ids), ADAM_ROWS))
 
     def view(self, step: Step) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return the pixels ``[h,w,3]`` float32 of the photo that a step draws, and the camera that draws them."""
+        """Return the pixels ``[h,w,3]`` float32 of the photo of a step, and the camera that draws them."""
         photos, mode, sample = self.photos[step.mode.size], step.mode, step.sample
         camera = photos.camera(step.view, sample)
         camera |= {"eps2d": mode.eps2d / sample.stride**2, "antialiased": mode.antialiased}
         return np.ascontiguousarray(photos.image(step.view, step.background, sample), np.float32), camera
 
     def drawn_opacities(self, state: FitState, step: Step) -> np.ndarray:
-        """Return the opacities ``[n]`` that a step draws: 0 for Gaussians left out by dropout, raised for the rest."""
+        """Return the opacities ``[n]`` that a step draws: 0 where dropout leaves out Gaussians, raised for the rest."""
         if step.mask is None:
             return state.splats.opacities
         raised = state.splats.opacities / np.float32(1 - self.run.dropout)
         return step.mask * np.minimum(raised, MAX_ALPHA)
 
     def constants(self, state: FitState, step: Step) -> dict[str, np.ndarray]:
-        """Return Adam's constants at a step, in the order of its arguments."""
+        """Return the constants of Adam at a step, by name, in the order of the arguments of ``kernels.adam``."""
         options, count = self.run.job.options, max(len(state.x), 1)
         rates, rounds = options.tuning, step.number / len(self.photos[0])
         return {
@@ -104,13 +104,13 @@ class Optimiser:
 
     @cached_property
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Limits of parameters before and after the growth of a run.
+        """The limits of the parameters, as ``kernels.adam`` takes them, before and after the growth of a run.
 
-        Before the growth no limit shortens long Gaussians, because no new Gaussians could fill the gaps beside them.
+        Before the growth nothing shortens long Gaussians, because no new Gaussians could fill the gaps beside them.
         """
         rates = self.run.job.options.tuning
         moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
-        widest = max(photos.width for photos in self.run.job.photos)  # the unit of the least scale is its pixel
+        widest = max(photos.width for photos in self.run.job.photos)  # its pixel is the unit of the least scale
         max_length = rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))  # in units of the least scale
         log_ratio, log_length = log(np.array([rates.max_ratio, max_length]))
         before = np.array([*moves, np.inf, log_length], np.float32)
@@ -118,14 +118,14 @@ class Optimiser:
         return before, after
 
     def _buffers_of(self, state: FitState, threads: int) -> StepBuffers:
-        """Return the buffers of the last step, or new ones for another state or number of threads."""
+        """Return the buffers of the last step, or new ones if the state or the number of threads is another one."""
         if self.buffers is None or self.buffers.state is not state or self.buffers.threads != threads:
             self.buffers = StepBuffers(state, threads, self.poses is not None)
         return self.buffers
 
 
 def make_optimiser(run: FitRun) -> Optimiser:
-    """Return the optimiser of a fit; its cameras are where the photos were taken."""
+    """Return the optimiser of a fit before its first step, with the cameras where the photos were taken."""
     photos = run.job.photos
     if not run.job.options.move_cameras:
         return Optimiser(run, photos, None)

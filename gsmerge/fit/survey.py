@@ -1,4 +1,4 @@
-"""Survey the weights of each Gaussian of a fit in the photos, and score renders of Gaussians against the photos."""
+"""Measure how much photos show of each Gaussian, and score renders of Gaussians against the photos."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from gsmerge.raster.photos import NEAR_PLANE, Photos, photo_errors, render_photo
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
-MOST_SCORED = 12  # most photos that a fit is scored on
-ENOUGH_PHOTOS = 6  # a survey has enough photos of a Gaussian if its centre is inside this many of them
+MOST_SCORED = 12  # a fit is scored on at most this many photos
+ENOUGH_PHOTOS = 6  # a survey needs no further photo of a Gaussian if the centre of the Gaussian is inside this many
 # A photo is added to a survey if more than this share of its Gaussians has fewer photos than ENOUGH_PHOTOS
 FEWER_SHARE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Facts that half-size photos show about each of the n Gaussians that a fit starts from."""
+    """What half-size photos show of each of the n Gaussians from which a fit starts."""
 
-    score: float  # PSNR (dB) of the held-out patches
-    inside: np.ndarray  # [n] bool, Gaussians that may reach into the frustum of some photo
-    peaks: np.ndarray  # [n] float32 largest blending weight
+    score: float  # PSNR (dB) of renders of all n Gaussians on the held-out patches; NaN if none are held out
+    inside: np.ndarray  # [n] bool, true for Gaussians that may reach into the frustum of some photo
+    peaks: np.ndarray  # [n] float32 largest blending weight in any pixel
     sums: np.ndarray  # [n] float64 blending weights summed over all photos, pixels
-    squares: np.ndarray  # [n] float64 squares of each photo's sum, summed
+    squares: np.ndarray  # [n] float64 sum over photos of the squared sum of weights in a photo
     pixels: np.ndarray  # [n] float32 size of the finest pixel that shows the Gaussian, world units; inf if none does
 
     def visible(self, min_weight: float) -> np.ndarray:
-        """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or outside all frustums."""
+        """Return a mask ``[n]`` of Gaussians with a weight of at least ``min_weight``, or outside of all frustums."""
         return ~self.inside | (self.peaks >= min_weight)
 
     def __getitem__(self, rows: np.ndarray) -> Survey:
@@ -44,9 +44,9 @@ class Survey:
 
 
 def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
-    """Draw Gaussians into half-size photos of a fit, see :func:`choose_photos`, and collect the facts about each.
+    """Draw Gaussians at the cameras of half-size photos, and measure what each photo shows of each Gaussian.
 
-    The size of the finest pixel refers to the largest photos.
+    :func:`choose_photos` chooses the photos. The size of the finest pixel is that of a pixel of the largest photos.
     """
     photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
@@ -72,11 +72,11 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
 
 
 def choose_photos(gaussians: Gaussians, photos: Photos) -> list[int]:
-    """Choose the photos of a survey: the scored photos, and further ones.
+    """Return the indices of the photos for a survey: the scored photos, and others that show something new.
 
-    A photo is added if it shows many Gaussians with fewer than ``ENOUGH_PHOTOS`` photos so far.
+    A photo shows something new if many of its Gaussians are inside fewer than ``ENOUGH_PHOTOS`` of those chosen so far.
     """
-    sample_gaussians = 4096  # the photos are chosen by at most about twice this many Gaussians
+    sample_gaussians = 4096  # at most about twice this many Gaussians are looked at
     means = gaussians.means[:: max(1, len(gaussians) // sample_gaussians)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
     inside = (depths > NEAR_PLANE) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
@@ -90,18 +90,18 @@ def choose_photos(gaussians: Gaussians, photos: Photos) -> list[int]:
 
 
 def choose_scored_photos(count: int) -> list[int]:
-    """Choose the photos out of ``count`` that a fit is scored on, at most ``MOST_SCORED``."""
+    """Return the indices of the photos that a fit is scored on, at most ``MOST_SCORED`` of ``count``."""
     return sorted(spread_views(count)[:MOST_SCORED])
 
 
 def spread_views(count: int) -> list[int]:
-    """Order views so that any number of the first ones is spread evenly over all views."""
+    """Return the indices of ``count`` views in an order whose first ones, however many, spread evenly over all."""
     # the order of the reversed bits of the numbers (van der Corput)
     return sorted(range(count), key=lambda view: f"{view:032b}"[::-1])
 
 
 def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.ndarray]:
-    """Return each Gaussian's largest blending weight ``[n]`` over photos, and whether it is in some frustum ``[n]``."""
+    """Return the largest blending weight ``[n]`` of each Gaussian, and a mask ``[n]`` of those in some frustum."""
     splats = make_splats(gaussians)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +130,7 @@ def score_state(state: FitState, run: FitRun, half: Photos) -> float:
 
 
 def photo_mses(gaussians: Gaussians, photos: Photos) -> np.ndarray:
-    """Return the mean squared errors ``[v]``, above 0, of renders against whole photos."""
+    """Return the mean squared error ``[v]`` of the render of each whole photo, raised above 0 so that it can divide."""
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
         return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))

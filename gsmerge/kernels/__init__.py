@@ -1,4 +1,6 @@
-"""Run the inner loops on arrays: no torch, no files, no options. The loops are in C, each beside its declaration.
+"""Run the inner loops of the package on arrays, without torch, files or options.
+
+The loops are written in C. Each C file lies beside the Python file that declares its functions.
 
 Every kernel uses a single thread, releases the GIL and is deterministic. Callers run several kernels at once on
 different views (:mod:`gsmerge.runtime.threads`). Each kernel has a slow, obvious twin in ``tests/kernels``.

@@ -1,6 +1,7 @@
-"""Build the native library: called by ``pip install``, and by ``python tasks.py native`` after a change.
+"""Build the native library of the kernels.
 
-It runs before anything is installed, so it needs only the standard library. One compiler, the clang of the PyPI wheel
+``pip install`` runs this file, and so does ``python tasks.py native`` after a change. It runs before anything is
+installed, so it needs only the standard library. One compiler, the clang of the PyPI wheel
 ``ziglang``, builds every target. ``GSMERGE_CC`` names another compiler, whose rounding may differ.
 """
 
@@ -27,15 +28,15 @@ LINK = ("-shared", "-nostdlib")
 
 @dataclass(frozen=True)
 class Target:
-    """A kind of processor that the library is built for."""
+    """A kind of processor for which a library is built."""
 
-    name: str  # in the library's file name, and in GSMERGE_TARGET
-    zig: tuple[str, ...]  # options for the clang of ziglang
-    gcc: tuple[str, ...]  # options for other compilers, which take those of GCC
+    name: str  # part of the library's file name, and a value of GSMERGE_TARGET
+    zig: tuple[str, ...]  # options of the compiler if it is the clang of ziglang
+    gcc: tuple[str, ...]  # options of other compilers, which take the options of GCC
 
 
 V3 = Target("v3", ("-mcpu=x86_64_v3",), ("-march=x86-64-v3",))
-# Without gathers and scatters: on many processors they take longer than the loads and stores that they replace
+# Gathers and scatters are off, because on many processors they take longer than the loads and stores that they replace
 V4 = Target(
     "v4",
     ("-mcpu=x86_64_v4+prefer_no_gather+prefer_no_scatter", "-mprefer-vector-width=512"),
@@ -46,14 +47,14 @@ ARM64 = Target("arm64", (), ())
 
 @dataclass(frozen=True)
 class Platform:
-    """A system and a family of processors that share a wheel."""
+    """An operating system and a family of processors, for which there is one wheel."""
 
     system: str  # linux, macosx or win, as at the start of a wheel's tag
     machine: str  # x86_64 or arm64
 
     @property
     def suffix(self) -> str:
-        """Suffix of library files."""
+        """Ending of the names of library files."""
         return {"macosx": ".dylib", "win": ".dll"}.get(self.system, ".so")
 
     @property
@@ -63,14 +64,14 @@ class Platform:
 
     @property
     def triple(self) -> str:
-        """The target triple of the compiler; it names a C library, but none is linked."""
+        """The target triple for the compiler. It names a C library, although none is linked."""
         kind = "x86_64" if self.machine == "x86_64" else "aarch64"
         system = {"macosx": "macos.11.0", "win": "windows-gnu"}.get(self.system, "linux-gnu.2.17")
         return f"{kind}-{system}"
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """Further options for the compiler; on Windows, stack probes are off, since they would need a C library."""
+        """Further options of the compiler. On Windows they turn off stack probes, which would need a C library."""
         return ("-mno-stack-arg-probe",) if self.system == "win" else ()
 
     def library_name(self, target: Target) -> str:
@@ -79,19 +80,19 @@ class Platform:
 
 
 def find_platform(tag: str | None = None) -> Platform:
-    """Return the platform of a wheel's tag, such as ``manylinux_2_17_aarch64``; by default this machine's."""
+    """Return the platform of a wheel with a tag such as ``manylinux_2_17_aarch64``; by default that of this machine."""
     name = (tag or sysconfig.get_platform()).lower()
     system = next((system for system in ("macosx", "win") if name.startswith(system)), "linux")
     return Platform(system, "arm64" if name.endswith(("arm64", "aarch64")) else "x86_64")
 
 
 def source_files() -> list[Path]:
-    """List the C sources and headers in this folder; a wheel may have none."""
+    """List the C sources and headers below this folder, by name; a wheel may have none."""
     return sorted([*FOLDER.rglob("*.c"), *FOLDER.rglob("*.h")], key=lambda path: path.name)
 
 
 def hash_sources() -> str:
-    """Return a hash of all sources; empty if there are none."""
+    """Return a hash of the names and contents of all sources; empty if there are none."""
     digest, paths = hashlib.sha256(), source_files()
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
@@ -99,7 +100,7 @@ def hash_sources() -> str:
 
 
 def compiler() -> list[str]:
-    """Return the command of the compiler; OSError if there is none."""
+    """Return the words of the command that runs the compiler; OSError if there is no compiler."""
     words = shlex.split(os.environ.get("GSMERGE_CC", ""))
     if words:
         program = shutil.which(words[0])
@@ -116,7 +117,7 @@ def compiler() -> list[str]:
 def build_target(
     target: Target, folder: Path, platform: Platform, extra: tuple[str, ...] = (), link: tuple[str, ...] = LINK
 ) -> Path:
-    """Build one target's library into a folder; OSError with the compiler's message if that fails."""
+    """Build the library of a target into a folder, and return its path; OSError with the message of the compiler."""
     command, path = compiler(), folder / platform.library_name(target)
     is_zig = Path(command[0]).stem == "zig"
     options = ["-target", platform.triple, *platform.flags, *target.zig] if is_zig else target.gcc
@@ -137,16 +138,16 @@ def build_target(
     return path
 
 
-def build(
+def build_libraries(
     folder: Path = FOLDER, extra: tuple[str, ...] = (), platform: str | None = None, link: tuple[str, ...] = LINK
 ) -> list[Path]:
-    """Build the libraries of all targets into a folder.
+    """Build the libraries of all targets of a platform into a folder, and return their paths.
 
     Args:
         folder: Folder of the libraries.
-        extra: Further options for the compiler.
-        platform: Tag of a wheel; by default the platform of this machine.
-        link: Options that link the objects to a library.
+        extra: Further options of the compiler.
+        platform: Tag of the wheel that gets the libraries; by default they are for this machine.
+        link: Options of the compiler that link a library.
     """
     from concurrent.futures import ThreadPoolExecutor  # takes some milliseconds, and runs only need `hash_sources`
 
@@ -158,7 +159,7 @@ def build(
 
 if __name__ == "__main__":
     try:
-        for built in build():
+        for built in build_libraries():
             print(built)
     except OSError as error:
         sys.exit(str(error))

@@ -1,8 +1,8 @@
-// Cast rays of a pinhole camera against shapes, and add light with shadow maps; see cast.py.
+// Draw simple shapes by casting the rays of a pinhole camera, and light them with shadow maps; see cast.py.
 #include "trig.h"
 
 enum { QUAD, BOX, ELLIPSOID, CONE, LEAF, BLOB };
-enum { WAVES = 4, MARCH = 24, HALVINGS = 10 };  // of a blob: waves, most steps of a ray, bisections of the last step
+enum { WAVES = 4, MARCH = 24, HALVINGS = 10 };  // waves of a blob; most steps along a ray; bisections of the last step
 static const double NEAR = 1e-4;  // depth below which hits do not count
 static const double MISS = 1e30;
 
@@ -14,7 +14,8 @@ typedef struct {
 typedef struct {
   int32_t kind;
   const double *rotation, *size, *waves;
-  double origin[3], columns[3][3];  // of rays in the shape's frame, directions by pixel coordinates
+  // origin of all rays in the shape's frame, and their directions by pixel coordinates
+  double origin[3], columns[3][3];
   double reach, slope;  // upper bounds of the sum of the waves and of its slope
 } shape;
 
@@ -28,8 +29,7 @@ static inline double dot3(const double *a, const double *b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-// The sines of the waves at a point times their amplitudes, summed; their cosines if shifted by a
-// quarter period.
+// Write the sine of each wave at a point times its amplitude, or its cosine if it is shifted by one quarter period.
 static inline void swing(const double *waves, double x, double y, double z, int64_t quarters,
                          double *out) {
   for (int k = 0; k < WAVES; k++) {
@@ -45,7 +45,7 @@ static inline double find_level(const double *waves, const ray *r, double t) {
   return sqrtf8(x * x + y * y + z * z) - 1.0 - ((w[0] + w[1]) + (w[2] + w[3]));
 }
 
-// Entry and exit of a ray between -h and h along one axis.
+// Depths at which a ray enters and leaves the range from -h to h of one axis.
 static inline span cut_slab(double o, double d, double h) {
   if (d == 0.0) return absf8(o) <= h ? (span){-MISS, MISS} : (span){MISS, -MISS};
   double a = (-h - o) / d, b = (h - o) / d;
@@ -68,7 +68,7 @@ static inline double hit_box(const double *s, const ray *r) {
   return near >= NEAR ? near : far;
 }
 
-// Entry and exit of the sphere about the origin.
+// Depths at which a ray enters and leaves a sphere about the origin.
 static inline span cut_sphere(double radius, const ray *r) {
   double a = dot3(r->d, r->d), b = dot3(r->o, r->d), c = dot3(r->o, r->o) - radius * radius;
   double square = b * b - a * c;
@@ -77,7 +77,7 @@ static inline span cut_sphere(double radius, const ray *r) {
   return (span){(-b - root) / a, (-b + root) / a};
 }
 
-// Hit of the side or the ends of a tapered cylinder; x and z are in units of the radius at -y, y in half heights.
+// Depth of the first hit of a tapered cylinder. x and z are in units of the radius at -y, and y in half heights.
 static inline double hit_cone(const double *s, const ray *r) {
   double best = MISS, mean = 0.5 * (1.0 + s[3]), slope = 0.5 * (s[3] - 1.0);
   double ox = r->o[0], oy = r->o[1], oz = r->o[2], dx = r->d[0], dy = r->d[1], dz = r->d[2];
@@ -94,14 +94,15 @@ static inline double hit_cone(const double *s, const ray *r) {
   return best;
 }
 
-// First change of sign of a blob's level between two depths. Steps are so short that they hardly
-// cross the surface; pace bounds the change of the level per unit of depth.
+// Depth between two depths at which the level of a blob first changes its sign. Steps are so short that they hardly
+// cross the surface. The level changes by at most `pace` per unit of depth.
 static double march(const double *waves, double pace, double first, double last, const ray *r) {
   first = maxd(first, NEAR);
   if (!(last > first)) return MISS;
   double least = (last - first) / MARCH, t = first, level = find_level(waves, r, t);
   bool outside = level > 0.0;
-  for (int step = 0; t < last && step < 2 * MARCH; step++) {  // a step may round to zero, so their number is bounded
+  // the number of steps is bounded, because a step may round to zero
+  for (int step = 0; t < last && step < 2 * MARCH; step++) {
     double before = t;
     t = mind(t + maxd(absf8(level) / pace, least), last);
     level = find_level(waves, r, t);

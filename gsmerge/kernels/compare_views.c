@@ -1,19 +1,21 @@
-// Compare pixels of two views: measure how far their photos agree, and find pixels that show the same surface.
+// Compare pixels of two views: measure how well their photos agree, and find pixels that show the same surface.
 //
-// Products that must not be fused with a sum are separate statements.
+// A product that must not be fused with a sum is a statement of its own.
 #include "bilinear.h"
 #include "exp_log.h"
 #include "gaussians/select.h"
 
-enum { MIN_SEEN = 50 };  // pixels that two views must share
+enum { MIN_SEEN = 50 };  // least number of pixels that two views must share
 static const double SAME_DEPTH = 0.15;  // largest difference of the logarithms of two depths of one surface
-// Scale of the robust weights: that many median absolute residuals, and its least value in grey levels, 0 to 1.
+// The scale of the robust weights is DOUBT times the median absolute residual, and at least MIN_DOUBT. Grey levels are
+// from 0 to 1.
 static const double DOUBT = 1.5, MIN_DOUBT = 0.01;
-static const double CLEAR = 0.03;  // residual, grey levels 0 to 1, above which the cost grows only logarithmically
+static const double CLEAR = 0.03;  // a cost grows only logarithmically with residuals above this
 
-typedef struct { double world[3], x, y, z, u, v; } Place;  // point in the world; x / z, y / z and z in a camera; pixel
+// point in the world; its x / z, y / z and z in a camera; its pixel
+typedef struct { double world[3], x, y, z, u, v; } Place;
 
-// Columns of values of the pixels that two views share.
+// Numbers of all pixels that two views share, in columns.
 typedef struct { double *world[3], *x, *y, *z, *right, *down, *residual, *value; int64_t *order; } Columns;
 enum { COLUMNS = 10 };
 
@@ -29,7 +31,7 @@ static inline double dot3(const double *a, const double *b, int step) {
   return sum;
 }
 
-// The place in one camera of a point that is given in the frame of another camera.
+// Where the camera `to` sees a point that is given in the frame of the camera `from`.
 static inline Place place_of(const double *point, const double *from, const double *to, const double *K, double near) {
   Place p;
   double away[3], camera[3];
@@ -52,7 +54,7 @@ static double median_of(const double *values, int64_t *order, int64_t n) {
   return (lower + upper) / 2.0;
 }
 
-// Normal equations of the pose of the second camera, from the columns; `doubt` is the squared scale of the weights.
+// Write the normal equations for the pose of the second camera; `doubt` is the squared scale of the weights.
 static void sum_normal(const Columns *s, const double *viewmat, double doubt, int64_t n, double *restrict curvature,
                        double *restrict slope) {
   for (int k = 0; k < 36; k++) curvature[k] = 0.0;
@@ -114,7 +116,8 @@ API int32_t compare_views(const double *points, const float *greys, const int64_
       continue;
     }
     flows[k] = scale * median_of(s.value, order, m);
-    double middle = median_of(s.residual, order, m), doubt, sum = 0.0;  // the median is a difference in exposure
+    // subtracting the median removes a difference in exposure
+    double middle = median_of(s.residual, order, m), doubt, sum = 0.0;
     for (int64_t i = 0; i < m; i++) {
       s.residual[i] -= middle;
       s.value[i] = absf8(s.residual[i]);
@@ -156,7 +159,7 @@ API int64_t find_surfaces(const float *means, const int64_t *rows, const float *
   return count;
 }
 
-// Add to `sums`, for pixels that a camera shows in the picture [h,w,3], the difference of their colour from it, and 1.
+// Add to `sums`, for pixels that the picture [h,w,3] of a camera shows, the difference of their colour from it, and 1.
 // Points are `start` plus `depths` times `along`, whose rows are columns, rows and depths in that camera.
 API int32_t add_differences(const float *picture, const double *along, const double *start, const double *depths,
                             const float *colors, const int64_t *pixels, float *sums, int64_t h, int64_t w, int64_t n,

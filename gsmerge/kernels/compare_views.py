@@ -1,4 +1,4 @@
-"""Compare pixels of one view with what another view shows."""
+"""Compare the pixels of one view with what another view shows at the same places."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i8, native, u1
 
-SCRATCH_COLUMNS = 10  # values of scratch per pixel
+SCRATCH_COLUMNS = 10  # numbers of scratch for each pixel
 
 
 @native(
@@ -21,23 +21,23 @@ def compare_views(
     points, greys, starts, pairs, viewmats, given, Ks, pictures, depths, near, border, scale, first, last, scratch,
     order, curvatures, slopes, costs, flows,
 ):  # fmt: skip
-    """Compare pixels of one view with the photo of another, for the pairs of views ``first`` to ``last``.
+    """Compare pixels of one view with the photo of another, for the pairs of views from ``first`` to before ``last``.
 
-    Pixels are given as ``points`` in the frame of their camera. The pixels of view i have the rows ``starts[i]`` to
-    ``starts[i + 1]``.
+    A pixel is given by its point in the frame of its camera. The points of view i are the rows from ``starts[i]`` to
+    before ``starts[i + 1]``.
 
     Args:
         greys: For each pair, the grey levels that the second view should show at the pixels of the first.
-        pictures: Grey level, and its derivatives to the right and down; pixels nearer than ``border`` to the edge of a
-            picture are not used.
-        depths: Depths of the Gaussians at the pixels' centres; NaN without any.
-        given: Poses from which ``flows`` are measured.
-        scale: Unit of ``flows`` per pixel.
+        pictures: Grey level, and its derivatives to the right and down. Pixels less than ``border`` from a side of
+            the picture are not used.
+        depths: Depths of the Gaussians at the centres of the pixels; NaN where there are none.
+        given: Poses before any motion, relative to which ``flows`` are measured.
+        scale: Factor from pixels to the unit of ``flows``.
         scratch: ``[SCRATCH_COLUMNS, largest number of pixels of a view]``.
-        curvatures: Written: Gauss-Newton's second derivatives of half the weighted squared differences with respect to
-            a motion of the second camera; ``slopes`` gets the first derivatives.
+        curvatures: Written: second derivatives, by Gauss-Newton, of half the weighted squared differences by a motion
+            of the second camera; ``slopes`` gets the first derivatives.
         costs: Written: mean over the pixels of a robust function of their differences.
-        flows: Written: median distances between the pixels' projections with the present poses and with ``given``.
+        flows: Written: median distance of the pixels' projections with ``viewmats`` from those with ``given``.
     """
 
 
@@ -49,11 +49,11 @@ _find_surfaces = declare(
 
 
 def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
-    """Find the pixels ``rows`` of a view whose surface another view shows too.
+    """Find those pixels, among ``rows`` of a view, whose surface another view shows too.
 
-    ``means`` and ``others`` are the points ``[pixels,3]`` of the pixels of both views. A pixel shows the same surface
-    if the other view's point is ``valid`` and the logarithms of the two depths differ by less than ``same``. Returns
-    the positions of these pixels within ``rows``, and the matching pixels of the other view.
+    ``means`` and ``others`` are the points of all pixels of the two views. Two pixels show the same surface if the
+    other view's point is ``valid``, and the logarithms of both depths differ by less than ``same``. Returns the
+    positions of the pixels within ``rows``, and the matching pixels of the other view.
     """
     ids, places = np.empty((2, len(rows)), np.int64)
     count = _find_surfaces(means, rows, others, valid.view(np.uint8), viewmat, K, width, near, same, ids, places)
@@ -65,8 +65,8 @@ def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
     sums=f4("height", "width", 2, out=True),
 )  # fmt: skip
 def add_differences(picture, along, start, depths, colors, pixels, sums):
-    """Add to ``sums``, for ``pixels`` that a picture shows, the difference of their ``colors`` from it, and 1.
+    """Add to ``sums``, for those ``pixels`` that a picture shows, the difference of their ``colors`` from it, and 1.
 
-    The projections of the points, homogeneous in pixels of the picture, are ``start`` plus ``depths`` times ``along``.
-    The three rows of ``along`` are the changes of column, row and depth.
+    The homogeneous coordinates of the points, in pixels of the picture, are ``start`` plus ``depths`` times ``along``.
+    Their three numbers are column times depth, row times depth, and depth.
     """

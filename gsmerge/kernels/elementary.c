@@ -1,4 +1,4 @@
-// Elementary functions of every number of an array.
+// Apply elementary functions to every number of an array.
 #include "exp_log.h"
 #include "trig.h"
 
@@ -29,7 +29,7 @@ API void log1p_each(const double *restrict values, double *restrict out, int64_t
   for (int64_t i = 0; i < n; i++) out[i] = log1p8(values[i]);
 }
 
-// e^x - 1 = 2^k (e^r - 1) + (2^k - 1) with x = k ln 2 + r: e^r - 1 is Taylor's series, nothing cancels.
+// e^x - 1 = 2^k (e^r - 1) + (2^k - 1) with x = k ln 2 + r. Taylor's series gives e^r - 1, so no digits cancel.
 static inline double expm18(double x) {
   double n = x * 1.4426950408889634;
   n = n < -60.0 ? -60.0 : n;
@@ -42,7 +42,7 @@ static inline double expm18(double x) {
   bits8 power = {.u = (shifted.u - 0x4338000000000000u + 1023u) << 52};
   double result = p * power.f + (power.f - 1.0);
   result = x < -40.0 ? -1.0 : result;
-  result = x > 709.0 ? exp8(x) : result;  // where 2^k - 1 is 2^k
+  result = x > 709.0 ? exp8(x) : result;  // there 2^k - 1 rounds to 2^k
   return x == 0.0 ? x : result;
 }
 
@@ -67,7 +67,7 @@ API void arctan2_each(const double *restrict y, const double *restrict x, double
   for (int64_t i = 0; i < n; i++) out[i] = atan28(y[i], x[i]);
 }
 
-// Bases from 0 on; x^0 = 1 for all x, and x^1 is x itself.
+// Raise bases of at least 0 to powers. x^0 is 1 for all x, and x^1 is x without rounding.
 API void power_each(const double *restrict bases, const double *restrict exponents,
                     double *restrict out, int64_t n) {
   for (int64_t i = 0; i < n; i++) {

@@ -1,9 +1,9 @@
-// exp, log and similar functions within two units of the last place, in plain arithmetic: loops over them vectorise and
-// give the same bits on every processor.
+// Compute exp, log and similar functions, exact up to two units of the last place. They use plain arithmetic, so loops
+// over them vectorise and give the same bits on every processor.
 #pragma once
 #include "native.h"
 
-// e^x in float32; 0 below -104, inf above 89. x = n ln 2 + r, polynomial of Cephes' expf in r.
+// e^x in float32; 0 below -104, inf above 89. With x = n ln 2 + r, the polynomial of Cephes' expf gives e^r.
 static inline float exp4(float x) {
   const float magic = 12582912.f;  // 1.5 * 2^23: adding it rounds to whole numbers
   x = x < -104.f ? -104.f : x;
@@ -18,7 +18,7 @@ static inline float exp4(float x) {
   p = p * r + 1.6666665459e-1f;
   p = p * r + 5.0000001201e-1f;
   p = p * (r * r) + r + 1.f;
-  int32_t power = (int32_t)(shifted.u - 0x4b400000u), half = power >> 1;  // undefined value for NaN
+  int32_t power = (int32_t)(shifted.u - 0x4b400000u), half = power >> 1;  // for NaN this may be any number
   bits4 low = {.u = (uint32_t)(half + 127) << 23}, high = {.u = (uint32_t)(power - half + 127) << 23};
   return p * low.f * high.f;
 }
@@ -46,7 +46,7 @@ static inline float log4(float x) {
   return x >= 0.f ? result : __builtin_nanf("");
 }
 
-// (e^r - 1 - r) / r^2 of Taylor's series to r^13 / 13!, for |r| up to ln(2) / 2.
+// (e^r - 1 - r) / r^2 by Taylor's series up to the term r^13 / 13!, for |r| of at most ln(2) / 2.
 static inline double exp_series(double r) {
   double p = 1.0 / 6227020800.0;
   p = p * r + 1.0 / 479001600.0;
@@ -104,8 +104,8 @@ static inline double log1p8(double x) {
   return x == 0.0 ? x : result;
 }
 
-// log Γ(x) in float64 for x from 0 on, within 1e-14 near its zeros at 1 and 2. Stirling's series from 12 on, below that
-// Γ(x) = Γ(x + 1) / x.
+// log Γ(x) in float64 for x of at least 0, exact up to 1e-14 near its zeros at 1 and 2. From 12 on it is Stirling's
+// series. Below, Γ(x) = Γ(x + 1) / x is used.
 static inline double lgamma8(double x) {
   if (!(x >= 0.0)) return __builtin_nan("");
   if (x > 1e305) return __builtin_inf();
@@ -131,7 +131,7 @@ static inline float erf4(float x) {
   p = p * z - 3.7612447e-1f;
   p = p * z + 1.2837914e-1f;
   p = p * t + t;
-  float u = t < 4.f ? t : 4.f;  // where it is 1 in float32
+  float u = t < 4.f ? t : 4.f;  // from 4 on the function is 1 in float32
   float q = -1.9242520e-4f * u + 3.0085293e-3f;
   q = q * u - 2.2087612e-2f;
   q = q * u + 1.0364027e-1f;

@@ -15,24 +15,24 @@ REMEDY = "run python tasks.py native, or pip install again"
 
 @lru_cache(maxsize=1)
 def load_library() -> ctypes.CDLL:
-    """Return the library of the most advanced target that this processor runs, or of ``GSMERGE_TARGET``.
+    """Return the native library, in the version of the most advanced target that this processor runs.
 
-    ``GSMERGE_NATIVE`` names another folder of libraries. Raises UsageError if no library fits, or if it is missing or
-    older than the sources beside it.
+    The environment variable ``GSMERGE_TARGET`` names another target, and ``GSMERGE_NATIVE`` another folder of
+    libraries. Raises UsageError if no library fits the processor, or if it is missing or older than the sources.
     """
     targets = {target.name: target for target in _runnable_targets()}
     name = os.environ.get("GSMERGE_TARGET") or list(targets)[-1]
     if name not in targets:
         raise UsageError(f"GSMERGE_TARGET: expected {' or '.join(targets)} on this processor, found {name!r}; unset it")
-    return _open(targets[name])
+    return _open_library(targets[name])
 
 
 def _runnable_targets() -> list[Target]:
-    """Return the targets that this processor runs, at least one, with the most advanced last."""
+    """Return the targets that this processor runs, the most advanced one last; UsageError if it runs none."""
     basic, *advanced = find_platform().targets
     if basic.name == "arm64":
         return [basic]
-    library = _open(basic)  # its function that identifies the processor uses only instructions of all processors
+    library = _open_library(basic)  # its function processor_level runs on every processor
     level = library.processor_level()
     if level < 3:
         raise UsageError("expected a processor with AVX2 and FMA (x86-64-v3, from 2013 on), found an older one")
@@ -40,13 +40,14 @@ def _runnable_targets() -> list[Target]:
 
 
 @lru_cache
-def _open(target: Target) -> ctypes.CDLL:
+def _open_library(target: Target) -> ctypes.CDLL:
+    """Load the library of a target; UsageError if it is missing, damaged, or older than the sources."""
     folder = Path(os.environ.get("GSMERGE_NATIVE") or FOLDER)
     path = folder / find_platform().library_name(target)
     try:
         library = ctypes.CDLL(str(path))
         sources_hash = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
-    except (OSError, ValueError) as error:  # ValueError if it is not a library of this package
+    except (OSError, ValueError) as error:  # ValueError if the library is not one of this package
         if is_out_of_memory(error):
             raise MemoryError from error
         if path.exists():

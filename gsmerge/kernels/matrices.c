@@ -1,14 +1,13 @@
-// Products, linear equations and symmetric eigenvalues of float64 matrices, in a fixed order of
-// operations.
+// Multiply float64 matrices, solve linear equations, and find symmetric eigenvalues, in a fixed order of operations.
 //
-// Every element of a product is the fused sum of its terms in their order. Loops run over the columns
-// of a row, so they vectorise without changing a bit.
+// Each element of a product is the fused sum of its terms in their order. Loops run over the columns of a row, so they
+// vectorise without changing a bit.
 #include "native.h"
 
 enum { PANEL = 16 };   // columns that are eliminated together, so that large matrices stay in the caches
-enum { ROWS = 4, COLUMNS = 8 };  // block of a product whose sums stay in registers
+enum { ROWS = 4, COLUMNS = 8 };  // size of a block of a product whose sums stay in registers
 enum { TERMS = 256 };            // terms that are added at a time, so that their part of b stays in the first cache
-enum { SWEEPS = 50 };  // of Jacobi's method at most; it needs about six
+enum { SWEEPS = 50 };  // most sweeps of Jacobi's method, which needs about six
 static const double TINY = 1e-300;
 
 // out[i,k] += a[i,j] b[j,k] over the terms from..to, for a block of rows and columns whose sums stay in registers.
@@ -43,7 +42,7 @@ static inline void multiply_rows(const double *restrict a, const double *restric
   }
 }
 
-// The same for points (three columns), whose sums stay in registers.
+// The same product for points, which have three columns whose sums stay in registers.
 static inline void turn_points(const double *restrict a, const double *restrict b, double *restrict out, int64_t i) {
   for (int64_t row = 0; row < i; row++) {
     double sums[3] = {0.0};
@@ -82,8 +81,8 @@ static inline void take_off(double *restrict a, const double *restrict b, double
   for (int64_t c = 0; c < n; c++) a[c] -= factor * b[c];
 }
 
-// Replaces the columns first..last of a by those of L and U, and brings the rows below and those of b
-// into the order of the pivots; false if a pivot is zero.
+// Replace the columns first..last of a by those of L and U, and bring the rows below, and those of b, into the order of
+// the pivots; return false if a pivot is zero.
 static bool factor_panel(double *a, double *b, int64_t d, int64_t k, int64_t first, int64_t last) {
   for (int64_t c = first; c < last; c++) {
     int64_t best = c;
@@ -106,8 +105,8 @@ static bool factor_panel(double *a, double *b, int64_t d, int64_t k, int64_t fir
   return true;
 }
 
-// Solves a x = b for n matrices of d rows by elimination with pivots chosen by columns; a is
-// overwritten, b becomes x. 1: some matrix is singular.
+// Solve a x = b for n matrices of d rows, by elimination with pivots chosen by columns. Overwrite a, and replace b by
+// x. Return 1 if some matrix is singular, otherwise 0.
 API int32_t solve_equations(double *a, double *b, int64_t n, int64_t d, int64_t k) {
   for (int64_t i = 0; i < n; i++, a += d * d, b += d * k) {
     for (int64_t first = 0; first < d; first += PANEL) {
@@ -127,7 +126,7 @@ API int32_t solve_equations(double *a, double *b, int64_t n, int64_t d, int64_t 
   return 0;
 }
 
-// One rotation of the symmetric a that zeroes a[p][q]; the columns of v are rotated alike.
+// Rotate the symmetric a so that a[p][q] becomes zero, and rotate the columns of v alike.
 static void rotate_pair(double *a, double *v, int64_t d, int64_t p, int64_t q) {
   double off = a[p * d + q];
   if (!(absf8(off) > TINY)) return;
@@ -150,7 +149,7 @@ static void rotate_pair(double *a, double *v, int64_t d, int64_t p, int64_t q) {
   }
 }
 
-// Jacobi's method: n symmetric matrices a become diagonal, the columns of v their eigenvectors.
+// Make n symmetric matrices a diagonal by Jacobi's method, and write their eigenvectors to the columns of v.
 API void diagonalise(double *restrict a, double *restrict v, int64_t n, int64_t d) {
   for (int64_t i = 0; i < n; i++, a += d * d, v += d * d) {
     for (int64_t k = 0; k < d * d; k++) v[k] = k % (d + 1) == 0 ? 1.0 : 0.0;

@@ -1,6 +1,6 @@
-"""Compute with small float64 matrices with equal bits on every processor, which BLAS does not ensure.
+"""Compute with small matrices with the same bits on every processor, which BLAS does not ensure.
 
-Sums are taken in float64. Results are float32 if all arrays are, otherwise float64.
+All sums are taken in float64. Results are float32 if all arrays are float32, otherwise float64.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ Array = np.ndarray[Any, Any]
 NARROW, WIDE = np.dtype(np.float32), np.dtype(np.float64)
 
 
-# b may be one matrix for all
+# b is one matrix for all if m is 1
 _multiply_matrices = declare(
     "multiply_matrices", STATUS, a=f8("n", "i", "j"), b=f8("m", "j", "k"), out=f8("n", "i", "k", out=True)
 )
 
 
-# Replaces b by the solutions and overwrites a. Returns 0, or 1 if a matrix is singular.
+# Overwrites a, and replaces b by the solutions of a x = b. Returns 0, or 1 if a matrix is singular
 _solve_equations = declare("solve_equations", i4(), a=f8("n", "d", "d", out=True), b=f8("n", "d", "k", out=True))
 
 
-# Replaces symmetric matrices by their eigenvalues on the diagonal; writes their eigenvectors to the columns.
+# Replaces symmetric matrices a by diagonal matrices of their eigenvalues; writes the eigenvectors to the columns of v
 _diagonalise = declare("diagonalise", a=f8("n", "d", "d", out=True), v=f8("n", "d", "d", out=True))
 
 
 def _wide(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:
-    """Return arrays in float64, and the type of the result."""
+    """Return arrays as float64, and the type that the result should have."""
     inputs = [np.asarray(array) for array in arrays]
     dtype = NARROW if all(array.dtype == NARROW for array in inputs) else WIDE
     return [array if array.dtype == WIDE else array.astype(WIDE) for array in inputs], dtype
@@ -44,7 +44,7 @@ def matmul(a: ArrayLike, b: ArrayLike) -> Array:
     left_is_vector, right_is_vector = left.ndim == 1, right.ndim == 1
     left, right = left[None] if left_is_vector else left, right[:, None] if right_is_vector else right
     lead = left.shape[:-2]
-    if right.ndim == 2:  # one matrix for all, so all rows of the left are treated as one matrix
+    if right.ndim == 2:  # it is multiplied by all matrices on the left, which then form a single tall matrix
         first, second = left.reshape(1, math.prod(left.shape[:-1]), left.shape[-1]), right[None]
     else:
         if lead != right.shape[:-2]:
@@ -59,9 +59,9 @@ def matmul(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def solve(a: ArrayLike, b: ArrayLike) -> Array:
-    """Solve ``a x = b`` for matrices ``[...,d,d]`` and right sides ``[...,d,k]``, or one ``[d]``.
+    """Solve ``a x = b`` for matrices ``a [...,d,d]`` and right sides ``b [...,d,k]`` or one ``b [d]``; return x.
 
-    Raises numpy.linalg.LinAlgError where a matrix is singular.
+    Raises numpy.linalg.LinAlgError if a matrix is singular.
     """
     (left, right), dtype = _wide(a, b)
     if right.ndim == 1:
@@ -75,13 +75,13 @@ def solve(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def invert(matrices: ArrayLike) -> Array:
-    """Invert matrices ``[...,d,d]``; numpy.linalg.LinAlgError where one is singular."""
+    """Return the inverses of matrices ``[...,d,d]``; numpy.linalg.LinAlgError if one is singular."""
     matrices = np.asarray(matrices)
     return solve(matrices, np.eye(matrices.shape[-1], dtype=matrices.dtype))
 
 
 def eigh(matrices: ArrayLike) -> tuple[Array, Array]:
-    """Return the ascending eigenvalues ``[...,d]`` of symmetric matrices, and eigenvectors as columns ``[...,d,d]``."""
+    """Return eigenvalues ``[...,d]`` of symmetric matrices, ascending, and eigenvectors as columns ``[...,d,d]``."""
     (wide,), dtype = _wide(matrices)
     size = wide.shape[-1]
     work = wide.reshape(math.prod(wide.shape[:-2]), size, size).copy()
@@ -95,7 +95,7 @@ def eigh(matrices: ArrayLike) -> tuple[Array, Array]:
 
 
 def transform(matrices: ArrayLike, vectors: ArrayLike) -> Array:
-    """Multiply matrices ``[n,i,j]`` and vectors ``[n,j]``, one to one."""
+    """Multiply each of ``matrices [n,i,j]`` by the vector of the same number of ``vectors [n,j]``."""
     return matmul(matrices, np.asarray(vectors)[..., None])[..., 0]
 
 
@@ -118,7 +118,7 @@ def determinant(matrices: ArrayLike) -> Array:
 
 
 def closest_rotation(matrix: ArrayLike) -> Array:
-    """Return the rotation R ``[3,3]`` nearest to a matrix by least squares; it has the largest trace of ``R^T matrix``.
+    """Return the rotation R ``[3,3]`` nearest to a matrix by least squares, which maximises the trace of R^T matrix.
 
     R is made from a quaternion, which is an eigenvector (Horn 1987), so it is never a reflection.
     """

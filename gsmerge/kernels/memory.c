@@ -1,4 +1,4 @@
-// The three functions that a compiler may call in place of a loop or an assignment, since no C library is linked.
+// Define the three functions that a compiler may call in place of a loop or an assignment. No C library is linked.
 #include <stddef.h>
 #if defined(__clang__)
 #define PLAIN __attribute__((no_builtin))

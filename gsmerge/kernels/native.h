@@ -1,6 +1,6 @@
-// Shared by all files: vectors of sixteen floats, clamping, and exp and log with equal bits on every processor.
+// Definitions that all files share: vectors of sixteen floats, sums over their lanes, and clamping.
 //
-// Sums over lanes have a fixed order. Functions of the C library are not used, because their last bit differs.
+// Sums over lanes have a fixed order. Functions of the C library are not used, because their last bits differ.
 #pragma once
 #include <stdbool.h>
 #include <stdint.h>
@@ -14,7 +14,7 @@
 #define INLINE static inline __attribute__((always_inline))
 
 enum { LANES = 16 };
-enum { OUTSIDE = 1 };  // status of a function that met an index outside its array; 0 otherwise
+enum { OUTSIDE = 1 };  // what a function returns that met an index outside its array; otherwise it returns 0
 typedef float v16f __attribute__((vector_size(64), aligned(4)));
 typedef float v8f __attribute__((vector_size(32), aligned(4)));
 typedef float v4f __attribute__((vector_size(16), aligned(4)));
@@ -42,7 +42,7 @@ static inline void store8(float *p, v8f v) { *(v8f *)p = v; }
 
 static inline v16f join8(v8f a, v8f b) { return PICK(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
 
-// The sum of sixteen lanes, halves first.
+// The sum of sixteen lanes: first the two halves are added, then the halves of the result, and so on.
 static inline float total(v16f v) {
   v8f a = PICK(v, v, 0, 1, 2, 3, 4, 5, 6, 7) + PICK(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
   v4f b = PICK(a, a, 0, 1, 2, 3) + PICK(a, a, 4, 5, 6, 7);
@@ -50,7 +50,8 @@ static inline float total(v16f v) {
   return c[0] + c[1];
 }
 
-// The two halves of every group of eight, four or two lanes added; the second vector's follow the first's per block.
+// Add the two halves of each block of sixteen, eight or four lanes. In each block of the result, the sums of the first
+// vector come before those of the second.
 static inline v16f add_halves8(v16f a, v16f b) {
   return PICK(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
       + PICK(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
@@ -64,7 +65,7 @@ static inline v16f add_halves2(v16f a, v16f b) {
       + PICK(a, b, 2, 3, 6, 7, 10, 11, 14, 15, 18, 19, 22, 23, 26, 27, 30, 31);
 }
 
-// The sums over the lanes of eight vectors, in the order of total(), as a tree that halves all at once.
+// The sums of the lanes of eight vectors, each in the order of total(). All vectors are halved at once.
 static inline v8f totals(const v16f v[8]) {
   v16f a = add_halves4(add_halves8(v[0], v[1]), add_halves8(v[2], v[3]));
   v16f b = add_halves4(add_halves8(v[4], v[5]), add_halves8(v[6], v[7])), c = add_halves2(a, b);
@@ -78,13 +79,13 @@ static inline double maxd(double a, double b) { return a > b ? a : b; }
 static inline int64_t mini(int64_t a, int64_t b) { return a < b ? a : b; }
 static inline int64_t maxi(int64_t a, int64_t b) { return a > b ? a : b; }
 
-// A float clamped between two whole numbers, as an integer; NaN gives the lower one.
+// Clamp a float between two whole numbers, and return it as an integer; NaN gives the lower number.
 static inline int32_t whole(float x, float low, float high) {
   x = x > low ? x : low;
   return (int32_t)(x < high ? x : high);
 }
 
-// Whether one of m indices is outside an array of n.
+// True if one of m indices is outside an array of n.
 static inline bool any_outside(const int32_t *ids, int64_t m, int64_t n) {
   uint32_t most = 0;  // as unsigned numbers negative indices are above all others
   for (int64_t i = 0; i < m; i++) most = (uint32_t)ids[i] > most ? (uint32_t)ids[i] : most;

@@ -2,11 +2,11 @@
 #include "exp_log.h"
 
 enum { LOOKS = 10, MOST_COLUMNS = 64 };  // columns before the harmonics, and most columns
-enum { BLOCK = 256 };                    // rows that are packed column by column, in loops that vectorise
+enum { BLOCK = 256 };                    // number of rows that are packed column by column, in loops that vectorise
 
-typedef int32_t column[BLOCK + 1];  // the number of the row before a block, then those of its rows
+typedef int32_t column[BLOCK + 1];  // a number of the row before a block, then the numbers of its rows
 
-// Rounds halves to even numbers.
+// The nearest whole number; halves are rounded to even numbers.
 static inline double nearest(double x) {
   const double magic = 6755399441055744.0;  // 1.5 * 2^52
   return (x + magic) - magic;
@@ -19,13 +19,13 @@ static inline int32_t to_byte(double x) {
   return (int32_t)(x < 255.0 ? x : 255.0);
 }
 
-// The difference of a number from the one before, with the sign in the lowest bit.
+// The difference of a number from the number before, with the sign in the lowest bit.
 static inline uint32_t step_from(int32_t before, int32_t now) {
   uint32_t by = (uint32_t)now - (uint32_t)before;
   return (by << 1) ^ (by >> 31 ? UINT32_MAX : 0);
 }
 
-// Writes the differences of a row from the one before.
+// Write the differences of a row from the row before, which it replaces.
 static inline void put(const int32_t *row, int32_t *before, uint32_t *out, int64_t i, int64_t m, int64_t columns) {
   for (int64_t c = 0; c < columns; c++) {
     out[c * m + i] = step_from(before[c], row[c]);
@@ -40,7 +40,7 @@ static inline void gather(const int64_t *restrict rows, const float *restrict va
   for (int64_t i = 0; i < count; i++) out[i] = values[width * rows[i]];
 }
 
-// Products and sums are separate statements, so that they are rounded as in NumPy.
+// Pack opacities. Products and sums are separate statements, so that they are rounded as in NumPy.
 static void pack_opacities(const double *restrict opacities, int32_t step, int64_t count, int32_t *restrict out) {
   for (int64_t i = 0; i < count; i++) {
     double opacity = 255.0 * opacities[i];
@@ -93,7 +93,7 @@ static void pack_harmonics(const double *restrict values, int32_t step, int64_t 
   }
 }
 
-// Writes the differences of a column from row to row, and keeps its last row for the next block.
+// Write the differences of a column from row to row, and keep its last number for the next block.
 static void put_column(int32_t *restrict numbers, int64_t count, uint32_t *restrict out) {
   for (int64_t i = 0; i < count; i++) out[i] = step_from(numbers[i], numbers[1 + i]);
   numbers[0] = numbers[count];
@@ -117,7 +117,7 @@ API int32_t pack_looks(const int64_t *rows, const float *opacities, const float 
       gather(block, scales + c, 3, count, values);
       pack_scales(values, steps[2], count, looks[4 + c] + 1);
     }
-    for (int64_t i = 1; i <= count; i++) {  // as differences from green, with which they are highly correlated
+    for (int64_t i = 1; i <= count; i++) {  // red and blue are stored as differences from green, which are small
       looks[1][i] -= looks[2][i];
       looks[3][i] -= looks[2][i];
     }

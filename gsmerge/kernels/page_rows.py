@@ -1,10 +1,13 @@
-"""Pack Gaussians as whole numbers for a page: differences from the row before, with the sign in the lowest bit."""
+"""Pack Gaussians as whole numbers for a page.
+
+Each number is stored as the difference from the row before, with the sign in the lowest bit.
+"""
 
 from __future__ import annotations
 
 from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u4
 
-LOOKS = 10  # columns before the harmonics
+LOOKS = 10  # number of columns before those of the harmonics
 
 
 @native(
@@ -13,16 +16,16 @@ LOOKS = 10  # columns before the harmonics
     out=u4("columns", "m", out=True),
 )  # fmt: skip
 def pack_looks(rows, opacities, sh0, scales, quats, shN, sh_scale, color_scale, steps, levels, out):
-    """Pack the appearance of the Gaussians ``rows``, as the numbers of a ``.spz`` in coarser steps.
+    """Pack the appearance of the Gaussians ``rows`` into the numbers that a ``.spz`` has, but in coarser steps.
 
     Args:
         sh_scale: Factor from ``sh0`` to colours.
-        color_scale: Scale of colours in a ``.spz``.
-        steps: ``[3]`` int32 steps of opacities, colours and log scales.
-        levels: Factor of rotations. A rotation is stored as its axis times the tangent of a quarter of its angle, from
-            -1 to 1, times this factor.
-        out: Columns of opacity, red minus green, green, blue minus green, log scales and rotation. The remaining
-            columns are harmonics.
+        color_scale: Scale of the colours in a ``.spz``.
+        steps: ``[3]`` int32 sizes of the steps of opacities, colours and log scales.
+        levels: Number of steps of rotations from 0 to 1. A rotation is stored as its axis times the tangent of a
+            quarter of its angle, from -1 to 1.
+        out: Written: columns of opacity, red minus green, green, blue minus green, three log scales and three numbers
+            of the rotation. The remaining columns are harmonics.
     """
 
 
@@ -32,13 +35,13 @@ def pack_looks(rows, opacities, sh0, scales, quats, shN, sh_scale, color_scale, 
     out=u4(4, "m", out=True),
 )  # fmt: skip
 def pack_pixels(rows, ids, means, viewmats, Ks, width, height, pixel_parts, depth_parts, out):
-    """Pack positions of Gaussians relative to their pixels, up to the first row that is not in front of its camera.
+    """Pack the positions of the Gaussians ``rows`` relative to their pixels, and return the number of packed rows.
 
-    Returns the number of packed rows.
+    The first row that is not in front of its camera ends the packing.
 
     Args:
-        ids: ``[n]`` int64 pixels of the rows, among all pixels of all views.
+        ids: ``[n]`` int64 pixels of all Gaussians, counted through all views.
         pixel_parts: Number of steps per pixel.
         depth_parts: Number of steps per unit of the logarithm of a depth.
-        out: Columns of id, shifts right and down from the centre of the pixel, and log depth.
+        out: Written: columns of the pixel, of the shifts right and down from its centre, and of the log depth.
     """

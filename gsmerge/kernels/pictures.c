@@ -1,7 +1,7 @@
-// Filter and sample float32 pictures, channels last.
+// Filter and sample float32 pictures [height,width,channels].
 #include "bilinear.h"
 
-// Place of index i in a row of n that is mirrored at both ends without repeating them.
+// The pixel at index i of a row of n pixels, which is mirrored at both ends without repeating the last pixel.
 static inline int64_t mirrored(int64_t i, int64_t n) {
   while (i < 0 || i >= n) {
     i = i < 0 ? -i : 2 * (n - 1) - i;
@@ -10,7 +10,7 @@ static inline int64_t mirrored(int64_t i, int64_t n) {
   return i;
 }
 
-// to[i] = sum of taps[t] from[i + t stride], thirty-two values at a time, so that sums stay in registers.
+// Write to[i] = sum of taps[t] from[i + t stride], thirty-two values at a time, so that sums stay in registers.
 static void weigh(const float *restrict from, const float *restrict taps, int64_t count,
                   int64_t stride, float *restrict to, int64_t n) {
   int64_t i = 0;
@@ -30,9 +30,8 @@ static void weigh(const float *restrict from, const float *restrict taps, int64_
   }
 }
 
-// Convolves a picture [height,width,channels] with a filter along its rows and another along its
-// columns; both have odd lengths. `padded` holds a row with mirrored ends; `rows` holds the result of
-// the first filter, with mirrored rows above and below.
+// Convolve a picture with a filter along its rows and another along its columns, both of odd lengths. `padded` is room
+// for a row with mirrored ends, and `rows` for the result of the first filter, with mirrored rows above and below.
 API int32_t filter_picture(const float *restrict picture, const float *restrict across,
                            const float *restrict down, float *restrict padded,
                            float *restrict rows, float *restrict out, int64_t height,
@@ -58,7 +57,7 @@ API int32_t filter_picture(const float *restrict picture, const float *restrict 
   return 0;
 }
 
-// Samples a picture bilinearly at (x, y) in pixels; whole numbers are the centres of pixels.
+// Interpolate a picture bilinearly at (x, y) in pixels; the centres of pixels are at whole numbers.
 API int32_t sample_picture(const float *restrict picture, const float *restrict x,
                            const float *restrict y, float *restrict out, int64_t height,
                            int64_t width, int64_t channels, int64_t n) {
@@ -68,10 +67,10 @@ API int32_t sample_picture(const float *restrict picture, const float *restrict 
   return 0;
 }
 
-enum { PLANES = 4 };  // of windows: means of x, y, x x + y y and x y
+enum { PLANES = 4 };  // means over a window: of x, y, x x + y y and x y
 
-// The numbers of a row of both pictures, whose means the windows need. Products are separate statements, so that each is
-// rounded by itself.
+// Write the numbers of a row of both pictures whose means over windows are needed. Products are separate statements, so
+// that each is rounded by itself.
 static void multiply_row(const float *restrict x, const float *restrict y, float *restrict squares,
                          float *restrict products, int64_t n) {
   for (int64_t i = 0; i < n; i++) {
@@ -81,13 +80,13 @@ static void multiply_row(const float *restrict x, const float *restrict y, float
   }
 }
 
-// Similarities of the windows of a row, from their means.
+// Write the similarities of the windows of a row, from their means.
 static void compare_row(const float *restrict means, float c1, float c2, float *restrict out, int64_t n) {
   for (int64_t i = 0; i < n; i++) {
     float ux = means[i], uy = means[n + i], uxx = ux * ux, uyy = uy * uy, uxy = ux * uy;
     float variances = means[2 * n + i] - uxx, covariance = means[3 * n + i] - uxy;
     variances = variances - uyy;
-    ux = ux + 0.5f, uy = uy + 0.5f;  // pictures are centred
+    ux = ux + 0.5f, uy = uy + 0.5f;  // because the pictures are centred at 0
     float twice = 2.f * ux, mean = twice * uy, related = 2.f * covariance;
     float over = mean + c1, by = related + c2, above = over * by;
     float xx = ux * ux, yy = uy * uy, lengths = xx + yy;

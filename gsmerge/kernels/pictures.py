@@ -1,4 +1,4 @@
-"""Filter and sample pictures with equal bits on every processor, which OpenCV does not ensure for these operations."""
+"""Filter and sample pictures with the same bits on every processor, which OpenCV's functions do not ensure."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.signature import STATUS, declare, f4
 
-SLOPE, SMOOTH = np.array([-1, 0, 1], np.float32), np.array([1, 2, 1], np.float32)  # Sobel's filters
+SLOPE, SMOOTH = np.array([-1, 0, 1], np.float32), np.array([1, 2, 1], np.float32)  # the two parts of Sobel's filter
 Picture = np.ndarray[Any, Any]
-ORIENTATIONS = 8  # of a picture, as in EXIF tags: four quarter turns, and four of the mirror image
+ORIENTATIONS = 8  # number of orientations of a picture, as in EXIF tags: four rotations, also of the mirror image
 
 
 _filter_picture = declare(
@@ -37,10 +37,10 @@ _sample_picture = declare(
 
 
 def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
-    """Convolve a picture ``[h,w]`` or ``[h,w,c]`` with two filters of odd lengths, mirrored at its borders; float32.
+    """Convolve a picture ``[h,w]`` or ``[h,w,c]`` with two filters of odd lengths; return it as float32.
 
-    ``across`` filters along the rows, and ``down`` filters along the columns. Mirroring does not repeat the border
-    pixels.
+    ``across`` filters along the rows, and ``down`` filters along the columns. Outside of its borders the picture is
+    mirrored, without repeating the border pixels.
     """
     source: Picture = np.ascontiguousarray(picture, np.float32)
     layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
@@ -53,28 +53,29 @@ def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
 
 
 def blur(picture: Picture, sigma: float, size: int | None = None) -> Picture:
-    """Blur a picture ``[h,w]`` or ``[h,w,c]`` by a Gaussian of ``sigma`` pixels; float32.
+    """Blur a picture ``[h,w]`` or ``[h,w,c]`` by a Gaussian of ``sigma`` pixels; return it as float32.
 
-    ``size`` is the odd number of pixels of the filter, by default all pixels within four ``sigma``.
+    The filter has an odd number ``size`` of pixels, by default all those within four ``sigma``.
     """
     taps = _gaussian_taps(sigma, round(8 * sigma + 1) | 1 if size is None else size)
     return convolve(picture, taps, taps)
 
 
 def _gaussian_taps(sigma: float, size: int) -> np.ndarray:
-    """Return the weights ``[size]`` of a Gaussian of ``sigma`` pixels, in an odd number of pixels."""
+    """Return the weights ``[size]`` of a Gaussian of ``sigma`` pixels, whose sum is 1; ``size`` is odd."""
     offsets = np.arange(size) - size // 2
     weights = exp(offsets**2 * (-0.5 / sigma**2))
     return weights / weights.sum()
 
 
 def compare_windows(first: Picture, second: Picture, sigma: float, size: int, c1: float, c2: float) -> Picture:
-    """Return the similarity (SSIM) of each Gaussian window of two pictures ``[h,w,c]`` in [0, 1]; float32.
+    """Return the structural similarity (SSIM) of two pictures ``[h,w,c]`` in [0, 1] within each window.
 
-    Windows have ``size`` pixels per side and a ``sigma`` in pixels. Those that lie inside the pictures are compared,
-    ``[h-size+1,w-size+1,c]``. ``c1`` and ``c2`` stabilise quotients of means and of variances.
+    The weights of a window of ``size`` pixels per side are a Gaussian of ``sigma`` pixels. The result is float32 of
+    shape ``[h-size+1,w-size+1,c]``, because only windows inside the pictures are compared. ``c1`` and ``c2`` are the
+    constants that stabilise the quotients of means and of variances.
     """
-    # Variances are small differences of large numbers. With centred values float32 is exact enough.
+    # Variances are small differences of large numbers, for which float32 is exact enough if values are centred at 0
     x, y = (np.ascontiguousarray(picture, np.float32) - np.float32(0.5) for picture in (first, second))
     (height, width, channels), inner_width = x.shape, x.shape[1] - size + 1
     row, across = np.empty(2 * width * channels, np.float32), np.empty((4, height, inner_width, channels), np.float32)
@@ -85,14 +86,15 @@ def compare_windows(first: Picture, second: Picture, sigma: float, size: int, c1
 
 
 def sobel(picture: Picture) -> tuple[Picture, Picture]:
-    """Compute Sobel's derivatives of a picture to the right and down: float32, eight times the change per pixel."""
+    """Return Sobel's derivatives of a picture to the right and down as float32: eight times the change per pixel."""
     return convolve(picture, SLOPE, SMOOTH), convolve(picture, SMOOTH, SLOPE)
 
 
 def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
-    """Sample a picture ``[h,w]`` or ``[h,w,c]`` bilinearly: float32 of shape ``[...,c]``.
+    """Return the values ``[...,c]`` float32 of a picture ``[h,w]`` or ``[h,w,c]`` at points, interpolated bilinearly.
 
-    ``x`` and ``y [...]`` are in pixels, with the top-left pixel's centre at (0, 0). Border pixels are repeated outside.
+    ``x [...]`` and ``y [...]`` are in pixels, with the centre of the top-left pixel at (0, 0). Outside of the picture,
+    its border pixels are repeated.
     """
     source: Picture = np.ascontiguousarray(picture, np.float32)
     layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
@@ -103,9 +105,9 @@ def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
 
 
 def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False) -> Picture:
-    """Resize a picture ``[h,w]`` or ``[h,w,c]`` to a larger size in pixels by cubic convolution; float32.
+    """Return a picture ``[h,w]`` or ``[h,w,c]`` in a larger size, as float32, by cubic convolution.
 
-    Border pixels are repeated outside. If ``periodic``, the picture itself is repeated.
+    Outside of the picture, its border pixels are repeated, or the whole picture if ``periodic`` is true.
     """
     out: Picture = np.asarray(picture, np.float32)
     for axis, size in ((0, height), (1, width)):
@@ -120,28 +122,28 @@ def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False
 def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
     """Return the indices ``[4,new]`` of the four old pixels around each new pixel, and their weights ``[4,new]``.
 
-    A line of ``old`` pixels is enlarged to ``new`` pixels. Indices at its ends may lie outside, below 0 or above.
+    A line of ``old`` pixels is enlarged to ``new`` pixels. At its ends, indices may be below 0 or above the last pixel.
     """
-    centres = (np.arange(new) + 0.5) * (old / new) - 0.5  # of the new pixels, in old pixels
+    centres = (np.arange(new) + 0.5) * (old / new) - 0.5  # centres of the new pixels, in old pixels
     floors, taps = np.floor(centres).astype(np.int64), np.arange(-1, 3)[:, None]
     distances = np.abs(centres - floors - taps)
-    a = -0.75  # slope parameter of the cubic convolution (Keys 1981), OpenCV's
+    a = -0.75  # slope parameter of the cubic convolution (Keys 1981), the same as in OpenCV
     inner = ((a + 2) * distances - (a + 3)) * distances * distances + 1
     outer = ((a * distances - 5 * a) * distances + 8 * a) * distances - 4 * a
     return floors + taps, np.where(distances <= 1, inner, outer).astype(np.float32)
 
 
 def turn_picture(picture: Picture, orientation: int) -> Picture:
-    """Bring a stored picture ``[h,w,...]`` into its ``orientation``, 0 to 7.
+    """Turn a stored picture ``[h,w,...]`` as its ``orientation`` from 0 to 7 says.
 
-    From 4 on the picture is first mirrored left to right. It is then turned counterclockwise by ``orientation % 4``
-    quarters.
+    For 4 to 7 the picture is first mirrored left to right. Then it is rotated counterclockwise by ``orientation % 4``
+    quarter turns.
     """
     return np.rot90(picture[:, ::-1] if is_mirrored(orientation) else picture, orientation % (ORIENTATIONS // 2))
 
 
 def is_mirrored(orientation: int) -> bool:
-    """Return True if an orientation mirrors pictures."""
+    """Return true if an orientation mirrors pictures."""
     return orientation >= ORIENTATIONS // 2
 
 
@@ -152,10 +154,10 @@ def turn_back(picture: Picture, orientation: int) -> Picture:
 
 
 def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:
-    """Count the lines of one colour at each border of a picture ``[h,w,c]``: above, below, left and right.
+    """Return the widths, in pixels, of the bars at the borders of a picture ``[h,w,c]``: above, below, left and right.
 
-    Such lines form a bar, whose values all lie within ``spread``. A bar that reaches the middle of the picture has a
-    count of 0.
+    A bar is of one colour, so its values differ by at most ``spread``. If it reaches the middle of the picture, it is
+    no bar, and its width is 0.
     """
     counts = []
     for lines in (image, image[::-1], image.swapaxes(0, 1), image.swapaxes(0, 1)[::-1]):

@@ -1,4 +1,4 @@
-// Report the sources of the library, and the level of the processor.
+// Tell of which sources the library was made, and what level the processor has.
 #include "native.h"
 
 // Hash of the sources that the library was made of.
@@ -9,7 +9,8 @@ static inline void ask(uint32_t leaf, uint32_t *a, uint32_t *b, uint32_t *c, uin
   __asm__ volatile("cpuid" : "=a"(*a), "=b"(*b), "=c"(*c), "=d"(*d) : "a"(leaf), "c"(0));
 }
 
-// The processor's level of x86-64: 4 (AVX-512), 3 (AVX2 and FMA), or 0. Uses only instructions of all processors.
+// The level of the processor in x86-64: 4 (AVX-512), 3 (AVX2 and FMA), or 0 for less. This function uses only
+// instructions that all processors have.
 __attribute__((target("arch=x86-64"))) API int32_t processor_level(void) {
   const uint32_t fma = 1u << 12, movbe = 1u << 22, osxsave = 1u << 27, avx = 1u << 28, f16c = 1u << 29;
   const uint32_t bmi1 = 1u << 3, avx2 = 1u << 5, bmi2 = 1u << 8;

@@ -1,7 +1,7 @@
-// Project points into views: measure distances from their pixels, and mark pixels.
+// Project points into views, to measure how far they are from their pixels, or to find which views see them.
 #include "native.h"
 
-// Rows of a matrix times a vector, in the order of multiply_matrices.
+// A row of a matrix times a vector, in the order of multiply_matrices.
 static inline double row_times(const double *row, const double *v) {
   double sum = 0.0;
   for (int t = 0; t < 3; t++) sum += v[t] * row[t];
@@ -17,13 +17,14 @@ API int32_t pixel_errors(const double *points, const int64_t *views, const doubl
     for (int c = 0; c < 3; c++) camera[c] = row_times(viewmat + 4 * c, points + 3 * i) + viewmat[4 * c + 3];
     for (int c = 0; c < 3; c++) image[c] = row_times(K + 3 * c, camera);
     double x = image[0] / image[2] - pixels[2 * i], y = image[1] / image[2] - pixels[2 * i + 1];
-    double xx = x * x, yy = y * y, error = sqrtf8(xx + yy);  // separate products are not fused with the sum
+    // products in statements of their own are not fused with the sum
+    double xx = x * x, yy = y * y, error = sqrtf8(xx + yy);
     errors[i] = camera[2] > 0.0 && error < __builtin_inf() ? error : __builtin_inf();
   }
   return 0;
 }
 
-// Project a point into a camera: its place, pixels, and its depth. Return 1 if it is inside the image, otherwise 0.
+// Project a point into a camera, and write its pixel and its depth. Return 1 if it is inside the image, otherwise 0.
 static inline int show(const double point[3], const double *viewmat, const double *K, int64_t width, int64_t height,
                        double place[3]) {
   double camera[3], image[3];
@@ -36,7 +37,7 @@ static inline int show(const double point[3], const double *viewmat, const doubl
   return 1;
 }
 
-enum { BLOCK = 64 };  // points that are projected together, in loops that vectorise
+enum { BLOCK = 64 };  // number of points that are projected together, in loops that vectorise
 
 API void mark_pixels(const double *points, const double *viewmat, const double *K, double near, uint8_t *hit, int64_t n,
                      int64_t height, int64_t width) {
@@ -57,8 +58,8 @@ API void mark_pixels(const double *points, const double *viewmat, const double *
   }
 }
 
-// For each of v cameras, mark which of n points are inside its picture, farther than `near`, and which of these are seen:
-// at most `behind` times as far as the depth of their cell in a grid of lines and columns over the picture.
+// For each of v cameras, mark which of n points are inside its picture, farther than `near`, and which of these are
+// seen: at most `behind` times as far as the depth of their cell in a grid of lines and columns over the picture.
 API void see_points(const double *points, const double *viewmats, const double *Ks, const double *depths, double width,
                     double height, double near, double behind, uint8_t *inside, uint8_t *seen, int64_t n, int64_t v,
                     int64_t lines, int64_t columns) {
@@ -100,7 +101,8 @@ API int64_t follow_pixels(const float *points, const double *viewmats, const dou
       for (; at > 0 && keys[at - 1] < key; at--) keys[at] = keys[at - 1], views[at] = views[at - 1];
       keys[at] = key, views[at] = (int32_t)view;
     }
-    for (int64_t k = 0; k < count; k++) {  // largest key first, so that no key follows another one of the same point
+    // the largest key comes first, so that no key follows another key of the same point
+    for (int64_t k = 0; k < count; k++) {
       int64_t low = 0, high = length;
       while (low < high) {
         int64_t middle = (low + high) / 2;

@@ -1,4 +1,4 @@
-"""Project points into views: measure distances from their pixels, and mark pixels."""
+"""Project points into views, to measure how far they are from their pixels, or to find which views see them."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8, na
     errors=f8("n", out=True),
 )  # fmt: skip
 def pixel_errors(points, views, viewmats, Ks, pixels, errors):
-    """Write the distances, pixels, between each point's projection into its view and its pixel.
+    """Write to ``errors`` the distance, in pixels, of each point's projection into its view from its pixel.
 
-    They are inf for points behind the camera.
+    It is inf if the point is behind the camera.
     """
 
 
 @native(points=f8("n", 3), viewmat=f8(4, 4), K=f8(3, 3), near=f8(), hit=u1("height", "width", out=True))
 def mark_pixels(points, viewmat, K, near, hit):
-    """Write 1 to the pixels of a view in which points beyond the depth ``near`` lie; other pixels stay unchanged."""
+    """Write 1 to the pixels of ``hit`` in which points beyond the depth ``near`` lie; leave the others unchanged."""
 
 
 _see_points = declare(
@@ -31,10 +31,10 @@ _see_points = declare(
 
 
 def see_points(points, viewmats, Ks, depths, width, height, near, behind):
-    """Return two masks ``[v,n]`` of points ``[n,3]``: inside the picture of each camera, and seen by each camera.
+    """Return two masks ``[v,n]`` of ``points [n,3]``: those inside the picture of each camera, and those that it sees.
 
-    Points inside lie farther than ``near``. Points are seen if they lie at most ``behind`` times as far as the depth of
-    their cell, in a grid ``depths [v,lines,columns]`` over the picture.
+    A point is inside only if its depth is more than ``near``. It is seen if its depth is at most ``behind`` times the
+    depth of the surface in its cell. ``depths [v,lines,columns]`` are the depths in a grid of cells over each picture.
     """
     inside, seen = np.empty((2, len(viewmats), len(points)), bool)
     masks = inside.view(np.uint8), seen.view(np.uint8)
@@ -48,11 +48,11 @@ def see_points(points, viewmats, Ks, depths, width, height, near, behind):
     views=i4("v", out=True), width=i8(least=1), height=i8(least=1), mixed=i4(least=0, most=1),
 )  # fmt: skip
 def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, width, height, mixed):
-    """Write the pixel of each point, -1 for none, so that as many points as possible are in the order of the pixels.
+    """Write to ``ids`` the pixel of each point, so that as many points as possible are in the order of the pixels.
 
-    Pixels are ordered by view, then by line. If ``mixed``, they are ordered by line and column, and the views of a
-    pixel follow each other. Returns the number of points with a pixel. Arrays after ``ids`` are scratch; ``before`` has
-    n·v values.
+    Pixels are ordered by view and then by line. If ``mixed`` is 1, they are ordered by line and column, and the same
+    pixels of all views follow each other. A point without a pixel gets -1. Returns the number of points with a pixel.
+    The arrays from ``tails`` to ``views`` are scratch, of which ``before`` has n·v values.
     """
 
 
@@ -61,9 +61,10 @@ def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, w
     residuals=f8("rows", out=True),
 )  # fmt: skip
 def linearise(points, pixels, K, pose, jacobian, residuals):
-    """Write the projection errors of a view's points, and their derivatives by motions of the camera.
+    """Write how far a view's points are projected from their pixels, and the derivatives of that by camera parameters.
 
-    ``residuals [2n]`` are the errors to the right of all points, then the errors downwards. The columns of ``jacobian
-    [2n,6+f]`` are rotation and shift of the camera, and f intrinsics: with f = 1 the logarithm of the focal length,
-    with f = 2 the logarithms of both focal lengths, with f = 4 also the principal point.
+    ``residuals [2n]`` are the errors of all points to the right, then those downwards. The columns of ``jacobian
+    [2n,6+f]`` are derivatives by the rotation and the shift of the camera, and by f intrinsics. With f = 1 this is the
+    logarithm of the focal length, with f = 2 these are those of both focal lengths, and with f = 4 also the principal
+    point.
     """

@@ -1,11 +1,13 @@
 """Declare functions of the native library, and check their arguments, so that C code accesses only valid memory.
 
+For example,
+
     @native(values=f4("n"), ids=i4("m", least=0, below="n"), out=f4("m", out=True))
     def take(values, ids, out):
         \"\"\"Write the values at the ids.\"\"\"
 
-calls ``void take(const float *values, const int32_t *ids, float *out, int64_t n, int64_t m)``. The arguments are passed
-in their order, followed by the named sizes in the order of their first appearance.
+declares ``void take(const float *values, const int32_t *ids, float *out, int64_t n, int64_t m)``. A call passes the
+arguments in their order, and then the named sizes in the order in which they first appear.
 """
 
 from __future__ import annotations
@@ -27,24 +29,25 @@ _CODES = {
     "i8": ("int64_t", ctypes.c_int64), "f4": ("float", ctypes.c_float), "f8": ("double", ctypes.c_double),
 }  # fmt: skip
 _POSITIONAL = inspect.Parameter.POSITIONAL_OR_KEYWORD
-ArraySize = int | str  # a number, or the name of a size or of an integer argument
+ArraySize = int | str  # a number, or the name of a size, which may be that of an integer argument
 
 
 @dataclass(frozen=True)
 class Argument:
-    """Argument of a native function: an array in C order, or a scalar if there is no shape.
+    """An argument of a native function: an array in C order, or a scalar if it has no shape.
 
-    Rules for values (``least``, ``below``, ``most``) may be numbers, or names of sizes and integer arguments.
+    The limits ``least``, ``below`` and ``most`` are numbers, or names of sizes and integer arguments.
 
     Args:
         code: NumPy's name of the type.
-        shape: Sizes of the array's axes: numbers, or names; a name has the same size in all arguments.
-        least: Smallest value, None for any.
-        below: Exclusive upper bound of the values, None for any.
-        most: Largest value, None for any.
-        ascending: Each value is at least the value before it.
-        out: The array is written.
-        optional: None is allowed and becomes a null pointer; names in its shape must appear in other arguments.
+        shape: Sizes of the array's axes, as numbers or names. A name stands for the same size in all arguments.
+        least: Smallest value; None for no limit.
+        below: All values are smaller than this; None for no limit.
+        most: Largest value; None for no limit.
+        ascending: True if no value is smaller than the value before it.
+        out: True if the function writes the array.
+        optional: True if None is allowed, which becomes a null pointer. Other arguments must have the names in its
+            shape.
     """
 
     code: str
@@ -69,7 +72,7 @@ class Argument:
 
     @cached_property
     def span(self) -> tuple[int, int]:
-        """Smallest and largest integer that the type and the numeric rules allow."""
+        """The smallest and the largest integer that the type and the limits allow, as far as these are numbers."""
         limits = np.iinfo(self.dtype)
         most = self.below - 1 if isinstance(self.below, int) else self.most
         return (
@@ -79,7 +82,7 @@ class Argument:
 
     @property
     def has_rules(self) -> bool:
-        """True if values are checked after all sizes are known: arrays, and scalars with rules that name sizes."""
+        """True if limits have to be checked once all sizes are known: those of arrays, and those that name a size."""
         rules = [rule for rule in (self.least, self.below, self.most) if rule is not None]
         return self.ascending or any(self.shape or isinstance(rule, str) for rule in rules)
 
@@ -95,21 +98,22 @@ u1, i1, i2, u4, i4, u8, i8, f4, f8 = (
     partial(_argument, code) for code in ("u1", "i1", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 )
 
-STATUS = i4()  # result of a function that checks indices: 0, or another number if an index is outside its array
-COUNT = i8()  # result of a function that counts and checks indices: a count, or a negative number for a wrong index
+STATUS = i4()  # return type of a function that checks indices: 0, or another number if an index is outside its array
+COUNT = i8()  # return type of a function that also counts: a count, or a negative number if an index is outside
 
 
-PROTOTYPES: dict[str, str] = {}  # of all functions declared so far, in C: tests compare them with the sources
+PROTOTYPES: dict[str, str] = {}  # C declarations of all functions by name, which tests compare with the sources
 
 
 def native(returns: Argument | None = None, /, **arguments: Argument) -> Callable[[Callable[..., Any]], Any]:
     """Replace a function by the function of the same name in the native library.
 
-    The arguments are checked at every call. A ValueError names the argument that has a wrong type, shape or range.
+    Only the name, the parameters and the docstring of the decorated function are used. The arguments are checked at
+    every call. A ValueError names the argument that has a wrong type, shape or range.
 
     Args:
-        returns: Scalar that the function returns; None for nothing. With STATUS the function returns nothing, or raises
-            ValueError for an index outside its array. With COUNT it returns a count, or raises ValueError.
+        returns: Scalar that the C function returns; None for nothing. If it is STATUS, the Python function returns
+            nothing. If it is COUNT, it returns a count. Both raise ValueError for an index outside its array.
         arguments: Declarations of the arguments, in their order.
     """
 
@@ -125,7 +129,7 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
 def declare(name: str, returns: Argument | None = None, /, **arguments: Argument) -> Callable[..., Any]:
     """Return a function of the native library, with the checks of :func:`native` but without documentation."""
     signature = inspect.Signature([inspect.Parameter(key, _POSITIONAL) for key in arguments])
-    entries: dict[ctypes.CDLL, Any] = {}  # the function in each loaded library, since tests load several
+    entries: dict[ctypes.CDLL, Any] = {}  # the C function in each loaded library, because tests load several
     names = size_names(arguments)
     ruled = [(i, key, argument) for i, (key, argument) in enumerate(arguments.items()) if argument.has_rules]
 
@@ -149,7 +153,7 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
         return None if returns is STATUS else result
 
     def prepare(*values: Any) -> Callable[[], None]:
-        """Check arguments once, and return a function that calls with them; their memory must stay allocated."""
+        """Check arguments once; return a function that makes the call with them. Their memory must stay allocated."""
         sizes: dict[str, int] = {}
         passed = convert(values, sizes)
         passed += [sizes.get(key, 0) for key in names]
@@ -167,19 +171,19 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
 
 
 class Table:
-    """A struct of the native library: addresses of arrays, then named sizes, then numbers, 8 bytes each."""
+    """Declares a struct of the native library: addresses of arrays, then named sizes, then numbers, 8 bytes each."""
 
     def __init__(self, name: str, numbers: tuple[str, ...], **arrays: Argument) -> None:
         self.name, self.arrays = name, arrays
         self.fields = {key: i for i, key in enumerate((*arrays, *size_names(arrays), *numbers))}
 
     def fill(self, arrays: dict[str, np.ndarray[Any, Any]]) -> FilledTable:
-        """Check all arrays and write their addresses and sizes; the numbers are zero."""
+        """Return a struct with the addresses and sizes of ``arrays``, which are checked, and with numbers of zero."""
         return FilledTable(self, arrays)
 
 
 class FilledTable:
-    """Values of a :class:`Table`; it keeps the arrays that it points to alive."""
+    """A struct as a :class:`Table` declares it. It keeps the arrays alive to which it points."""
 
     def __init__(self, table: Table, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
         self.table, self.arrays, self._sizes = table, dict[str, np.ndarray[Any, Any]](), dict[str, int]()
@@ -190,7 +194,7 @@ class FilledTable:
             self[key] = size
 
     def point(self, key: str, array: np.ndarray[Any, Any]) -> None:
-        """Set an address to another array of the same sizes; ValueError if the array does not fit."""
+        """Let the struct point to another array of the same sizes as before; ValueError if the array does not fit."""
         self[key] = _convert(self.table.name, key, self.table.arrays[key], array, self._sizes)
         self.arrays[key] = array
 
@@ -202,19 +206,20 @@ class FilledTable:
 
 
 def size_names(arguments: dict[str, Argument]) -> list[str]:
-    """Return the names of sizes that are not arguments, in order of appearance."""
+    """Return the names of sizes that are no arguments themselves, in the order in which they first appear."""
     sizes = (size for argument in arguments.values() for size in argument.shape)
     return list(dict.fromkeys(size for size in sizes if isinstance(size, str) and size not in arguments))
 
 
 def _prototype(name: str, returns: Argument | None, arguments: dict[str, Argument]) -> str:
-    """Return the declaration in C that a function must have."""
+    """Return the declaration that a function must have in C."""
     parameters = [f"{argument.c}{'' if argument.shape else ' '}{key}" for key, argument in arguments.items()]
     parameters += [f"int64_t {size}" for size in size_names(arguments)]
     return f"{returns.c if returns else 'void'} {name}({', '.join(parameters)})"
 
 
 def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments: dict[str, Argument]) -> Any:
+    """Return a function of a loaded library, with the types of its arguments and of its result set."""
     function = getattr(library, name)
     types = [ctypes.c_void_p if argument.shape else _CODES[argument.code][1] for argument in arguments.values()]
     function.argtypes = [*types, *[ctypes.c_int64] * len(size_names(arguments))]
@@ -223,7 +228,7 @@ def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments:
 
 
 def _convert(name: str, key: str, argument: Argument, value: Any, sizes: dict[str, int]) -> Any:
-    """Check one argument and return its value for ctypes; values of named sizes are added to ``sizes``."""
+    """Check the type and the shape of one argument, and return it as ctypes takes it; add named sizes to ``sizes``."""
     if not argument.shape:
         if argument.code[0] != "f":
             value = int(value)
@@ -250,14 +255,14 @@ def _convert(name: str, key: str, argument: Argument, value: Any, sizes: dict[st
 
 
 def _address(array: np.ndarray[Any, Any], writeable: bool) -> int:
-    """Return the address of an array's values, through its buffer if possible, which takes a fifth of the time."""
+    """Return the address of an array's values. Through a writable buffer this takes a fifth of the time."""
     if writeable and array.size:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
     return int(array.__array_interface__["data"][0])
 
 
 def _check_values(name: str, key: str, argument: Argument, value: Any, sizes: dict[str, int]) -> None:
-    """Check the values of an argument whose type and shape are valid."""
+    """Raise ValueError if an argument, whose type and shape are right, has values outside its limits."""
     if value is None or (argument.shape and not value.size):
         return
     low, high = (value.min(), value.max()) if argument.shape else (value, value)
@@ -275,6 +280,7 @@ def _check_values(name: str, key: str, argument: Argument, value: Any, sizes: di
 
 
 def _describe(value: Any) -> str:
+    """Return the type and the shape of a value for a message."""
     if not isinstance(value, np.ndarray):
         return type(value).__name__
     return f"{value.dtype} [{','.join(map(str, value.shape))}]"

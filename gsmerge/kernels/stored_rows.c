@@ -1,9 +1,10 @@
-// Convert Gaussians as files store them, row by row, to arrays in the package's convention.
+// Convert Gaussians, as files store them row by row, to arrays in the convention of the package.
 #include "exp_log.h"
 
-enum { LINE = 64 };  // rows whose scales are exponentiated together
+enum { LINE = 64 };  // number of rows whose scales are computed together
 
-// Products are separate statements, so that they are rounded as in NumPy.
+// Write a quaternion with length one; return false if this is impossible. Products are separate statements, so that
+// they are rounded as in NumPy.
 static inline bool unit_quat(const float *q, float *out) {
   float w = q[0] * q[0], x = q[1] * q[1], y = q[2] * q[2], z = q[3] * q[3];
   float squared = ((w + x) + y) + z, inverse = 1.f / sqrtf4(squared);

@@ -1,4 +1,4 @@
-"""Convert Gaussians as files store them: log scales become scales, and quaternions unit ones."""
+"""Convert Gaussians as files store them: scales from their logarithms, and quaternions to unit length."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from gsmerge.kernels.signature import f4, i4, i8, native
     scales=f4("n", 3, out=True), opacities=f4("n", out=True), sh0=f4("n", 3, out=True), shN=f4("n", "rest", out=True),
 )  # fmt: skip
 def convert_rows(rows, places, most_position, most_harmonic, most_log_scale, means, quats, scales, opacities, sh0, shN):
-    """Convert rows, block by block, up to the first block with a row that is not plain; return the number converted.
+    """Convert plain rows, block by block, and return the number of converted rows.
 
-    Later rows of the outputs are undefined. ``places`` are the columns of x, y, z, of the harmonics in the order of
-    ``sh0`` and ``shN``, of the log scales, of the quaternions wxyz, and of the opacity, which is copied. A row is plain
-    if its values are finite, its positions, harmonics and log scales are within the limits, and its quaternion has a
-    length between 1e-15 and 1e15. A block has 64 rows.
+    The first block with a row that is not plain ends the conversion; later rows of the outputs are undefined. A block
+    has 64 rows. A row is plain if its values are finite, its positions, harmonics and log scales are within the limits,
+    and its quaternion has a length between 1e-15 and 1e15. ``places`` are the columns of x, y, z, of the harmonics in
+    the order of ``sh0`` and ``shN``, of the log scales, of the quaternions wxyz, and of the opacity, which is copied.
     """

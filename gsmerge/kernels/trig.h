@@ -1,10 +1,10 @@
-// Sines, cosines and their inverses in float64, within two units of the last place, in plain
-// arithmetic: loops over them vectorise and give the same bits on every processor.
+// Compute sines, cosines and their inverses in float64, exact up to two units of the last place. They use plain
+// arithmetic, so loops over them vectorise and give the same bits on every processor.
 #pragma once
 #include "native.h"
 
-// Sine of x + quarters right angles, |x| up to some 1e5: x = n pi / 2 + r, polynomials of fdlibm in
-// r.
+// The sine of x plus `quarters` right angles, for |x| up to about 1e5. With x = n pi / 2 + r, it is a polynomial of
+// fdlibm in r.
 static inline double sin_shifted(double x, int64_t quarters) {
   const double magic = 6755399441055744.0;  // 1.5 * 2^52: adding it rounds to whole numbers
   bits8 shifted = {.f = x * 0.63661977236758134308 + magic};
@@ -34,8 +34,8 @@ static inline double sin_shifted(double x, int64_t quarters) {
 static inline double sin8(double x) { return sin_shifted(x, 0); }
 static inline double cos8(double x) { return sin_shifted(x, 1); }
 
-// Arc cosine of -1 to 1, NaN outside, as fdlibm: a rational function in x^2, or in (1 - |x|) / 2
-// where |x| > 1/2.
+// The arc cosine from -1 to 1, and NaN outside. As in fdlibm, it is a rational function of x^2, or of (1 - |x|) / 2 if
+// |x| > 1/2.
 static inline double acos8(double x) {
   double size = absf8(x);
   bool small = size < 0.5;
@@ -57,8 +57,7 @@ static inline double acos8(double x) {
   return small ? inner : outer;
 }
 
-// Arc tangent of y / x in the quadrant of (x, y), -pi to pi, as Cephes: 0 for the origin, NaN for
-// NaN.
+// The angle of the point (x, y), from -pi to pi, computed as in Cephes; 0 for the origin, NaN for NaN.
 static inline double atan28(double y, double x) {
   double a = absf8(x), b = absf8(y);
   bool steep = b > a;

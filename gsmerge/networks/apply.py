@@ -1,7 +1,9 @@
-"""Run the networks on padded tables of tokens, in parallel, and apply their corrections.
+"""Run the networks on tables of tokens, several tables at once, and apply their corrections.
 
-Everything here works on arrays. In training, :class:`gsmerge.research.training.predict.TrainingContext` replaces
-methods of :class:`NetworkContext` by the same formulas on tensors, so that gradients pass from stage to stage.
+A token describes one Gaussian relative to its group. A table has a row of tokens for each of several groups, padded to
+the same width. Everything here works on arrays. In training,
+:class:`gsmerge.research.training.predict.TrainingContext` replaces methods of :class:`NetworkContext` by the same
+formulas on tensors, so that gradients pass from stage to stage.
 """
 
 from __future__ import annotations
@@ -43,19 +45,19 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, as_array, concat_columns, concat_rows, like
 
-# Columns of a Feature Gaussian itself; members, their weights and the view belong to its cluster
+# Fields of a Feature Gaussian that describe it alone; its members, their weights and its view belong to its cluster
 OWN_COLUMNS = (*CORRECTED, "gains", "shN", "footprints")
-RunTable = Callable[[np.ndarray, int], Array]  # takes rows and width of a table, returns [rows, columns]
+RunTable = Callable[[np.ndarray, int], Array]  # takes the groups and the width of a table, returns [groups,columns]
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkContext(Corrector):
-    """Networks, with their inputs other than Feature Gaussians."""
+    """Networks together with the scene from which their inputs come."""
 
     networks: RunnableNetworks  # encoder, merger, refiner and decoder heads; in training torch modules
     members: Members  # the scene's Gaussians
     cameras: Cameras  # the scene's views
-    seed: int = 0  # of the sampling of members in large groups
+    seed: int = 0  # seed by which members of large groups are sampled
 
     @property
     def options(self) -> NetworkOptions:
@@ -68,15 +70,15 @@ class NetworkContext(Corrector):
         return self.options.max_children
 
     def encode(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Run the encoder, see :func:`encode_features`, and the head for K = 1 if ``geometry`` is ``"carried"``."""
+        """Correct Feature Gaussians with the encoder; with the ``geometry`` "carried" also with the head for K = 1."""
         encoded = encode_features(features, self)
         if self.options.geometry != "carried":
             return encoded
-        # only scales and rotations are those of the head; the mean is that of the encoder (paper section 4.2)
+        # the head gives only scales and rotations; the mean is that of the encoder (paper section 4.2)
         return replace(encoded, covars=self.decode_covars(encoded))
 
     def decode_covars(self, features: FeatureGaussians) -> Array:
-        """Run the head for K = 1; return the covariances ``[g,3,3]`` of its Gaussians."""
+        """Decode each Feature Gaussian by the head for K = 1; return the covariances ``[g,3,3]`` of the Gaussians."""
         described = self.describe(features)
         decoded = decode_gaussians(described.base, np.arange(len(features)), described, self)
         return covariances(decoded.quats, decoded.scales)
@@ -86,8 +88,8 @@ class NetworkContext(Corrector):
     ) -> FeatureGaussians:
         """Correct c merged Feature Gaussians with the merger (paper section 4.4).
 
-        Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. In the
-        paper the merger corrects the first of these rows instead of the pooled Feature Gaussian.
+        Row i of ``pooled`` is a cluster of the rows ``order[cuts[i] : cuts[i + 1]]`` of the Feature Gaussians
+        ``parts``. In the paper the merger corrects the first of these rows instead of the pooled Feature Gaussian.
         """
         options = self.options
         if not options.merger:
@@ -99,7 +101,7 @@ class NetworkContext(Corrector):
         sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), self.seed)
         from_means, means = as_array(parts.means), as_array(pooled.means)
 
-        def run(rows: np.ndarray, width: int) -> Any:
+        def run_rows(rows: np.ndarray, width: int) -> Any:
             positions, owners = group_rows(cuts[rows], sizes[rows])
             keys = ((from_means[order[positions]] - means[rows[owners]]) ** 2).sum(1)
             sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
@@ -108,12 +110,12 @@ class NetworkContext(Corrector):
             tokens = concat_columns([relative, parts.latents[ids]]).reshape(*mask.shape, -1)
             return self.networks.run("merger", tokens, mask, group_features.group[rows])
 
-        outputs = self.run_tables(sizes, options.members, FEATURE + options.latent, run)
+        outputs = self.run_tables(sizes, options.members, FEATURE + options.latent, run_rows)
         return _apply_outputs(group_features, outputs, self)
 
     @stage("refine")
     def refine(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Correct Feature Gaussians with the refiner, whose inputs include their neighbours (paper section 4.5)."""
+        """Correct Feature Gaussians with the refiner, which also reads their neighbours (paper section 4.5)."""
         options = self.options
         if len(features) == 0 or not options.refiner:
             return features
@@ -122,7 +124,7 @@ class NetworkContext(Corrector):
         count, width = len(features), neighbors.shape[1] + 1
         table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
 
-        def run(rows: np.ndarray, _: int) -> Any:
+        def run_rows(rows: np.ndarray, _: int) -> Any:
             ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
             mask = ids >= 0
             ids = np.where(mask, ids, owners)
@@ -132,41 +134,41 @@ class NetworkContext(Corrector):
             return self.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
 
         max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
-        outputs = self.run_tables(np.full(count, width), max_width, columns, run)
+        outputs = self.run_tables(np.full(count, width), max_width, columns, run_rows)
         return _apply_outputs(group_features, outputs, self)
 
     @property
     def makes_children(self) -> bool:
-        """True if the heads make children without analytic ones."""
+        """True if the heads make all children themselves, instead of correcting those of the closed formulas."""
         return self.options.makes_children
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
-        """Run the heads, see :func:`decode_gaussians`."""
+        """Correct ``children`` with the decoder heads, see :func:`decode_gaussians`."""
         return decode_gaussians(children, parents, self.describe(features), self)
 
     def make_base(self, features: FeatureGaussians) -> Gaussians:
-        """Decode every Feature Gaussian into one Gaussian."""
+        """Return the Gaussian with the moments of each Feature Gaussian, as the kernels take it."""
         return contiguous(feature_to_gaussians(features))
 
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
-        """Compute the networks' inputs for Feature Gaussians."""
+        """Return the inputs of the networks for Feature Gaussians."""
         return compute_group_features(features, self.members, self.cameras)
 
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Make tokens of Gaussians relative to their groups; see :func:`gsmerge.networks.tokens.part_tokens`."""
+        """Return tokens of the Gaussians ``ids`` of ``parts``, see :func:`gsmerge.networks.tokens.part_tokens`."""
         return part_tokens(
             parts, ids, owners, group_features, MEMBER_COLUMNS if isinstance(parts, Members) else PART_COLUMNS
         )
 
     def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
-        """Apply corrections ``[g,14]`` to Feature Gaussians."""
+        """Return the Feature Gaussians of ``group_features`` with corrections ``residuals [g,14]``."""
         g = group_features
         return move_features(g.features, g.base, as_array(residuals), g.frames)
 
     def run_tables(self, sizes: np.ndarray, max_width: int, columns: int, run: RunTable) -> Array:
-        """Run a network on all groups, table by table; return outputs ``[g,columns]``."""
+        """Split groups of ``sizes [g]`` into tables, and call ``run`` on each; return all outputs ``[g,columns]``."""
         tables = list(split_tables(sizes, max_width))
         if not tables:
             return np.zeros((0, columns), np.float32)
@@ -174,7 +176,7 @@ class NetworkContext(Corrector):
             outputs = parallel_map(lambda table: run(*table), tables)
         else:
             outputs = [run(*table) for table in tables]
-        output_rows = np.empty(len(sizes), np.int64)  # row of each group in the joined outputs of the tables
+        output_rows = np.empty(len(sizes), np.int64)  # row of each group in the joined outputs of all tables
         output_rows[np.concatenate([rows for rows, _ in tables])] = np.arange(len(sizes))
         return concat_rows(outputs)[output_rows]
 
@@ -187,10 +189,10 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
     group_features, starts, ids = context.describe(features), features.starts, features.members
     sizes, seeds = np.diff(starts), point_seeds(as_array(features.means), context.seed)
     base = group_features.base
-    # the longest axis of each Gaussian, [g,3]: its scales are ascending, so the last column of its rotation
+    # [g,3] the longest axis of each Gaussian, which is the last column of its rotation, because scales are ascending
     axes, means = np.stack(rotation_entries(*as_array(base.quats).T)[2::3], 1), as_array(base.means)
 
-    def run(rows: np.ndarray, width: int) -> Any:
+    def run_rows(rows: np.ndarray, width: int) -> Any:
         positions, owners = group_rows(starts[rows], sizes[rows])
         offsets = context.members.means[ids[positions]] - means[rows[owners]]
         keys = (offsets * axes[rows[owners]]).sum(1)
@@ -200,23 +202,24 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
         table = tokens.reshape(*mask.shape, MEMBER_COLUMNS)
         return context.networks.run("encoder", table, mask, group_features.group[rows])
 
-    encoded = context.run_tables(sizes, options.members, options.latent + 3, run)
+    encoded = context.run_tables(sizes, options.members, options.latent + 3, run_rows)
     zeros = np.zeros((len(features), FEATURE - 3), np.float32)
     residuals = scale_outputs(concat_columns([encoded[:, -3:], zeros]), options.bounds, HALF)
     return replace(context.correct_features(group_features, residuals), latents=encoded[:, :-3])
 
 
 def find_neighbors(means: np.ndarray, count: int) -> np.ndarray:
-    """Find the nearest neighbours ``[g,count]`` int64 of points ``[g,3]``; -1 if there are fewer."""
+    """Return the nearest neighbours ``[g,count]`` int64 of points ``means [g,3]``; -1 where there are fewer."""
     means, neighbors = means.astype(np.float64), np.full((len(means), count), -1, np.int64)
     rows = np.flatnonzero(np.isfinite(means).all(1))
-    nearest = nearest_of_other_views(means[rows], np.full(len(rows), -1, np.int64), count)  # -1: no views
+    no_views = np.full(len(rows), -1, np.int64)  # so that every other point is one of another view
+    nearest = nearest_of_other_views(means[rows], no_views, count)
     neighbors[rows] = np.where(nearest < 0, -1, rows[nearest])
     return neighbors
 
 
 def _apply_outputs(group_features: GroupFeatures, outputs: Array, context: NetworkContext) -> FeatureGaussians:
-    """Apply outputs ``[g,14+latent]`` of merger or refiner."""
+    """Apply the outputs ``[g,14+latent]`` of merger or refiner: corrections of Gaussians, and changes of latents."""
     features = group_features.features
     moved = context.correct_features(group_features, scale_outputs(outputs[:, :FEATURE], context.options.bounds, HALF))
     return replace(moved, latents=like(features.latents, outputs) + outputs[:, FEATURE:])
@@ -227,9 +230,9 @@ def decode_gaussians(
 ) -> Gaussians:
     """Correct the children of Feature Gaussians with the decoder head for their number (paper section 4.3).
 
-    Children of one Feature Gaussian are adjacent; ``parents [n]`` are rows of ``group_features``, ascending. Three
-    children use three slots of the head for four. Five to eight children are corrected in two halves, each as a
-    separate group; heads with absolute outputs cannot do this.
+    The children of a Feature Gaussian are adjacent. ``parents [n]`` are their rows in ``group_features``, ascending.
+    Three children use three slots of the head for four. Five to eight children are corrected in two halves, as if each
+    half were a group of its own. Heads with absolute outputs cannot do this.
     """
     children = prepare_children(children, parents, group_features, context.options)
     residuals = as_array(run_heads(contiguous(children), parents, group_features, context))
@@ -239,7 +242,7 @@ def decode_gaussians(
 def prepare_children(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, options: NetworkOptions
 ) -> Gaussians:
-    """Prepare the children that heads correct: unchanged, or round Gaussians for heads with absolute outputs.
+    """Return what the heads correct: the children, or a round Gaussian in place of each for absolute outputs.
 
     A round Gaussian has the mean and the base colour of its group, and the axes of the group's frame. The outputs of
     the head are offsets from these (paper section 4.3). Its size is that of the group, and its opacity is 0.5.
@@ -260,11 +263,11 @@ def prepare_children(
 def run_heads(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Array:
-    """Compute bounded corrections ``[n,13]`` of children; zero if there is no head for their number."""
+    """Return bounded corrections ``[n,13]`` of children by the heads; zeros if there is no head for their number."""
     options = context.options
     count, halves = len(group_features.features), options.max_children > SLOTS[-1]
     starts, sizes, owners = _split_siblings(parents, count, halves=halves)
-    # row 0 of the outputs is zero; children without a head keep it
+    # children without a head keep row 0 of the outputs, which is zero
     outputs, output_rows, total = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
     for slots, min_size in zip(SLOTS, (1, 2, 3), strict=True):
         rows = np.flatnonzero((sizes >= min_size) & (sizes <= slots))
@@ -273,7 +276,7 @@ def run_heads(
         offsets = np.arange(slots)[None]
         mask = offsets < sizes[rows, None]
         ids = starts[rows, None] + np.where(mask, offsets, 0)
-        outputs.append(_run_head(children, (owners[rows], ids, mask), group_features, context))
+        outputs.append(_run_head(children, owners[rows], ids, mask, group_features, context))
         output_rows[ids[mask]] = total + np.flatnonzero(mask)
         total += mask.size
     return scale_outputs(
@@ -282,9 +285,10 @@ def run_heads(
 
 
 def _split_siblings(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return first row, number and parent of each run of children that a head corrects together.
+    """Return the first row, the number and the parent of each run of children that a head corrects together.
 
-    With ``halves``, the children of a parent with more than four are split into two runs.
+    ``parents`` are those of all children, of ``count`` parents. If ``halves`` is true, more than four children of a
+    parent are split into two runs.
     """
     sizes = np.bincount(parents, minlength=count)
     starts = np.cumsum(sizes) - sizes
@@ -297,19 +301,24 @@ def _split_siblings(parents: np.ndarray, count: int, *, halves: bool) -> tuple[n
 
 def _run_head(
     children: Gaussians,
-    table: tuple[np.ndarray, np.ndarray, np.ndarray],
+    parents: np.ndarray,
+    ids: np.ndarray,
+    mask: np.ndarray,
     group_features: GroupFeatures,
     context: NetworkContext,
 ) -> Array:
-    """Compute outputs ``[r·slots,13]`` for a table: rows of parents, rows of children, and mask."""
-    parents, ids, mask = table
+    """Return the outputs ``[r·slots,13]`` of a head for r runs of children.
+
+    ``parents [r]`` are the rows of their groups, ``ids [r,slots]`` the rows of the children, and ``mask [r,slots]`` is
+    false for slots without a child.
+    """
     slots, latents = mask.shape[1], group_features.features.latents
 
-    def run(rows: np.ndarray, _: int) -> Any:
+    def run_rows(rows: np.ndarray, _: int) -> Any:
         owners = parents[rows]
         tokens = context.make_tokens(children, ids[rows].reshape(-1), np.repeat(owners, slots), group_features)
         table = tokens.reshape(len(rows), slots, PART_COLUMNS)
         return context.networks.run(f"heads.{slots}", latents[owners], group_features.group[owners], table, mask[rows])
 
-    outputs = context.run_tables(np.full(len(parents), slots), slots, slots * RESIDUAL, run)
+    outputs = context.run_tables(np.full(len(parents), slots), slots, slots * RESIDUAL, run_rows)
     return outputs.reshape(-1, RESIDUAL)

@@ -1,4 +1,7 @@
-"""Read and write networks as a safetensors file: only data, with sizes and facts about the training in the header."""
+"""Read and write networks as a safetensors file, which holds no code.
+
+The header has the sizes of the networks and facts about their training.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +24,16 @@ from gsmerge.networks.weights import NetworkWeights
 from gsmerge.types import StrPath
 from gsmerge.version import __version__
 
-SCHEMA = 2  # version of the tensors' names and of the tokens that the networks take
+SCHEMA = 2  # changes with the names of the tensors, and with the tokens that the networks take
 FORMAT = "gsmerge-networks"
 REMEDY = "give another file, or --set checkpoint=none"
 SHIPPED = Path(__file__).with_name("shipped.safetensors")
-IN_PACKAGE = {"shipped": SHIPPED, "paper": Path(__file__).with_name("paper.safetensors")}  # by name
+IN_PACKAGE = {"shipped": SHIPPED, "paper": Path(__file__).with_name("paper.safetensors")}  # files of the package
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Networks from a file."""
+    """Networks that were read from a file."""
 
     networks: NetworkWeights
     path: Path  # the file
@@ -38,7 +41,7 @@ class Checkpoint:
     training: Mapping[str, Any]  # facts about the training, as the trainer wrote them
 
     def facts(self) -> dict[str, Any]:
-        """Return facts about the checkpoint for a report."""
+        """Return what a report says about the checkpoint: name, versions, sizes and training."""
         sizes = {"num_parameters": self.networks.num_parameters, "options": asdict(self.networks.options)}
         name = next((name for name, path in IN_PACKAGE.items() if path == self.path), str(self.path))
         head = {"checkpoint": name, "schema": SCHEMA, "gsmerge": self.version}
@@ -55,7 +58,7 @@ def save_checkpoint(path: str | PathLike[str], networks: NetworkWeights, trainin
 
 
 def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
-    """Read networks from a file; nothing in the file is executed.
+    """Read networks from a file, without executing anything in it.
 
     Raises:
         SceneError: If the file is missing, damaged or of another format or version, or if its tensors are not finite or
@@ -66,14 +69,14 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
         raise SceneError(path, "expected a checkpoint, found no such file", REMEDY)
     budget = read_budget(path)
     header, tensors = read_tensors(path, "a safetensors file", REMEDY)
-    options, training, version = _header(header, budget)
+    options, training, version = _read_header(header, budget)
     return Checkpoint(build_networks(path, options, tensors), path, version, training)
 
 
 def build_networks(path: Path, options: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NetworkWeights:
-    """Build networks from options, see ``NetworkOptions.from_dict``, and weights by name.
+    """Make networks of options, as ``NetworkOptions.from_dict`` takes them, and weights by name.
 
-    Raises SceneError with ``path`` if the sizes are out of range, or if the weights have other sizes.
+    Raises SceneError about the file ``path`` if an option is out of range, or if the weights do not fit the options.
     """
     try:
         sizes = NetworkOptions.from_dict(options)
@@ -92,8 +95,8 @@ def build_networks(path: Path, options: Mapping[str, Any], arrays: Mapping[str, 
     return NetworkWeights(sizes, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
-def _header(header: Mapping[str, str], budget: ReadBudget) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """Read the sizes of the networks, facts about the training, and the version that wrote the file."""
+def _read_header(header: Mapping[str, str], budget: ReadBudget) -> tuple[dict[str, Any], dict[str, Any], str]:
+    """Return the options of the networks, facts about the training, and the version that wrote the file."""
     path = budget.path
     if FORMAT not in header:
         raise SceneError(path, "expected networks of gsmerge, found another safetensors file", REMEDY)
@@ -111,16 +114,17 @@ def _header(header: Mapping[str, str], budget: ReadBudget) -> tuple[dict[str, An
 
 
 def _header_error(path: StrPath, error: Exception) -> SceneError:
+    """Return the error to raise for a file whose header does not describe networks; ``error`` says why."""
     reason = str(error).splitlines()[0]
     return SceneError(path, f"expected a header that describes the networks ({reason})", REMEDY)
 
 
 def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, list[str]]:
-    """Load a checkpoint by name, with notes for the user; None for the analytic stages.
+    """Load a checkpoint by name; also return notes for the user.
 
-    ``name`` is a file, ``"shipped"`` or ``"paper"`` in the package, or ``"none"``. Raises SceneError if a file, or a
-    ``required`` checkpoint of the package, cannot be used. Otherwise a note is added, and the stages run without
-    networks.
+    ``name`` is a file, or ``"shipped"`` or ``"paper"`` for one in the package. For ``"none"`` the checkpoint is None,
+    and the stages run without networks. If a checkpoint of the package cannot be used and is not ``required``, it is
+    None too, and a note says so. In all other cases a checkpoint that cannot be used raises SceneError.
     """
     if name == "none":
         return None, []

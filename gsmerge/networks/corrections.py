@@ -1,9 +1,9 @@
 """Apply bounded corrections to Gaussians and Feature Gaussians; a correction of zero changes no bit.
 
-A correction has 13 columns: shift of the mean (3), change of the log scales (3) along the principal axes, rotation
-vector (3), change of the logit of the opacity (1) and of the base colour (3). Shift and rotation vector are in the
-group's frame. A correction of a Feature Gaussian has one more column, the change of the logarithm of its mass in
-addition to the change by size and opacity.
+A correction has 13 columns: a shift of the mean (3), changes of the log scales along the principal axes (3), a rotation
+vector (3), a change of the opacity's logit (1), and changes of the base colour (3). Shift and rotation vector are in
+the group's frame. A correction of a Feature Gaussian has one more column. It changes the logarithm of the mass, in
+addition to what size and opacity change of it.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from gsmerge.values.arrays import Array, like
 # Columns of a correction
 MEAN_COLUMNS, SIZE_COLUMNS, ROTATION_COLUMNS = slice(0, 3), slice(3, 6), slice(6, 9)
 LOGIT_COLUMN, COLOR_COLUMNS, MASS_COLUMN = 9, slice(10, 13), 13  # the last is only in corrections of Feature Gaussians
-HALF = 0.5  # share of the bounds that each stage before the decoder may use
+HALF = 0.5  # encoder, merger and refiner may each use this share of the bounds
 CORRECTION_ROWS = 8192  # rows per task
 
 
 def residual_limits(bounds: Bounds) -> np.ndarray:
-    """Return the bound of each of the 14 columns of a Feature Gaussian's correction, ``[14]`` float32."""
+    """Return the bounds ``[14]`` float32 of the columns of a Feature Gaussian's correction."""
     b = bounds
     return np.array([b.mean] * 3 + [b.size] * 3 + [b.turn] * 3 + [b.logit] + [b.color] * 3 + [b.logit], np.float32)
 
 
 def scale_outputs(outputs: Array, bounds: Bounds, share: float = 1.0) -> Array:
-    """Scale network outputs ``[...,13 or 14]`` in [-1, 1] to corrections within ``share`` of the bounds."""
+    """Scale network outputs ``[...,13 or 14]`` in [-1, 1] to corrections of at most ``share`` times the bounds."""
     return outputs * like(np.float32(share) * residual_limits(bounds)[: outputs.shape[-1]], outputs)
 
 
 def move_gaussians(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarray, frames: np.ndarray) -> Gaussians:
-    """Apply corrections ``[n,13]`` to Gaussians, in the frames ``[g,3,3]`` of their groups ``owners [n]``."""
+    """Apply corrections ``residuals [n,13]`` to Gaussians, in the ``frames [g,3,3]`` of their groups ``owners [n]``."""
     names = ("means", "quats", "scales", "opacities", "sh0")
     columns = {name: np.array(getattr(gaussians, name), np.float32, order="C") for name in names}
 
@@ -53,11 +53,11 @@ def move_gaussians(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarr
 def move_features(
     features: FeatureGaussians, base: Gaussians, residuals: np.ndarray, frames: np.ndarray
 ) -> FeatureGaussians:
-    """Apply corrections ``[g,14]`` to Feature Gaussians; the opacity depends only on its own column, not on the scales.
+    """Apply corrections ``residuals [g,14]`` to Feature Gaussians.
 
     ``base`` has one Gaussian for each group. ``frames [g,3,3]`` have the axes of each group as columns, in the world.
-    The tenth column is added to the logarithms of integrated optical depth and mass, and the last column to the
-    logarithm of mass only.
+    The tenth column is added to the logarithms of both the integrated optical depth and the mass, the last column only
+    to that of the mass. A change of scales does not change the opacity.
     """
     names = ("means", "covars", "masses", "extinctions", "sh0")
     columns = {name: np.array(getattr(features, name), np.float32, order="C") for name in names}

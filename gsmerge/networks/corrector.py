@@ -1,4 +1,4 @@
-"""Interface of corrections to the analytic stages; :class:`gsmerge.networks.apply.NetworkContext` has networks."""
+"""Let networks correct the results of the analytic stages, which are the stages that use closed formulas."""
 
 from __future__ import annotations
 
@@ -9,35 +9,45 @@ from gsmerge.types import FeatureGaussians, Gaussians
 
 
 class Corrector:
-    """Correct nothing: the results of the analytic stages do not change."""
+    """Interface of the corrections, which changes nothing itself.
+
+    The class with networks is :class:`gsmerge.networks.apply.NetworkContext`.
+    """
 
     @property
     def max_children(self) -> int:
-        """Largest number of children of a Feature Gaussian."""
+        """Largest number of children that a Feature Gaussian may have."""
         return MAX_CHILDREN
 
     def encode(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Correct pooled Feature Gaussians and add their latents."""
+        """Return pooled Feature Gaussians with corrections and latents."""
         return features
 
     def merge(
         self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     ) -> FeatureGaussians:
-        """Correct pooled Feature Gaussians; ``cuts`` are the starts of their runs in ``order``, rows of ``parts``."""
+        """Return merged Feature Gaussians with corrections.
+
+        Each row of ``pooled`` is a cluster of rows of ``parts``. These rows are a run of ``order``, and ``cuts`` are
+        the starts of these runs.
+        """
         return pooled
 
     def refine(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Correct merged Feature Gaussians by their neighbours."""
+        """Return merged Feature Gaussians with corrections that depend on their neighbours."""
         return features
 
     @property
     def makes_children(self) -> bool:
-        """True if :meth:`decode` makes children without analytic ones, so that every group can have any number."""
+        """True if :meth:`decode` makes all children itself, so that a group may have more than its members allow."""
         return False
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
-        """Correct the children of Feature Gaussians; ``parents [n]`` are rows of ``features``, ascending."""
+        """Return the children of Feature Gaussians with corrections.
+
+        ``parents [n]`` are the rows of the children's Feature Gaussians in ``features``, ascending.
+        """
         return children
 
 
-ANALYTIC = Corrector()
+ANALYTIC = Corrector()  # for runs without networks

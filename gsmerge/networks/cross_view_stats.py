@@ -1,4 +1,4 @@
-"""Measure the agreement of Feature Gaussians with the Gaussians of other views, without photos; find neighbours."""
+"""Measure how well Feature Gaussians agree with the Gaussians of other views, and find neighbours in other views."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from gsmerge.types import SH_C0, Cameras
 
 NUM_STATS = SUM_COLUMNS + 1
 NEAR_LOG = 0.03  # largest difference of the logarithms of two depths on the same surface
-FAR_LOG = 0.3  # larger differences of the logarithms of depths are clipped to this
-MIN_SURFACE_OPACITY = 1 / 255  # more transparent Gaussians show no surface
+FAR_LOG = 0.3  # differences of the logarithms of depths are clipped to at most this
+MIN_SURFACE_OPACITY = 1 / 255  # a fainter Gaussian is no surface
 STATS_ROWS = 8192  # points per task
-# The search compares MAX_COMPARED points per neighbour, for at least MIN_NEIGHBORS neighbours
+# The search for neighbours compares MAX_COMPARED points for each neighbour, or for MIN_NEIGHBORS if there are fewer
 MAX_COMPARED, MIN_NEIGHBORS = 64, 16
 
 
@@ -28,11 +28,12 @@ def cross_view_stats(
 ) -> np.ndarray:
     """Measure how well points agree with the Gaussians that they project onto in every other view.
 
-    Points ``means [g,3]`` with base colours ``sh0 [g,1,3]`` belong to ``views [g]`` int64, which are left out. Each
-    point is compared with the ``most`` views nearest to its own; None: with all. The statistics ``[g,7]`` float32 are
-    the logarithm of the number of views that see the point; the shares of these views with a surface at the point,
-    behind it and in front of it; the mean differences of colours and of relative depths; and the logarithm of the
-    number of all views.
+    A point with its mean in ``means [g,3]`` and its base colour in ``sh0 [g,1,3]`` belongs to a view in ``views [g]``
+    int64. It is compared with the ``most`` views nearest to this view, or with all others if None.
+
+    Returns statistics ``[g,7]`` float32. The first is the logarithm of the number of views that see the point. The next
+    three are the shares of these views that have a surface at the point, behind it, and in front of it. Then follow
+    the mean differences of colours and of relative depths, and the logarithm of the number of all views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, -1] = math.log(len(cameras)) / 4
@@ -60,11 +61,11 @@ def cross_view_stats(
 
 
 def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
-    """Find the nearest points of other views, ``[g,count]`` int64, nearest first (paper section 4.4).
+    """Return the nearest points of other views, ``[g,count]`` int64, nearest first (paper section 4.4).
 
-    If there are fewer than ``count``, the result is filled with -1. The search ends after ``MAX_COMPARED`` times
-    ``count`` nearer points, at least 1,024. Most of these belong to the point's own view, and Gaussians behind them do
-    not overlap. Points are ``means [g,3]`` float64, finite. A view below 0 counts as different from all others.
+    Points are ``means [g,3]`` float64, finite, and belong to ``views [g]``. A view below 0 differs from all others. If
+    there are fewer than ``count`` points, the rest is -1. The search for a point ends after ``MAX_COMPARED`` times
+    ``count`` others, at least 1,024. Most of these belong to its own view, and Gaussians farther away do not overlap.
     """
     num = len(means)
     neighbors, means = np.empty((num, count), np.int64), np.ascontiguousarray(means)

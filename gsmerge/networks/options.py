@@ -10,22 +10,22 @@ from typing import Any
 from gsmerge.networks.cross_view_stats import NUM_STATS
 from gsmerge.settings.setting import Settings, setting
 
-SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
+SLOTS = (1, 2, 4)  # there is a decoder head for each of these numbers of children
 OUTPUTS = ("residual", "absolute")
 STARTS = ("pooled", "first")
 GEOMETRIES = ("analytic", "carried")
 PART_COLUMNS = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
-MEMBER_COLUMNS = PART_COLUMNS + 6  # columns of a member: also its position in footprints and its colour
-GROUP_COLUMNS = 19 + NUM_STATS  # columns of a whole group
+MEMBER_COLUMNS = PART_COLUMNS + 6  # columns of a member, with its position in footprints and its colour at the end
+GROUP_COLUMNS = 19 + NUM_STATS  # numbers that describe a whole group
 RESIDUAL = 13  # columns of a correction, see gsmerge.networks.corrections
-FEATURE = RESIDUAL + 1  # columns of a correction of a Feature Gaussian; the last one is the mass
-CORRECTED = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # columns of Feature Gaussians that change
-PAPER_NUMBERS = (4, 8, 9, 10)  # columns of a group that the paper's decoder takes: mass and base colour
+FEATURE = RESIDUAL + 1  # columns of a correction of a Feature Gaussian; the last one changes its mass
+CORRECTED = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # fields that corrections change
+PAPER_NUMBERS = (4, 8, 9, 10)  # the numbers of a group that the paper's decoder reads: mass and base colour
 
 
 @dataclass(frozen=True)
 class Bounds(Settings):
-    """Largest corrections by the decoder, 0: none; merger, refiner and encoder may each correct by half as much."""
+    """Largest corrections by the decoder; encoder, merger and refiner may each correct by half as much."""
 
     mean: float = setting(1.0, "Shift along each axis of the group's frame, in units of the Gaussian's size.", least=0,
         most=8)  # fmt: skip
@@ -36,7 +36,7 @@ class Bounds(Settings):
     color: float = setting(0.25, "Change of each channel of the base colour, sRGB in [0, 1].", least=0, most=8)
 
 
-ABSOLUTE_BOUNDS = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # bounds of absolute outputs
+ABSOLUTE_BOUNDS = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # for heads with absolute outputs
 
 
 @dataclass(frozen=True)
@@ -73,19 +73,19 @@ class NetworkOptions(Settings):
 
     @property
     def reads_children(self) -> bool:
-        """True if heads take the Gaussians that they correct as inputs; absolute heads take only the group's size."""
+        """True if heads read the Gaussians that they correct; absolute heads learn only the group's size from them."""
         return self.group_numbers or not self.makes_children
 
     @property
     def makes_children(self) -> bool:
-        """True if heads make children without analytic ones, so that every group has K children."""
+        """True if heads make all children themselves, so that every group has exactly K of them."""
         return self.outputs == "absolute"
 
     @property
     def max_children(self) -> int:
         """Largest number of children that heads correct.
 
-        Five or more are corrected in two halves; absolute heads cannot do this.
+        Five or more children are corrected in two halves, which absolute heads cannot do.
         """
         return SLOTS[-1] if self.makes_children else 2 * SLOTS[-1]
 
@@ -96,7 +96,7 @@ class NetworkOptions(Settings):
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> NetworkOptions:
-        """Make options from the values of ``dataclasses.asdict``; ValueError for an unknown name or a wrong value."""
+        """Make options from what ``dataclasses.asdict`` gives; ValueError for an unknown name or a wrong value."""
         unknown = sorted(values.keys() - {f.name for f in fields(NetworkOptions)})
         bounds = values.get("bounds", {})
         if not isinstance(bounds, Mapping):
@@ -108,7 +108,7 @@ class NetworkOptions(Settings):
 
 
 def weight_shapes(options: NetworkOptions) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of all weights of the networks by name."""
+    """Return the shape of each weight of the networks by its name."""
     width, latent = options.width, options.latent
     shapes = dict[str, tuple[int, ...]]()
     if options.encoder:
@@ -134,7 +134,7 @@ def weight_shapes(options: NetworkOptions) -> dict[str, tuple[int, ...]]:
 
 
 def _set_network(name: str, token: int, options: NetworkOptions) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the part that encoder and merger share."""
+    """Return the shapes of the weights of a network that reads a set of tokens, the encoder or the merger."""
     width = options.width
     shapes = _mlp(f"{name}.embed", token, width, width)
     for i in range(options.blocks):
@@ -144,7 +144,7 @@ def _set_network(name: str, token: int, options: NetworkOptions) -> dict[str, tu
 
 
 def _block(name: str, width: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of attention and MLP with their norms."""
+    """Return the shapes of the weights of an attention block: attention, MLP and their norms."""
     attention = f"{name}.attention"
     return {
         **_norm(f"{name}.before", width),
@@ -157,7 +157,7 @@ def _block(name: str, width: int) -> dict[str, tuple[int, ...]]:
 
 
 def _mlp(name: str, *widths: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of linear layers; their numbers are even, since activations have the odd numbers."""
+    """Return the shapes of the weights of linear layers, which have even numbers; activations have the odd ones."""
     layers = (_linear(f"{name}.{2 * i}", *pair) for i, pair in enumerate(pairwise(widths)))
     return {key: shape for layer in layers for key, shape in layer.items()}
 

@@ -1,4 +1,4 @@
-"""Apply corrections to Gaussians of tensors, with gradients, as :mod:`gsmerge.networks.corrections` does to arrays."""
+"""Apply corrections as :mod:`gsmerge.networks.corrections` does, but to tensors and with gradients."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from gsmerge.types import SH_C0, Gaussians
 
 
 def gaussian_sizes(scales: Tensor) -> Tensor:
-    """Compute sizes ``[n]`` of Gaussians: the geometric mean of the two largest of ``scales [n,3]``."""
+    """Return the size ``[n]`` of each Gaussian, which is the geometric mean of its two largest ``scales [n,3]``."""
     top = scales.sort(-1).values
     return (top[..., 1] * top[..., 2]).sqrt()
 
 
 def quat_to_rotmat(quats: Tensor) -> Tensor:
-    """Convert quaternions ``[...,4]`` to rotations ``[...,3,3]``, differentiable."""
+    """Convert quaternions ``[...,4]`` to rotation matrices ``[...,3,3]``, with gradients."""
     entries = rotation_entries(*normalize(quats, dim=-1).unbind(-1))
     return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
     """Rotate quaternions ``[n,4]`` by rotation vectors ``[n,3]`` in world axes."""
-    half = (vectors.square().sum(-1, keepdim=True) + 1e-20).sqrt() / 2  # the gradient is finite at zero, too
+    half = (vectors.square().sum(-1, keepdim=True) + 1e-20).sqrt() / 2  # the addend makes the gradient at zero finite
     w, (x, y, z) = half.cos()[:, 0], (half.sin() / (2 * half) * vectors).unbind(-1)
     a, b, c, d = quats.unbind(-1)
     return torch.stack(
@@ -37,7 +37,7 @@ def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
 
 
 def rotate_vectors(frames: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate vectors ``[n,3]`` from frames ``[n,3,3]`` into the world."""
+    """Rotate ``vectors [n,3]`` from their ``frames [n,3,3]``, whose columns are the axes, into the world."""
     return (frames @ vectors[:, :, None])[:, :, 0]
 
 
@@ -48,14 +48,14 @@ def skew_vectors(matrices: Tensor) -> Tensor:
 
 
 def move_tensors(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> Gaussians:
-    """Apply corrections ``[n,13]`` to Gaussians of tensors, in frames ``[n,3,3]`` (axes as columns, world)."""
+    """Apply corrections ``residuals [n,13]`` to Gaussians of tensors, in ``frames [n,3,3]`` whose columns are axes."""
     g = gaussians
-    odds, factor = g.opacities, torch.exp(residuals[:, LOGIT_COLUMN])
+    opacities, factor = g.opacities, torch.exp(residuals[:, LOGIT_COLUMN])
     return replace(
         g,
         means=g.means + rotate_vectors(frames, residuals[:, MEAN_COLUMNS] * gaussian_sizes(g.scales)[:, None]),
         quats=rotate_quats(rotate_vectors(frames, residuals[:, ROTATION_COLUMNS]), g.quats),
         scales=g.scales * torch.exp(residuals[:, SIZE_COLUMNS]),
-        opacities=(odds * factor / (1 + odds * (factor - 1))).clamp(0, 1),  # the logit plus the correction
+        opacities=(opacities * factor / (1 + opacities * (factor - 1))).clamp(0, 1),  # adds the correction to the logit
         sh0=g.sh0 + residuals[:, None, COLOR_COLUMNS] / SH_C0,
     )

@@ -1,8 +1,8 @@
-"""Compute the inputs of the networks: numbers without a unit, in the frame of each group.
+"""Compute the inputs of the networks, which are numbers without a unit in the frame of each group.
 
-The axes of the frame are the ray from the camera to the group, and the image's right and down of the group's view.
-Lengths are in units of the Feature Gaussian's size or of the footprint of one pixel. So the inputs do not depend on
-depth, focal length, resolution or the scale of the world.
+The axes of the frame are the right and down of the picture in the group's view, and the ray from the camera to the
+group. Lengths are in units of the Feature Gaussian's size or of the footprint of one pixel. So the inputs do not depend
+on depth, focal length, resolution or the scale of the world.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from gsmerge.values.arrays import Array, as_array
 
 @dataclass(frozen=True, eq=False)
 class GroupFeatures:
-    """Inputs of the networks for Feature Gaussians, float32; in training, numbers are tensors."""
+    """Inputs of the networks for g Feature Gaussians, float32. In training, arrays with a gradient are tensors."""
 
-    features: FeatureGaussians  # g of them
-    base: Gaussians  # g Gaussians without corrections
-    frames: Array  # [g,3,3] axes (right, down, away) as columns, world
+    features: FeatureGaussians
+    base: Gaussians  # for each Feature Gaussian, the Gaussian with the same moments
+    frames: Array  # [g,3,3] columns are the axes of each group (right, down, away), in the world
     sizes: Array  # [g] geometric mean of the two largest scales, world units
     footprints: np.ndarray  # [g] size of one pixel, world units
-    views: np.ndarray  # [g] int64 view of the frame
-    group: Array  # [g,GROUP_COLUMNS] numbers that describe the whole group
+    views: np.ndarray  # [g] int64 view in which the frame is defined
+    group: Array  # [g,GROUP_COLUMNS] numbers that describe the group as a whole
 
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
-    """Compute the networks' inputs for Feature Gaussians."""
+    """Return the inputs of the networks for Feature Gaussians, whose ``members`` are those of the whole scene."""
     views = choose_token_views(features, members, cameras)
     stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
     return describe_features(features, views, np.diff(features.starts), stats, cameras)
@@ -43,10 +43,9 @@ def compute_group_features(features: FeatureGaussians, members: Members, cameras
 def describe_features(
     features: FeatureGaussians, views: np.ndarray, num_members: np.ndarray, stats: np.ndarray, cameras: Cameras
 ) -> GroupFeatures:
-    """Compute the networks' inputs from Feature Gaussians, their views, numbers of members and statistics.
+    """Return the inputs of the networks, if the ``views [g]`` and ``stats [g,7]`` of Feature Gaussians are known.
 
-    ``views [g]`` is the view of each Feature Gaussian, ``num_members [g]`` its number of members, and ``stats [g,7]``
-    its agreement with other views.
+    ``stats`` are those of :func:`cross_view_stats`, and ``num_members [g]`` are numbers of members.
     """
     bare = make_group_features(features, views, np.zeros((len(features), GROUP_COLUMNS), np.float32), cameras)
     base, group = bare.base, np.empty((len(features), GROUP_COLUMNS), np.float32)
@@ -62,7 +61,7 @@ def describe_features(
 def make_group_features(
     features: FeatureGaussians, views: np.ndarray, group: np.ndarray, cameras: Cameras
 ) -> GroupFeatures:
-    """Assemble the networks' inputs from known ``views [g]`` and numbers ``group [g,GROUP_COLUMNS]``."""
+    """Return the inputs of the networks, if ``views [g]`` and the numbers ``group [g,GROUP_COLUMNS]`` are known."""
     base = contiguous(feature_to_gaussians(features))
     frames, sizes = np.empty((len(features), 3, 3), np.float32), np.empty(len(features), np.float32)
     place_frames(base.means, base.scales, _viewmats(cameras), views, frames, sizes)
@@ -70,7 +69,7 @@ def make_group_features(
 
 
 def contiguous(gaussians: Gaussians) -> Gaussians:
-    """Convert Gaussians to float32 arrays in C order, as the kernels take them."""
+    """Return Gaussians with float32 arrays in C order, as the kernels take them."""
     return Gaussians(*(in_order(column) for column in vars(gaussians).values()))
 
 
@@ -84,7 +83,10 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
 
 
 def choose_token_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
-    """Choose a view ``[g]`` int64 for each Feature Gaussian: its own, or after merging the view of most opacity."""
+    """Return a view ``[g]`` int64 for each Feature Gaussian.
+
+    It is its own view, or after merging across views the one whose members have the largest sum of opacities.
+    """
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)
     if len(merged) == 0:
@@ -105,10 +107,9 @@ def part_tokens(
     group_features: GroupFeatures,
     columns: int = PART_COLUMNS,
 ) -> np.ndarray:
-    """Make tokens that describe the Gaussians ``ids [n]`` relative to their groups ``owners [n]``.
+    """Return tokens ``[n,columns]`` that describe the Gaussians ``ids [n]`` of ``parts`` relative to their groups.
 
-    Returns ``[n,columns]``. The first PART_COLUMNS columns are written for all Gaussians, the others up to
-    MEMBER_COLUMNS only for members.
+    ``owners [n]`` are the groups. Members have ``MEMBER_COLUMNS`` columns, all other Gaussians ``PART_COLUMNS``.
     """
     g, out = group_features, np.zeros((len(ids), columns), np.float32)
     describe_parts(
@@ -119,13 +120,14 @@ def part_tokens(
 
 
 def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Split groups of ``sizes [g]`` into tables of similar size: yield rows of ``sizes`` and a width (power of two).
+    """Split groups of ``sizes [g]`` into tables; yield the groups and the width of each table.
 
-    The split depends only on the sizes. Groups larger than ``max_width`` have to be sampled.
+    A width is a power of two, at most ``max_width``. A table has groups of similar size, and larger groups than its
+    width have to be sampled. The split depends only on the sizes.
     """
-    bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # exponents of the next power of two
+    bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # exponents of the next powers of two
     widths = np.minimum(1 << bits, max_width)
-    max_tokens = 4096  # tokens of one table; their activations take a megabyte, which fits a processor's cache
+    max_tokens = 4096  # most tokens of a table; their activations take a megabyte, which fits a processor's cache
     for width in np.unique(widths):
         rows = np.flatnonzero(widths == width)
         step = max(1, max_tokens // int(width))
@@ -134,19 +136,24 @@ def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray
 
 
 def group_rows(begins: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions of all members of groups that start at ``begins [g]``, and the group of each."""
+    """Return the positions ``[m]`` of all members of groups, and the group ``[m]`` of each.
+
+    The members of a group have ``sizes [g]`` adjacent positions from ``begins [g]`` on.
+    """
     owners = np.repeat(np.arange(len(sizes)), sizes)
     offsets = np.cumsum(sizes) - sizes
     return np.arange(len(owners)) - offsets[owners] + begins[owners], owners
 
 
 def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sample at most ``width`` members of every group, evenly along their ``keys [m]``, independent of their order.
+    """Sample at most ``width`` members of each group, evenly along their ``keys [m]``, whatever their order.
 
-    ``keys`` are group after group, and ``sizes [g]`` are the numbers of each group. A group larger than ``width`` is
-    sorted by its keys and cut into ``width`` runs of similar length. One random member is taken from each run, by
-    ``seeds [g]`` uint64, so the sample covers the group (paper supplement, encoder compute). Returns positions
-    ``[g,width]`` in ``keys``, and a mask of the valid positions; the others repeat the first one of the group.
+    The keys are group after group, and ``sizes [g]`` are their numbers. A group with more than ``width`` members is
+    sorted by its keys and cut into ``width`` runs of similar length. ``seeds [g]`` uint64 choose one random member of
+    each run, so that the sample covers the group (paper supplement, encoder compute).
+
+    Returns positions ``[g,width]`` in ``keys``, and a mask ``[g,width]`` that is true for as many as there are. The
+    other positions repeat the first one of the group.
     """
     offsets = np.cumsum(sizes) - sizes
     order = np.lexsort((keys, np.repeat(np.arange(len(sizes)), sizes)))
@@ -161,12 +168,12 @@ def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.nd
 
 
 def hash_uniform(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
-    """Draw numbers in [0, 1) by hashing seeds and salts (splitmix64, Steele et al. 2014)."""
+    """Return evenly distributed numbers in [0, 1), one for each pair of a seed and a salt, both uint64."""
     return (hash_pairs(seeds, salts) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
 def hash_pairs(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
-    """Hash pairs of uint64 values to uint64."""
+    """Hash pairs of a seed and a salt, both uint64, to uint64 (splitmix64, Steele et al. 2014)."""
     x = seeds + (salts + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -174,7 +181,7 @@ def hash_pairs(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
 
 
 def point_seeds(points: np.ndarray, seed: int) -> np.ndarray:
-    """Hash float32 positions ``[n,3]`` and a seed to ``[n]`` uint64, independent of the order of the points."""
+    """Return a seed ``[n]`` uint64 for each of ``points [n,3]``, which depends only on its position and ``seed``."""
     bits = np.ascontiguousarray(points, np.float32).view(np.uint32).astype(np.uint64)
     hashes = np.full(len(points), seed & (2**64 - 1), np.uint64)
     for column in bits.T:

@@ -1,7 +1,7 @@
 """Run the forward pass of the networks on arrays with the native library.
 
 The arithmetic is that of the torch modules for training, :mod:`gsmerge.research.training.modules`, up to rounding.
-Every group is computed by itself. So results depend neither on the other groups of its table nor on the number of
+Every group is computed by itself, so its results depend neither on the other groups of a table nor on the number of
 threads.
 """
 
@@ -28,11 +28,11 @@ from gsmerge.kernels.networks.layers import (
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.values.arrays import Array
 
-Layer = tuple[np.ndarray, np.ndarray, int]  # packed weights, packed bias, outputs
+Layer = tuple[np.ndarray, np.ndarray, int]  # packed weights, packed bias, and the number of outputs
 
 
 class RunnableNetworks(Protocol):
-    """Networks as the stages use them: a checkpoint's :class:`NetworkWeights`, or the torch modules of training."""
+    """Networks that the stages can run: :class:`NetworkWeights` of a checkpoint, or torch modules in training."""
 
     @property
     def options(self) -> NetworkOptions:
@@ -40,7 +40,7 @@ class RunnableNetworks(Protocol):
 
     @property
     def in_parallel(self) -> bool:
-        """Whether tables of groups may run in several threads."""
+        """True if tables of groups may run in several threads."""
 
     def run(self, name: str, *inputs: Any) -> Array:
         """Run one of the networks on a table of groups, see :meth:`NetworkWeights.run`."""
@@ -48,12 +48,12 @@ class RunnableNetworks(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class NetworkWeights:
-    """Networks of a checkpoint: options, and float32 weights by name."""
+    """The networks of a checkpoint: their options, and their float32 weights by name."""
 
     options: NetworkOptions
     arrays: Mapping[str, np.ndarray]
 
-    in_parallel = True  # tables may run in several threads
+    in_parallel = True
 
     @property
     def num_parameters(self) -> int:
@@ -61,7 +61,7 @@ class NetworkWeights:
         return sum(array.size for array in self.arrays.values())
 
     def heads_alone(self) -> NetworkWeights:
-        """Return a copy with only the decoder heads; the other networks take ten times as long."""
+        """Return a copy that runs only the decoder heads, because the other networks take ten times as long."""
         options = replace(self.options, encoder=False, merger=False, refiner=False)
         return NetworkWeights(
             options, {name: array for name, array in self.arrays.items() if name.startswith("heads.")}
@@ -70,15 +70,15 @@ class NetworkWeights:
     def run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
         """Run ``"encoder"``, ``"merger"``, ``"refiner"`` or ``"heads.K"`` on a table of b groups.
 
-        Inputs are those of the module of the same name. Returns its concatenated outputs ``[b,columns]`` after tanh,
-        with 0 for NaN. Outputs of a head are ``[b,K * 13]``.
+        The inputs are those of the torch module of the same name. Returns all its outputs, concatenated, as
+        ``[b,columns]`` after tanh, with 0 in place of NaN. The outputs of a head are ``[b,K * 13]``.
         """
         if name.startswith("heads."):
             return self._run_head(name, *inputs)
         return self._run_refiner(*inputs) if name == "refiner" else self._run_set_network(name, *inputs)
 
     def _run_set_network(self, name: str, tokens: np.ndarray, mask: np.ndarray, group: np.ndarray) -> np.ndarray:
-        """Run the encoder or the merger: embed the tokens of a set, let them attend, pool them, and join the group."""
+        """Run the encoder or the merger: embed tokens, run attention, pool the tokens, and join the group's numbers."""
         set_name = f"{name}.set"
         x = self._mlp(f"{set_name}.embed", tokens)
         for i in range(self.options.blocks):
@@ -89,6 +89,7 @@ class NetworkWeights:
         return np.concatenate([self._dense(f"{name}.{out}", hidden, TANH) for out in outs], 1)
 
     def _run_refiner(self, tokens: np.ndarray, mask: np.ndarray, group: np.ndarray) -> np.ndarray:
+        """Run the refiner, in which the first token of a group is the group itself, and the others its neighbours."""
         x = self._mlp("refiner.embed", tokens)
         last = self.options.refine_blocks - 1
         for i in range(last + 1):
@@ -100,6 +101,7 @@ class NetworkWeights:
     def _run_head(
         self, name: str, latents: np.ndarray, group: np.ndarray, children: np.ndarray, mask: np.ndarray
     ) -> np.ndarray:
+        """Run a decoder head: make a token for each child, run attention, and return a correction for each."""
         numbers = group[:, list(self.options.head_numbers)]
         x = self._mlp(f"{name}.seeds", np.concatenate([latents, numbers], 1))
         x = x.reshape(*children.shape[:2], self.options.width)
@@ -109,14 +111,14 @@ class NetworkWeights:
         return self._dense(f"{name}.out", x, TANH).reshape(len(children), -1)
 
     def _block(self, name: str, x: np.ndarray, mask: np.ndarray, *, first_token_only: bool = False) -> np.ndarray:
-        """Run attention and an MLP, for all tokens or for the first token only."""
+        """Run an attention block on tokens ``x``; return the outputs of all tokens or only of the first token."""
         context = self._norm(f"{name}.before", x)
         x, query = (x[:, :1], context[:, :1]) if first_token_only else (x, context)
         x = self._attention(f"{name}.attention", query, context, mask, x)
         return self._mlp(f"{name}.mlp", self._norm(f"{name}.between", x), residual=x)
 
     def _pool(self, name: str, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Reduce sets ``[b,n,w]`` to one token each, ``[b,w]``."""
+        """Reduce each set of n tokens ``x [b,n,w]`` to one token, ``[b,w]``."""
         query = np.repeat(self.arrays[f"{name}.seed"], len(x), 0)
         pooled = self._attention(f"{name}.attention", query, self._norm(f"{name}.before", x), mask, query)
         return self._mlp(f"{name}.mlp", self._norm(f"{name}.between", pooled), residual=pooled)[:, 0]
@@ -124,7 +126,7 @@ class NetworkWeights:
     def _attention(
         self, name: str, query: np.ndarray, context: np.ndarray, mask: np.ndarray, residual: np.ndarray
     ) -> np.ndarray:
-        """Attend from ``query [b,q,w]`` to ``context [b,n,w]``, and add the result to ``residual [b,q,w]``."""
+        """Let tokens ``query [b,q,w]`` attend to ``context [b,n,w]``; return the outputs plus ``residual [b,q,w]``."""
         (sets, queries, width), heads = query.shape, self.options.heads
         query, pairs = self._dense(f"{name}.query", query), self._dense(f"{name}.pair", context)
         mixed = np.empty((sets, queries, heads * padded(width // heads)), np.float32)
@@ -133,13 +135,13 @@ class NetworkWeights:
         return self._dense(f"{name}.out", mixed, residual=residual)
 
     def _mlp(self, name: str, x: np.ndarray, activation: int = PLAIN, residual: np.ndarray | None = None) -> np.ndarray:
-        """Run two linear layers with GELU between them."""
+        """Run two linear layers with GELU between them, and add ``residual`` if given."""
         return self._dense(f"{name}.2", self._dense(f"{name}.0", x, GELU), activation, residual)
 
     def _dense(
         self, name: str, x: np.ndarray, activation: int = PLAIN, residual: np.ndarray | None = None
     ) -> np.ndarray:
-        """Run a linear layer on the last axis."""
+        """Run a linear layer on the last axis, and add ``residual`` if given."""
         weight, bias, outputs = self._layers[name]
         rows = np.ascontiguousarray(x, np.float32).reshape(-1, x.shape[-1])
         out = np.empty((len(rows), outputs), np.float32)
@@ -148,7 +150,7 @@ class NetworkWeights:
         return out.reshape(*x.shape[:-1], outputs)
 
     def _norm(self, name: str, x: np.ndarray) -> np.ndarray:
-        """Normalise the last axis."""
+        """Run a layer norm on the last axis."""
         rows = np.ascontiguousarray(x).reshape(-1, x.shape[-1])
         out = np.empty_like(rows)
         normalise(rows, self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"], out)
@@ -156,12 +158,12 @@ class NetworkWeights:
 
     @cached_property
     def _layers(self) -> dict[str, Layer]:
-        """The linear layers in the form that the library takes, by name."""
+        """All linear layers by name, packed as the library takes them."""
         names = [name.removesuffix(".weight") for name, array in self.arrays.items() if array.ndim == 2]
         return {name: self._layer(name) for name in names}
 
     def _layer(self, name: str) -> Layer:
-        """Pack a linear layer; the layers before and after attention get padded values for each head."""
+        """Return a packed linear layer; those before and after attention are padded, so that heads fill vectors."""
         weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
         width, heads = self.options.width, self.options.heads
         size = width // heads

@@ -39,7 +39,7 @@ from gsmerge.photos.scores import stands_out
 from gsmerge.photos.views import camera_kinds
 from gsmerge.raster import render
 from gsmerge.raster.photos import row_pictures
-from gsmerge.runtime.record import choose, list_some, note
+from gsmerge.runtime.record import list_some, note, record_choices
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
 from gsmerge.types import PicturedScene
@@ -90,7 +90,7 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         _note_hidden(scene, hidden, matching)
     changed = [view for view in matching if hidden[view].any() or changes[view] or view in grey]
     if changed:
-        choose(photos_changed=[scene.names[view] for view in changed])
+        record_choices(photos_changed=[scene.names[view] for view in changed])
     return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching)
 
 
@@ -245,7 +245,7 @@ def _note_stray(scene: PicturedScene, stray: Sequence[int], photo_views: Sequenc
     They are, unless most photos are stray.
     """
     names = [scene.names[view] for view in stray]
-    choose(photos_left_out=names)
+    record_choices(photos_left_out=names)
     are_few, listed = 2 * len(stray) <= len(photo_views), list_some(names)
     result = f" and are not used: {listed}"
     if not are_few:

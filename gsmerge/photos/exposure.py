@@ -25,7 +25,7 @@ from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve
 from gsmerge.photos.photo_change import CLIPPED, PhotoChange, change_large
 from gsmerge.raster.photos import NEAR_PLANE
-from gsmerge.runtime.record import choose, note
+from gsmerge.runtime.record import note, record_choices
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Exposure
 from gsmerge.types import Cameras, PicturedScene, Scene
@@ -86,7 +86,7 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
             remedy = "--set exposure=per-photo brings them to their mean exposure"
             note(f"{differ}; photos stay unchanged, because {objection}; {remedy}")
             return scene
-    choose(exposure=factors.tolist())
+    record_choices(exposure=factors.tolist())
     note(f"{differ}; photos are brought to their mean exposure")
     return _divide_by_gains(scene, factors)
 

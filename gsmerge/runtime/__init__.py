@@ -1,3 +1,3 @@
-"""The running process: threads, memory, records, and estimates of time and memory."""
+"""Threads, processes and memory of a run, its record, and its plugins."""
 
-MOST_THREADS = 1024  # each takes memory, even if it never has work
+MOST_THREADS = 1024  # because each thread takes memory, even if it never has work

@@ -1,4 +1,4 @@
-"""Memory of the machine and of the process, arrays in files, and release of unused memory."""
+"""Measure and estimate memory, keep large arrays in files, and release unused memory."""
 
 from __future__ import annotations
 
@@ -15,24 +15,26 @@ from weakref import WeakSet
 
 import numpy as np
 
-LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")  # of control groups 2 and 1
-# Parameters of glibc with their values, see mallopt(3). An array of 32 MiB or more gets separate pages, which are
-# returned when it is deleted. A process keeps up to 256 MiB of other freed memory for further arrays. With the default
-# values, clearing new pages for each array took a tenth of the time of `gsmerge view` for a page.
+# Files with the memory limit of a control group, version 2 and version 1
+LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+# Parameters of glibc with their values, see mallopt(3). An array of 32 MiB or more gets separate pages, which return to
+# the system when it is deleted. The process keeps up to 256 MiB of other freed memory for further arrays. With the
+# default values, the system cleared new pages for each array, a tenth of the time in which `gsmerge view` makes a page
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
-# Bytes that a run needs
-BYTES_FIXED = 250_000_000  # interpreter and libraries
-BYTES_PER_GAUSSIAN = 150  # of the scene, without higher harmonics
-BYTES_PER_VALUE = 4.5  # for each value of higher harmonics: of the scene, and of some of its groups
-BYTES_PER_PIXEL = 90  # the photo as floats, and arrays of segmentation and rendering
-# A conversion: of a Gaussian, up to a .sog or .glb; a .ply takes a third. Of each value of higher harmonics
+# Bytes of memory that a run needs
+BYTES_FIXED = 250_000_000  # for the interpreter and the libraries
+BYTES_PER_GAUSSIAN = 150  # for each Gaussian of the scene, without higher harmonics
+BYTES_PER_VALUE = 4.5  # for each value of higher harmonics, in the scene and in some of its groups
+BYTES_PER_PIXEL = 90  # for the photo as floats, and arrays of segmentation and rendering
+# Bytes that a conversion needs for each Gaussian, and for each value of higher harmonics. These are those of a .sog or
+# .glb, which need most; a .ply takes a third
 BYTES_CONVERTED, BYTES_CONVERTED_VALUE = 330, 6
-BYTES_ELSEWHERE = 40  # per Gaussian of the whole scene while a block of it is in memory
+BYTES_ELSEWHERE = 40  # for each Gaussian outside of the block that is in memory
 FEWER_PIXELS = (
     "use fewer views (gsmerge extend adds more later), export without higher harmonics, or try --effort draft"
 )
-_own_pages: WeakSet[mmap.mmap] = WeakSet()  # maps made here: only their pages may be discarded
+_own_pages: WeakSet[mmap.mmap] = WeakSet()  # maps that this module has made; only their pages may be discarded
 
 
 def peak_memory() -> int:
@@ -47,7 +49,7 @@ def peak_memory() -> int:
 
 
 def machine_memory() -> int | None:
-    """Return the memory of this machine, or the limit of its control group, in bytes; None if unknown."""
+    """Return the memory of this machine in bytes, or the lower limit of its control group; None if unknown."""
     if sys.platform == "win32":
         return _memory_status()[1]
     limits = []
@@ -60,7 +62,7 @@ def machine_memory() -> int | None:
 
 
 def free_memory() -> int | None:
-    """Return the bytes of memory that new processes can take; None if unknown."""
+    """Return how many bytes of memory new processes can take; None if unknown."""
     if sys.platform == "win32":
         return _memory_status()[2]
     with suppress(OSError, KeyError, ValueError), open("/proc/meminfo", encoding="ascii") as file:
@@ -70,7 +72,7 @@ def free_memory() -> int | None:
 
 
 def _memory_status() -> list[int]:
-    """Return the numbers of Windows' MEMORYSTATUSEX: the second is the total memory, the third the free memory."""
+    """Return the numbers of the struct MEMORYSTATUSEX of Windows; the second is the total memory, the third is free."""
     status = (ctypes.c_uint64 * 8)(64)  # the structure begins with its size
     if sys.platform == "win32":
         ctypes.windll.kernel32.GlobalMemoryStatusEx(status)
@@ -80,20 +82,20 @@ def _memory_status() -> list[int]:
 def memory_bytes(pixels: int, *, num_rest: int = 0, num_elsewhere: int = 0) -> int:
     """Estimate the memory of a run in bytes, imports included.
 
-    ``pixels``: number of pixels or Gaussians of the scene, or of the block in memory. ``num_rest``: columns of higher
-    harmonics. ``num_elsewhere``: number of Gaussians outside the block.
+    ``pixels`` is the number of pixels or Gaussians of the scene, or of the block in memory. ``num_rest`` is the number
+    of values of higher harmonics of a Gaussian, and ``num_elsewhere`` the number of Gaussians outside the block.
     """
     pixel_bytes = BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL
     return BYTES_FIXED + round(pixel_bytes * pixels + BYTES_ELSEWHERE * num_elsewhere)
 
 
 def conversion_bytes(count: int, num_rest: int) -> int:
-    """Estimate the memory of a conversion of ``count`` Gaussians in bytes; ``num_rest`` as in :func:`memory_bytes`."""
+    """Estimate the memory of a conversion in bytes; ``num_rest`` is the number of values of higher harmonics."""
     return count * (BYTES_CONVERTED + BYTES_CONVERTED_VALUE * num_rest)
 
 
 def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
-    """Return why a run that needs ``needed`` bytes may not fit into this machine, and what helps; None if it fits."""
+    """Return the message for a run that needs more memory than this machine has, with a remedy; None if it fits."""
     available = machine_memory()
     if available is None or needed <= available:
         return None
@@ -101,7 +103,7 @@ def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
 
 
 def keep_memory() -> None:
-    """Let new arrays reuse the memory of deleted ones, if the C library can; for processes that do a single job."""
+    """Let new arrays reuse the memory of deleted ones, if the C library can; for processes with a single job."""
     with suppress(AttributeError, OSError, TypeError):  # not glibc
         mallopt = ctypes.CDLL(None).mallopt
         for parameter in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
@@ -111,8 +113,8 @@ def keep_memory() -> None:
 def release_memory() -> None:
     """Return freed memory to the operating system.
 
-    glibc keeps the memory that a thread has freed for the same thread. Over stages that use different threads this adds
-    up to a tenth of the peak. Does nothing on systems other than Linux.
+    glibc keeps memory that a thread has freed for this thread. If stages use different threads, this is up to a tenth
+    of the peak. Does nothing on systems other than Linux.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
@@ -120,12 +122,11 @@ def release_memory() -> None:
 
 
 def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: int | None = None) -> np.ndarray:
-    """Make an uninitialised array; map a large array from an unnamed temporary file, if the disk has room.
+    """Return an uninitialised array. A large array is mapped from an unnamed temporary file, if the disk has room.
 
-    ``mapped_bytes``: size in bytes from which an array is large; at most ``MAPPED_BYTES``, which is also the default.
-
-    A mapped array takes memory only for pages in use, and none after :func:`free_pages`. Its file is in the system's
-    temporary folder (``TMPDIR``) and is removed with the array.
+    An array is large from ``mapped_bytes`` bytes on, by default and at most ``MAPPED_BYTES``. A mapped array takes
+    memory only for the pages in use, and none after :func:`free_pages`. Its file is in the system's temporary folder
+    (``TMPDIR``) and is removed with the array.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size >= min(MAPPED_BYTES, mapped_bytes or MAPPED_BYTES) and hasattr(os, "posix_fallocate"):
@@ -149,7 +150,7 @@ def free_pages(arrays: Iterable[np.ndarray]) -> None:
 
 
 def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
-    """Copy ``array[ids]``, with only a part of a mapped array in memory at a time; sorted ids need the least memory."""
+    """Return a copy of ``array[ids]``, with few pages of a mapped array in memory at a time if ids are sorted."""
     num_parts = -(-array.nbytes // MAPPED_BYTES)
     if num_parts <= 1:
         return array[ids]
@@ -163,7 +164,7 @@ def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
 def human_share(share: float, digits: int = 2) -> str:
     """Format a share in [0, 1] as a percentage: ``0.044`` -> ``4.40 %``.
 
-    It has ``digits`` decimals, or more if these would all be zeros.
+    The percentage has ``digits`` decimals, or more if these would all be zeros.
     """
     percent = 100 * share
     digits = digits if percent <= 0 else max(digits, -math.floor(math.log10(percent)))
@@ -171,7 +172,7 @@ def human_share(share: float, digits: int = 2) -> str:
 
 
 def human_bytes(count: float) -> str:
-    """Format bytes with powers of ten: ``1234567`` -> ``1.2 MB``."""
+    """Format a number of bytes with units of powers of ten: ``1234567`` -> ``1.2 MB``."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"

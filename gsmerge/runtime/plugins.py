@@ -1,4 +1,4 @@
-"""Import at first use: functions of optional parts, and entry points of installed packages."""
+"""Import functions of optional parts, and plugins of other packages, only when they are used."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from gsmerge.errors import UsageError
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-COMMANDS, METHODS = "gsmerge.commands", "gsmerge.methods"  # groups of entry points
+COMMANDS, METHODS = "gsmerge.commands", "gsmerge.methods"  # groups of the entry points of plugins
 
 
 @dataclass(frozen=True)
 class LazyFunction:
-    """A function, given by module and name, whose module is imported at the first call; for tables of formats."""
+    """A function whose module is imported at the first call, so that tables of formats cost nothing."""
 
     module: str
     name: str
@@ -33,13 +33,13 @@ class LazyFunction:
 
 
 def lazy_functions(package: str) -> Callable[[str], LazyFunction]:
-    """Return a function that makes a :class:`LazyFunction` of "module.name" in a package."""
+    """Return a function that takes a text "module.name" and returns the :class:`LazyFunction` of this package."""
     return lambda place: LazyFunction(f"{package}.{place.split('.')[0]}", place.split(".")[1])
 
 
 @cache
 def find_plugins(group: str) -> dict[str, EntryPoint]:
-    """Find the entry points of a group without importing any, sorted by name; of equal names the first counts."""
+    """Return the entry points of a group by name, sorted, without importing any; of equal names the first counts."""
     from importlib.metadata import entry_points  # takes 8 ms, and most commands do not need it
 
     plugins: dict[str, EntryPoint] = {}
@@ -49,7 +49,7 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
 
 
 def load_plugin(group: str, name: str) -> Any:
-    """Import the object of an entry point; UsageError with the name of its package if that fails."""
+    """Import and return the object of an entry point; UsageError with the name of its package if that fails."""
     entry = find_plugins(group)[name]
     try:
         return entry.load()

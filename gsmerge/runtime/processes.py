@@ -1,4 +1,4 @@
-"""A pool of processes on this machine; each process makes one call after the other."""
+"""Make calls in a pool of processes on this machine, each of which makes one call after the other."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ LOST, FEWER = "its process was killed or ended unexpectedly", "perhaps out of me
 
 
 class ProcessPool(WorkerPool):
-    """A pool of up to ``jobs`` processes, each an executor of its own, so that one that dies costs its call alone.
+    """A pool of up to ``jobs`` processes. Each is an executor of its own, so a process that dies loses only its call.
 
-    ``memory``: bytes that all calls may need together; a call that needs more runs alone.
+    The calls that run at the same time may need ``memory`` bytes together. A call that needs more runs alone.
     """
 
     def __init__(self, jobs: int, threads: int, memory: float) -> None:
@@ -31,7 +31,7 @@ class ProcessPool(WorkerPool):
         self.calls: dict[Future[Any], tuple[Call, ProcessPoolExecutor]] = {}  # running calls, each with its executor
 
     def has_room(self, call: Call) -> bool:
-        """Return whether a call fits into the memory beside those that run."""
+        """Return true if a call fits into the memory beside those that run, or if none runs."""
         needed = call.memory + sum(running.memory for running, _ in self.calls.values())
         return not self.calls or needed <= self.memory
 
@@ -40,7 +40,7 @@ class ProcessPool(WorkerPool):
         executor = self.idle.pop() if self.idle else ProcessPoolExecutor(
             1, multiprocessing.get_context("spawn"), initializer=begin_worker
         )  # fmt: skip
-        with _library_threads(self.threads):  # the first call starts the process
+        with _library_threads(self.threads):  # because the first call of an executor starts its process
             self.calls[executor.submit(function, *call.arguments)] = call, executor
 
     def wait(self) -> list[tuple[Any, Any]]:
@@ -51,12 +51,12 @@ class ProcessPool(WorkerPool):
             if isinstance(future.exception(), BrokenProcessPool):
                 ended.append((call.key, LostProcess(f"{LOST}; {memory_problem(call.memory) or FEWER}")))
             else:
-                self.idle.append(executor)  # first, since the call may have failed, and all executors are closed
+                self.idle.append(executor)  # before result(), which raises the error of a failed call
                 ended.append((call.key, future.result()))
         return ended
 
     def close(self) -> None:
-        """End all processes, at once if a call runs."""
+        """End all processes; those that make a call are killed."""
         for _, executor in self.calls.values():
             for process in [*executor._processes.values()]:  # before Python 3.14 no other way ends a running call
                 process.kill()
@@ -66,7 +66,7 @@ class ProcessPool(WorkerPool):
 
 @contextmanager
 def _library_threads(count: int) -> Iterator[None]:
-    """Let NumPy's libraries use ``count`` threads in processes that are started within the block."""
+    """Let libraries that NumPy uses have ``count`` threads in each process that is started within the block."""
     before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(count)))
     try:
@@ -78,7 +78,7 @@ def _library_threads(count: int) -> Iterator[None]:
 
 
 def begin_worker() -> None:
-    """Prepare a process of the pool: it leaves Ctrl-C and stdout to its parent, and ends with it."""
+    """Prepare a process of the pool, so that it ignores Ctrl-C, writes to stderr only, and ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.dup2(2, 1)
     parent = multiprocessing.parent_process()

@@ -1,7 +1,8 @@
-"""The record of a run: seconds of each stage, choices, notes for the user, and progress.
+"""Record what a run does: the seconds of each stage, choices, notes for the user, and progress.
 
 A run begins a record with :func:`record_run`. Code within the run, on the same thread, writes to this record with
-:func:`stage`, :func:`note` and :func:`choose`, without passing it around. Outside a run these write to no record.
+:func:`stage`, :func:`note` and :func:`record_choices`, so the record is no argument of any function. Outside a run
+these functions write nothing.
 """
 
 from __future__ import annotations
@@ -16,19 +17,19 @@ from typing import Any, NamedTuple
 
 from gsmerge.runtime.memory import release_memory
 
-Progress = Callable[[str, int, int], None]  # stage, done, total
+Progress = Callable[[str, int, int], None]  # takes the name of the stage, the number of steps done, and that of all
 STAGES = (
     "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
     "cover", "decode", "join", "fit", "prune", "fill", "score", "input",
 )  # fmt: skip
-FIT_STEP = "fit: "  # reports of a fit's steps begin with this
-BEFORE_FIT = 0.8  # share of the stages' seconds that pass before the fits
-# Stages after which memory is released, since other threads have freed much of it
+FIT_STEP = "fit: "  # the texts that report steps of a fit begin with this
+BEFORE_FIT = 0.8  # share of the seconds of all other stages that pass before the fits
+# Memory is released after these stages, because their threads have freed much that other threads cannot use
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 
 class RunPart(NamedTuple):
-    """A part of a run: the seconds of its fits and of all other stages, of which only the ratios count here."""
+    """Expected seconds of a part of a run, in its fits and in all other stages; only their ratios matter."""
 
     stages: float
     fits: float = 0.0
@@ -36,20 +37,20 @@ class RunPart(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """Seconds of the part."""
+        """Expected seconds of the whole part."""
         return self.stages + self.fits
 
 
 @dataclass
 class Forecast:
-    """Share of a run that is done, by the seconds of its parts; within a part, by the steps of its fits."""
+    """Estimates the share of a run that is done, by the expected seconds of its parts and the steps of its fits."""
 
-    parts: list[RunPart] = field(default_factory=list)  # The present one and those after it
-    spent: float = 0.0  # Seconds of the parts that have ended
-    has_begun: bool = False
-    fit: int = 0  # Fit of the present part, from 0, with its last step
-    step: int = 0
-    part_spent: float = 0.0  # Seconds of what is done of the present part
+    parts: list[RunPart] = field(default_factory=list)  # The present part, if one has begun, and those after it
+    spent: float = 0.0  # Expected seconds of the parts that have ended
+    has_begun: bool = False  # True from the first call of `begin` on
+    fit: int = 0  # Number of the present fit within the present part, from 0
+    step: int = 0  # Last step of this fit
+    part_spent: float = 0.0  # Expected seconds of what is done of the present part
 
     def begin(self) -> None:
         """End the present part, if there is one, and begin the next."""
@@ -60,11 +61,11 @@ class Forecast:
         self.has_begun, self.fit, self.step, self.part_spent = True, 0, 0, 0.0
 
     def expect(self, parts: Iterable[RunPart]) -> None:
-        """Set the parts that follow the present one."""
+        """Replace the parts that are expected after the present one."""
         self.parts[self.has_begun :] = parts
 
     def take_step(self, step: int, num_steps: int) -> None:
-        """Take a step of a fit; a lower number than the last one means that the next fit has begun."""
+        """Note that a fit has reached a step; a lower number than before means that the next fit has begun."""
         self.fit += step < self.step
         self.step = step
         if self.has_begun:
@@ -80,14 +81,14 @@ class Forecast:
 
 @dataclass
 class Record:
-    """Record of a run: seconds, choices, notes and progress."""
+    """What a run has recorded so far."""
 
-    progress: Progress | None = None  # Called with (stage, done, total)
+    progress: Progress | None = None  # Called at every report of progress
     seconds: dict[str, float] = field(default_factory=dict)  # Wall time of each stage
-    choices: dict[str, Any] = field(default_factory=dict)  # Decisions of the stages
+    choices: dict[str, Any] = field(default_factory=dict)  # Decisions of the stages, by name
     notes: list[str] = field(default_factory=list)  # Warnings and adaptations, each once
     running: str | None = None  # The stage that is being timed
-    forecast: Forecast = field(default_factory=Forecast)  # Of the whole run; parts of the run share it
+    forecast: Forecast = field(default_factory=Forecast)  # Of the whole run; the records of its parts share it
 
 
 _current: ContextVar[Record | None] = ContextVar("record", default=None)
@@ -95,7 +96,7 @@ _current: ContextVar[Record | None] = ContextVar("record", default=None)
 
 @contextmanager
 def record_run(progress: Progress | None = None) -> Iterator[Record]:
-    """Start a record for all reports of the block; at its end, ``progress`` is called with "done"."""
+    """Start a record to which all code in the block writes; at its end, ``progress`` is called with "done"."""
     with _write_to(Record(progress)) as record:
         yield record
         report_progress("done", len(STAGES), len(STAGES))
@@ -108,9 +109,10 @@ def current_record() -> Record:
 
 @contextmanager
 def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[Record]:
-    """Start a separate record for a part of the current run; ``silent``: do not report its progress.
+    """Start a separate record for a part of the current run, to which all code in the block writes.
 
-    With a ``title``, progress reports all stages of the part as steps of one stage with this name.
+    If ``silent`` is true, the progress of the part is not reported. With a ``title``, its progress is reported as that
+    of a stage of this name, of which the stages of the part are steps.
     """
     progress = None if silent else current_record().progress
     if progress is not None and title is not None:
@@ -126,7 +128,7 @@ def _titled(progress: Progress, title: str) -> Progress:
 
 @contextmanager
 def _write_to(record: Record) -> Iterator[Record]:
-    """Make a record the current one within the block."""
+    """Make ``record`` the current record within the block."""
     token = _current.set(record)
     try:
         yield record
@@ -136,9 +138,10 @@ def _write_to(record: Record) -> Iterator[Record]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Time a block or function as a stage; within another stage, its time counts for the outer stage.
+    """Report the progress of a stage, and record the seconds of its block; also a decorator of functions.
 
-    Progress of a name that is not one of ``STAGES`` counts the stages before it.
+    Within another stage this does nothing, because the time counts for the outer stage. A ``name`` that is not one of
+    ``STAGES`` is reported as the stage after those that are done.
     """
     record = _current.get()
     if record is None or record.running is not None:
@@ -157,21 +160,21 @@ def stage(name: str) -> Iterator[None]:
 
 
 def list_some(items: Sequence[str], separator: str = ", ") -> str:
-    """List the first items for a note, and the number of further ones."""
+    """Return the first items as a text for a note, with the number of those that are left out."""
     max_named = 4  # largest number of items that a note lists
     rest = f" and {len(items) - max_named} more" if len(items) > max_named else ""
     return separator.join(items[:max_named]) + rest
 
 
 def note(text: str) -> None:
-    """Add a note or a :class:`Doubt` to the current record, unless it has it already, and to the package's log."""
+    """Add a note or a :class:`Doubt` to the current record and to the package's log, unless the record has it."""
     record = current_record()
     if text not in record.notes:
         record.notes.append(text)
         logging.getLogger("gsmerge").info(text)
 
 
-def choose(**choices: Any) -> None:
+def record_choices(**choices: Any) -> None:
     """Add decisions of a stage to the current record, by name."""
     current_record().choices.update(choices)
 
@@ -184,24 +187,27 @@ def add_seconds(seconds: Mapping[str, float]) -> None:
 
 
 def adopt(part: Record) -> None:
-    """Copy choices and notes of a part's record into the current record."""
+    """Copy the choices and notes of a part's record into the current record."""
     record = current_record()
     record.choices |= part.choices
     record.notes += [text for text in part.notes if text not in record.notes]
 
 
 def expect_parts(parts: Iterable[RunPart]) -> None:
-    """Set the parts that the current run expects after its present part, replacing earlier expectations."""
+    """Replace the parts that the current run expects after its present part."""
     current_record().forecast.expect(parts)
 
 
 def begin_part() -> None:
-    """Begin the next part that the current run expects."""
+    """Note that the current run begins the next part that it expects."""
     current_record().forecast.begin()
 
 
 def report_progress(text: str, done: int, total: int) -> None:
-    """Report the progress of a stage, or of a step as ``"stage: detail"``, to the caller of the current run."""
+    """Report to the caller of the current run that ``done`` of ``total`` steps are done.
+
+    ``text`` is the name of the stage, or ``"stage: detail"`` for a step within a stage.
+    """
     record = current_record()
     if text.startswith(FIT_STEP):
         record.forecast.take_step(done, total)

@@ -1,10 +1,10 @@
-"""One thread pool for the whole package.
+"""Compute many items in parallel, on one pool of threads for the whole package.
 
-A kernel runs on one thread and releases the GIL. This module runs kernels in parallel over views or bands of an image.
-Therefore a pass over the views has one barrier, instead of one per loop, and no thread spins. A result cannot depend on
-the number of threads, since every item is computed separately and results are returned in order. While a pool is in
-use, OpenCV and torch are limited to one thread each, so that they do not compete with the pool for cores. Torch is
-limited only if other code has imported it.
+A kernel runs on one thread and releases the GIL, so several threads can run kernels at once, each on another view or on
+another band of an image. So threads wait for each other once for each pass over the views, not in each loop, and
+none is busy while it waits. A result cannot depend on the number of threads, because every item is computed by itself
+and results are returned in order. While a pool is in use, OpenCV and torch may use one thread each, so that they do not
+compete with the pool for cores. Torch is limited only if other code has imported it.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ import cv2
 from gsmerge.errors import UsageError
 from gsmerge.runtime import MOST_THREADS
 
-THREADS = "GSMERGE_THREADS"  # environment variable: the default number of threads
+THREADS = "GSMERGE_THREADS"  # environment variable with the default number of threads
 T = TypeVar("T")
 R = TypeVar("R")
-LIBRARIES = r"(PIL|plyfile|numpy|gsmerge\.io)\b"  # modules whose warnings are about damage, which readers report
-AT_ONCE = 12  # number of results of in_turn in memory at the same time
+LIBRARIES = r"(PIL|plyfile|numpy|gsmerge\.io)\b"  # modules that warn of damaged files, which readers report themselves
+AT_ONCE = 12  # most results of in_turn that are in memory at the same time
 
 
 class _Pool:
-    """Threads that wait for work; they start it in a tenth of the time that an executor with futures needs."""
+    """Threads that wait for work, and start it in a tenth of the time that an executor with futures takes."""
 
     def __init__(self, count: int) -> None:
         self.work = SimpleQueue[Callable[[], None] | None]()
@@ -58,8 +58,8 @@ class _Pool:
 def quiet_warnings() -> Iterator[None]:
     """Ignore warnings of libraries in the block, which may run in several threads at once.
 
-    Python's own ``catch_warnings`` would leave the filters of one thread to all others for good. So the first block
-    sets the filter, and the last one restores the caller's.
+    Filters of warnings are shared by all threads. If each block used Python's ``catch_warnings``, a block could restore
+    the filters that another one has set. So the first block sets the filter, and the last one to end removes it.
     """
     with _Quiet.lock:
         if not _Quiet.blocks:
@@ -77,36 +77,36 @@ def quiet_warnings() -> Iterator[None]:
 
 
 class _Quiet:
-    """State of :func:`quiet_warnings`, the same for all threads."""
+    """State of :func:`quiet_warnings`, which all threads share."""
 
     lock = threading.Lock()
-    blocks = 0  # that are running
-    saved: Any = None  # the caller's filters
+    blocks = 0  # number of blocks that are running
+    saved: Any = None  # the filters before the first block
 
 
 class _Local(threading.local):
-    """Pool of each calling thread, so that two simultaneous calls do not shut down each other's pool."""
+    """State of each calling thread, so that two calls at the same time do not shut down each other's pool."""
 
     pool: _Pool | None = None
-    count = 1
-    inside = False  # True on the pool's own threads, which must not wait for a pool
+    count = 1  # threads that parallel_map uses
+    inside = False  # True on a thread that computes an item, which must not wait for a pool
     holds_torch = False  # True if torch was limited to one thread for this thread's pool
 
 
 class _Libraries:
-    """Threads of torch and OpenCV. These are settings of the process, so all callers share them."""
+    """Numbers of threads of torch and OpenCV. These are settings of the process, so all callers share them."""
 
     lock = threading.Lock()
     pools = 0  # number of pools in use
-    opencv = 1  # OpenCV's threads before the first pool
-    torch: int | None = None  # torch's threads before the first pool; None if torch is not limited
+    opencv = 1  # number of OpenCV's threads before the first pool
+    torch: int | None = None  # number of torch's threads before it was limited; None if it is not limited
 
 
 _local, _libraries = _Local(), _Libraries()
 
 
 def available_threads() -> int:
-    """Return the number in the variable ``GSMERGE_THREADS``, or of the processors that this process may use.
+    """Return the number in the variable ``GSMERGE_THREADS``, or else that of processors that this process may use.
 
     UsageError if the variable is not a number from 1 to ``MOST_THREADS``.
     """
@@ -119,7 +119,7 @@ def available_threads() -> int:
 
 
 def work_alone() -> None:
-    """Make :func:`parallel_map` on the calling thread compute items one by one, as on the pool's own threads."""
+    """Let the calling thread compute the items of :func:`parallel_map` one by one, as threads of a pool do."""
     _local.inside = True
 
 
@@ -172,7 +172,7 @@ def hold_torch() -> None:
 
 
 def _release_libraries() -> None:
-    """Restore the threads of torch for this thread's pool, and those of OpenCV when no pool is in use."""
+    """Count one pool less. Restore torch's threads if this pool has limited them, and OpenCV's after the last pool."""
     with _libraries.lock:
         _libraries.pools -= 1
         if _local.holds_torch:
@@ -186,9 +186,8 @@ def _release_libraries() -> None:
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """Return ``[function(item) for item in items]``, computed on the pool, in the order of the items.
 
-    Outside :func:`use_threads` a pool with all processors is made for the call. Within another call the items are
-    computed one by one. The calling thread computes items as well, so that a short call costs one hand-over instead of
-    one for each item.
+    Outside of :func:`use_threads`, a pool with all processors is made for the call. A call within a computed item
+    computes its own items one by one. The calling thread computes items as well.
     """
     items = list(items)
     with use_threads() as count:
@@ -198,9 +197,9 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
 
 def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Yield the results of :func:`parallel_map` in order, with at most ``AT_ONCE`` in memory at a time.
+    """Yield the results of :func:`parallel_map` in order, with at most ``AT_ONCE`` of them in memory at a time.
 
-    Use it for large results, one per view, that are only summed up. Memory then does not grow with the number of views.
+    For large results of views that are only summed up, so that memory does not grow with the number of views.
     """
     items = list(items)
     for start in range(0, len(items), AT_ONCE):
@@ -210,8 +209,8 @@ def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 def _compute_on_pool(pool: _Pool, function: Callable[[T], R], items: list[T], num_helpers: int) -> list[R]:
     """Compute the items on this thread and on ``num_helpers`` threads of the pool; a free thread takes the next item.
 
-    The call does not wait for a thread that took no item. After an error, the thread takes all remaining items
-    without computing them. If several items fail, the error of the first item is raised, whichever thread is quicker.
+    The call does not wait for threads that took no item. After an error, a thread takes further items without computing
+    them. If several items fail, the error of the first of them is raised, whichever thread was quicker.
     """
     results: list[R] = [None] * len(items)  # type: ignore[list-item]
     indices = itertools.count()  # its next() is atomic

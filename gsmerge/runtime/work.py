@@ -1,8 +1,8 @@
-"""Engines that make calls: in this process, in other processes of this machine, or on a Ray cluster.
+"""Make calls in this process, in other processes of this machine, or on a Ray cluster.
 
-Ray is an optional dependency; it schedules calls by threads and memory. If a process dies, its call is lost. On a
-cluster the call is repeated on another process, with the same result. :mod:`gsmerge.runtime.processes` has the
-processes of this machine.
+Ray is an optional dependency, which schedules calls by their threads and memory. If a process dies, its call is lost.
+On a cluster, another process repeats the call, with the same result. The pool of processes of this machine is in
+:mod:`gsmerge.runtime.processes`.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from gsmerge.runtime.record import Record, record_part, report_progress
 from gsmerge.runtime.threads import use_threads
 
 T = TypeVar("T")
-RETRIES = 5  # repetitions of a call whose process or node was lost
-SMALL_STORE = 100 << 20  # bytes of shared objects on a cluster of this machine
+RETRIES = 5  # a call whose process or node was lost is repeated at most this often
+SMALL_STORE = 100 << 20  # bytes for shared objects, if Ray starts a cluster on this machine
 
 
 class Call(NamedTuple):
     """A call to make in another process."""
 
-    key: Any  # identifies the result for the caller
+    key: Any  # by which the caller recognises the result
     arguments: tuple[Any, ...]
     memory: int = 0  # bytes that the call may need
 
 
 class LostProcess(NamedTuple):
-    """Result of a call whose process or node was lost."""
+    """The result of a call whose process or node was lost."""
 
     reason: str
 
 
 class WorkerPool(ABC):
-    """Processes that make up to ``capacity`` calls at once."""
+    """Processes that make up to ``capacity`` calls at the same time."""
 
     capacity: int
 
     def run(self, function: Callable[..., Any], calls: Iterable[Call]) -> Iterator[tuple[Any, Any]]:
         """Make calls of a picklable function; take the next call when a process is free.
 
-        Yields key and result of each call as it ends; the result is a :class:`LostProcess` if the process died. Raises
-        the exception of a failed call.
+        Yields the key and the result of each call as soon as it ends. If the process died, the result is a
+        :class:`LostProcess`. Raises the exception of a failed call.
         """
         waiting, num_running, call = iter(calls), 0, None
         while True:
@@ -63,7 +63,7 @@ class WorkerPool(ABC):
             yield from ended
 
     def has_room(self, call: Call) -> bool:
-        """Return whether a call may start beside those that run; if none runs, it must."""
+        """Return true if a call may start beside those that run. If none runs, the answer must be true."""
         return True
 
     @abstractmethod
@@ -81,9 +81,9 @@ class WorkerPool(ABC):
 
 @contextmanager
 def start_work(engine: str, address: str | None = None, *, threads: int | None, memory: int) -> Iterator[Work]:
-    """Open an engine for calls that each need ``memory`` bytes and ``threads`` (None: the engine chooses).
+    """Open an engine for calls that each need ``memory`` bytes and ``threads`` threads (None: the engine chooses).
 
-    With the ``engine`` ``"local"``, calls run in this process, one after the other. With ``"ray"`` they run on the Ray
+    The ``engine`` "local" makes calls in this process, one after the other. The engine "ray" makes them on the Ray
     cluster at ``address``.
     """
     with ExitStack() as stack:
@@ -96,7 +96,7 @@ class Cluster:
 
     def __init__(self, address: str | None, *, store_bytes: int | None = None) -> None:
         self.ray = require_ray()
-        _join(self.ray, address, store_bytes)
+        _connect(self.ray, address, store_bytes)
 
     @property
     def processors(self) -> int:
@@ -104,9 +104,10 @@ class Cluster:
         return int(self.ray.cluster_resources().get("CPU", 1.0))
 
     def needs(self, threads: int, memory: int) -> dict[str, float]:
-        """Return the resources that a task requests, limited to those of the largest node.
+        """Return the resources that a task with ``threads`` and ``memory`` bytes requests from Ray.
 
-        In Ray a task that requests more would wait forever. UsageError if no node has processors.
+        They are limited to those of the largest node, because a task that requests more would wait forever. UsageError
+        if no node has processors.
         """
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
         if not nodes:
@@ -128,15 +129,15 @@ class Work:
     memory: int
 
     def share(self, value: Any) -> Any:
-        """Return a reference to a large argument, so that several calls can share it."""
+        """Return what to pass in place of a large argument, so that calls on a cluster share one copy of it."""
         return value if self.cluster is None else self.cluster.ray.put(value)
 
     def run(
         self, title: str, function: Callable[..., T], count: int, calls: Iterable[tuple[Any, ...]]
     ) -> Iterator[tuple[T, Record]]:
-        """Make ``count`` calls of a picklable function; yield result and record of each call, in order.
+        """Make ``count`` calls of a picklable function; yield the result and the record of each call, in order.
 
-        A cluster makes several calls at once, limited by its processors; this process makes one after the other.
+        A cluster makes as many calls at once as its processors allow. This process makes one after the other.
         """
         if self.cluster is not None:
             yield from self._run_on_cluster(self.cluster, title, function, count, calls)
@@ -152,6 +153,7 @@ class Work:
     def _run_on_cluster(
         self, cluster: Cluster, title: str, function: Callable[..., T], count: int, calls: Iterable[tuple[Any, ...]]
     ) -> Iterator[tuple[T, Record]]:
+        """Make the calls of :meth:`run` on a cluster; yield the results after the last call has ended, in order."""
         resources = cluster.needs(self.threads or max(1, cluster.processors // count), self.memory)
         pool, results = RayPool(cluster, max(1, int(resources["num_cpus"]))), dict[int, Any]()
 
@@ -169,25 +171,25 @@ class Work:
 
 
 def _call_in_part(threads: int, function: Callable[..., T], *arguments: Any) -> tuple[T, Record]:
-    """Make a call with its own record, and return both."""
+    """Make a call on ``threads`` threads; return its result, and a record that holds only what it recorded."""
     with use_threads(threads), record_part() as record:
         value = function(*arguments)
     return value, replace(record, progress=None)
 
 
 class RayPool(WorkerPool):
-    """A pool of up to ``jobs`` calls on a Ray cluster; 0: as many as it has processors."""
+    """A pool of up to ``jobs`` calls on a Ray cluster; 0 stands for as many as the cluster has processors for."""
 
     def __init__(self, cluster: Cluster, threads: int, *, jobs: int = 0) -> None:
         self.cluster, self.ray = cluster, cluster.ray
         self.threads, self.jobs = threads, jobs
-        calls_per_process = 200  # a process is then replaced, so that memory leaks of libraries cannot add up
+        calls_per_process = 200  # after these a process is replaced, so that memory leaks of libraries cannot add up
         self.function = self.ray.remote(max_retries=RETRIES, max_calls=calls_per_process)(_call_in_folder)
         self.keys: dict[Any, Any] = {}  # key of each running call, by the reference to its result
 
     @property
     def capacity(self) -> int:  # type: ignore[override]
-        """Number of simultaneous calls, which changes with the size of the cluster."""
+        """Largest number of calls at the same time, which changes with the size of the cluster."""
         return self.jobs or max(1, self.cluster.processors // self.threads)
 
     def submit(self, function: Callable[..., Any], call: Call) -> None:
@@ -220,7 +222,7 @@ class RayPool(WorkerPool):
 
 
 def _call_in_folder(folder: str, function: Callable[..., T], *arguments: Any) -> T:
-    """Make a call in the caller's working directory, to which relative paths refer."""
+    """Make a call in the working directory of the caller, because relative paths refer to it."""
     with suppress(OSError):
         os.chdir(folder)
     return function(*arguments)
@@ -235,10 +237,10 @@ def require_ray() -> ModuleType:
     return ray
 
 
-def _join(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
-    """Connect to the cluster, or start one on this machine."""
+def _connect(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
+    """Connect to the Ray cluster at ``address``; if None, start one on this machine with ``store_bytes``."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # after Ray itself has ended a process
+    os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # of tasks that Ray ends when memory runs out
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
     if ray.is_initialized():
         raise UsageError("engine ray: expected a process without a connection to Ray; call ray.shutdown() first")

@@ -1,1 +1,1 @@
-"""Declarations of all options: default, meaning and possible values. Light to import, since ``--help`` reads them."""
+"""Declare all options, in modules that take little time to import, because ``--help`` reads them."""

@@ -1,4 +1,4 @@
-"""Settings that decide the number of Gaussians, and the parsers of their texts.
+"""Declare the settings that decide the number of Gaussians, and parse their texts.
 
 A user asks for a count, a share of the input, a file size, a device or a quality.
 """
@@ -15,10 +15,10 @@ from fractions import Fraction
 from gsmerge.errors import UsageError
 from gsmerge.settings.setting import Settings, setting, suggest_name
 
-UNIT_BYTES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes
+UNIT_BYTES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 AUTO = "auto"
-COUNT_PATTERN = r"\d[\d_]*|\d{1,3}(?:,\d{3})+|\d*\.?\d+(?:k|m|e\d)"  # Gaussians: 40000, 40_000, 40,000, 40k, 4e4
-DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
+COUNT_PATTERN = r"\d[\d_]*|\d{1,3}(?:,\d{3})+|\d*\.?\d+(?:k|m|e\d)"  # such as 40000, 40_000, 40,000, 40k or 4e4
+DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}  # Gaussians that a device draws fluidly
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class BudgetOptions(Settings):
     fill: bool = setting(False, "Use all of a share, file size or device, even if fewer Gaussians suffice.")
     most: int | None = setting(None, "Number of Gaussians beyond which new views gain nothing, if known.",
         internal=True)  # fmt: skip
-    quality: str | None = setting(None, "Use the fewest Gaussians that render photos at a PSNR such as 30dB, or at "
-        "most so far below the best number, such as -0.2dB, judged by PSNR + 40 SSIM.",
+    quality: str | None = setting(None, "Use the fewest Gaussians that reach a target on photos: a PSNR such as 30dB, "
+        "or a loss against the best number of Gaussians such as -0.2dB (in PSNR + 40 SSIM).",
         "The photos are held out if there are four or more, otherwise they are those of the input. If the rows belong "
         "to no pixels and no number is asked for, the result keeps the quality of the input. Without photos it "
         "reaches 32.5 dB against renders of the input; with photos it loses at most 0.3 dB on them.")  # fmt: skip
@@ -60,40 +60,40 @@ class BudgetOptions(Settings):
 
     @property
     def search_names(self) -> list[str]:
-        """Names of the settings in use that need several results to be built and compared."""
+        """Names of the settings in use for which several results have to be built and compared."""
         requests = {"budget auto": self.auto, "levels": self.levels > 1, f"quality {self.quality}": self.quality}
         return [name for name, is_asked in requests.items() if is_asked]
 
     @property
     def leaves_open(self) -> bool:
-        """Whether the budget leaves the number of Gaussians to the scene, at most with a limit."""
+        """True if the scene decides the number of Gaussians, freely or up to the limit of a device."""
         return self.budget in (None, AUTO, *DEVICES)
 
     @property
     def auto(self) -> bool:
-        """Whether the scene decides the count."""
+        """True if the scene alone decides the number of Gaussians."""
         return self.budget == AUTO
 
     @property
     def is_limit(self) -> bool:
-        """Whether the budget is an upper limit: a share, a size or a device, used only as far as new views gain."""
+        """True if the budget is a share, a size or a device, and used only as far as new views gain."""
         return not self.fill and not self.auto and self.budget is not None and self.number is None
 
     @property
     def is_filled(self) -> bool:
-        """Whether the result has all Gaussians that the budget names or allows, even where no view sees them."""
+        """True if the result has as many Gaussians as the budget names or allows, even if no view sees some of them."""
         return self.number is not None or self.fill
 
     @property
     def number(self) -> int | None:
-        """The number of Gaussians that the budget names; None if it names none, or is a share, a size or a device."""
+        """The number of Gaussians that the budget names; None without a budget, or for a share, a size or a device."""
         if self.budget is None or self.auto or self.in_bytes or self.budget in DEVICES or "%" in str(self.budget):
             return None
         return parse_budget(self.budget, sys.maxsize)
 
     @property
     def in_bytes(self) -> bool:
-        """Whether the budget is a file size."""
+        """True if the budget is a file size."""
         return re.fullmatch(r"[^a-z]*[kmg]?i?b", str(self.budget).strip().lower()) is not None
 
     @property
@@ -104,13 +104,13 @@ class BudgetOptions(Settings):
 
     @property
     def max_drop(self) -> float | None:
-        """Allowed loss in dB against the best count on the scene's curve; None without such a target."""
+        """Largest loss in dB against the best number of Gaussians on the scene's curve; None without such a target."""
         loss = self.quality is not None and self.quality.strip().startswith("-")
         return -parse_quality(str(self.quality)) if loss else None
 
 
 def parse_quality(text: str) -> float:
-    """Parse the dB of ``--quality``: a PSNR such as "30dB", or a loss such as "-0.2dB", which is returned below zero.
+    """Parse a quality into dB: a PSNR such as "30dB", or a loss such as "-0.2dB", which is returned below zero.
 
     Example:
         >>> parse_quality("30dB"), parse_quality("-0.2dB")
@@ -118,7 +118,7 @@ def parse_quality(text: str) -> float:
     """
     match = re.fullmatch(r"(-?)(\d*\.?\d+)\s*db", str(text).strip().lower(), re.ASCII)
     value = float(match[2]) if match else math.inf
-    grey_psnr = 6.0  # dB; a picture of the mean grey reaches this on any photo, so nobody asks for less
+    grey_psnr = 6.0  # dB that a picture of the mean grey reaches on any photo, so nobody asks for less
     if match is None or not math.isfinite(value) or (value < grey_psnr and not match[1]):
         hint = f'; perhaps "{text}dB"' if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else ""
         hint = f'; perhaps "-{value:g}dB"' if match is not None and 0 < value < grey_psnr else hint
@@ -127,7 +127,7 @@ def parse_quality(text: str) -> float:
 
 
 def parse_share(text: str) -> float:
-    """Parse a share above 0 and up to 100 %: "4.4%" -> 0.044."""
+    """Parse a share above 0 and up to 100 %, such as "4.4%", to a number such as 0.044."""
     match = re.fullmatch(r"(\d*\.?\d+)\s*%", str(text).strip(), re.ASCII)
     share = Fraction(match[1]) / 100 if match else Fraction(0)
     if not 0 < share <= 1:
@@ -136,7 +136,7 @@ def parse_share(text: str) -> float:
 
 
 def share_text(share: float) -> str:
-    """Format a share exactly as :func:`parse_share` reads it: 0.044 -> "4.4%"."""
+    """Format a share such as 0.044 as a text such as "4.4%", which :func:`parse_share` reads as the same number."""
     if isinstance(share, bool) or not isinstance(share, int | float):
         raise ValueError(f"expected a share as a number, got {share!r}")
     return f"{(Decimal(repr(share)) * 100).normalize():f}%"

@@ -1,4 +1,4 @@
-"""All settings of a run in one place, by the flat names that users give."""
+"""Declare all settings of a run, which users give by their flat names, without the stage."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from gsmerge.settings.stages import (
 )
 
 OURS = "gsmerge"  # name of the built-in method; all others are plugins
-EFFORT_NAMES = ("draft", "fast", "default", "best")  # gsmerge.plan.EFFORTS says what each stands for
-CHECKPOINTS = ("auto", "shipped", "paper", "none")  # names of `checkpoint` that are not files
-# Settings under one name; settings that are given besides take precedence. "paper" is the chain of the superpixel
-# merging paper. It cuts 476 x 476 pixels into 12,000 superpixels by BASS from saliency seeds, uses networks with
-# absolute outputs, matches by latents and boxes, does not fit, and prunes by opacity only.
+EFFORT_NAMES = ("draft", "fast", "default", "best")  # gsmerge.plan.EFFORTS has the settings of each
+CHECKPOINTS = ("auto", "shipped", "paper", "none")  # values of `checkpoint` that are not paths of files
+# Several settings under one name; settings that a user gives as well take precedence. "paper" is the method of the
+# superpixel merging paper. It cuts 476 x 476 pixels into 12,000 superpixels by BASS from saliency seeds. It uses
+# networks with absolute outputs, matches by latents and boxes, does not fit, and prunes by opacity only
 RECIPES: Mapping[str, Mapping[str, Any]] = {
     "paper": {
         "superpixels": "5.3%", "segmentation": "bass-st", "match": "aabb", "fit": "none", "min_contribution": 0.0,
@@ -35,9 +35,9 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
 }  # fmt: skip
 # Settings that decide the number of Gaussians
 COUNTS = ("superpixels", "k", "budget")
-# Values for a run on a piece of a scene, which is a block or a batch of views: the whole scene decides these
+# Settings of a run on a piece of a scene, which is a block or a batch of views. Only the whole scene can decide these
 ONE_PIECE: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
-# Values for a run that tries settings on some of the views
+# Settings of a run that tries something on some of the views
 TRIAL: dict[str, Any] = {
     **ONE_PIECE, "budget": None, "quality": None, "levels": 1, "crop": None, "drop": None,
     "photo_scale": 1.0, "recipe": None,
@@ -109,18 +109,18 @@ class CompactOptions(Settings):
 
     @property
     def decides_count(self) -> bool:
-        """Whether settings decide the number of Gaussians, instead of the scene."""
+        """True if settings decide the number of Gaussians, false if the scene does."""
         names = [name for name in self.changed_counts if name != "budget" or not self.budget.leaves_open]
         return self.budget.quality is not None or bool(names)
 
     @property
     def replaces_stages(self) -> bool:
-        """Whether a method, networks or a recipe replace the closed formulas of the stages."""
+        """True if a method, networks or a recipe replace the closed formulas of the stages."""
         return self.method != OURS or self.checkpoint not in ("auto", "none") or self.recipe is not None
 
     @property
     def changes_superpixels(self) -> bool:
-        """Whether settings change how superpixels are cut, merged or decoded; their number does not count."""
+        """True if settings change how superpixels are cut, merged or decoded, other than their number."""
         kinds = (SegmentOptions, MatchOptions, DecodeOptions)
         return bool(self.changed([name for kind in kinds for name in flat_settings(kind) if name not in COUNTS]))
 
@@ -140,7 +140,7 @@ class CompactOptions(Settings):
 
     @property
     def compact_only(self) -> list[str]:
-        """Names of the settings in use that ``extend`` cannot apply, since it keeps Feature Gaussians only."""
+        """Names of the settings in use that ``extend`` cannot apply, because a state has only Feature Gaussians."""
         return [*self.whole_only, *self.blocks.asked]
 
     def changed(self, names: Iterable[str]) -> list[str]:
@@ -158,7 +158,10 @@ class CompactOptions(Settings):
         return flat
 
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
-        """Change settings by flat name (``k=2``), after those of a recipe; raise ValueError for unknown names."""
+        """Return options in which settings are changed by flat name (``k=2``), after those of a recipe.
+
+        Raises ValueError for an unknown name.
+        """
         if not isinstance(settings, Mapping):
             raise TypeError(f"settings: expected a dictionary of values by name, got {type(settings).__name__}")
         all_settings = flat_settings(CompactOptions)

@@ -1,4 +1,4 @@
-"""Settings of an evaluation against photos."""
+"""Declare the settings of an evaluation against photos."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings for adding a batch of new views to a state."""
+"""Declare the settings for adding a batch of new views to a state."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ class ExtendOptions(Settings):
 
 
 def batch_settings(settings: Mapping[str, Any]) -> tuple[CompactOptions, ExtendOptions]:
-    """Make the settings of a batch, by default those of a draft; raise ValueError for unknown ones."""
+    """Make the options of a batch of views from settings by flat name; the default effort is "draft".
+
+    Raises ValueError for an unknown setting, and for levels.
+    """
     names = ExtendOptions.__dataclass_fields__.keys()
     values = {"effort": "draft"} | dict(settings)
     extend_options = ExtendOptions(**{name: values.pop(name) for name in names if name in values})

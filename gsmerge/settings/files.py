@@ -1,4 +1,4 @@
-"""Settings of the files of a result."""
+"""Declare the settings of the files of a result."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class FileOptions(Settings):
         "`NAME.cameras.json` for viewers.")  # fmt: skip
     spz_version: Literal[2, 3] = setting(3, "Version of a `.spz`; readers of before 2025 only read 2.")
     place: str | None = setting(None, "Where a `tileset.json` lies on the globe: LON,LAT,HEIGHT, in degrees and metres "
-        "above the ellipsoid. Of the scene, y points down and z north; its unit is a metre.")  # fmt: skip
+        "above the ellipsoid. The scene's y axis must point down, its z axis north; its unit is a metre.")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""Settings of the fit to the photos."""
+"""Declare the settings of the fit to the photos."""
 
 from __future__ import annotations
 
@@ -9,60 +9,62 @@ from typing import Literal
 from gsmerge.settings.setting import Settings, setting
 
 Fit = Literal["full", "none"]
-STEPS = 320  # of the full fit
-LONG_STEPS = 600  # runs of at least so many steps gain from a little dropout
-USUAL_SHARE = 0.044  # Gaussians per pixel; photos with a quarter of the pixels suffice for this number
-GROW_STEPS = 150  # shorter runs do better when they begin with all their Gaussians
-# Steps for each photo, as a step draws one. Runs with fewer do not draw every photo before they grow, and do better
-# without: of 100 real views 20.9 dB for 20.7, in .6 of the time
+STEPS = 320  # default number of steps of the full fit
+LONG_STEPS = 600  # runs with at least this many steps gain from a little dropout
+USUAL_SHARE = 0.044  # for this many Gaussians per pixel, a quarter of the pixels is enough in the first steps
+GROW_STEPS = 150  # runs with fewer steps do better when they begin with all their Gaussians
+# A run grows only if it has this many steps for each photo, because each step draws one photo. A run with fewer does
+# not draw every photo before it grows. Without growth, a scene of 100 real views has 20.9 instead of 20.7 dB, in .6 of
+# the time
 GROW_ROUNDS = 2
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Constants of the fit, chosen on training scenes; tests and research change them."""
+    """Constants of the fit, which were chosen on training scenes. Only tests and research change them."""
 
-    means_lr: float = 0.1  # Step of a mean, in units of the Gaussian's size
-    scales_lr: float = 0.2  # Step of a log scale
-    quats_lr: float = 0.03  # Step of a quaternion
-    opacities_lr: float = 0.3  # Step of an opacity's logit
-    colors_lr: float = 0.03  # Step of a colour, sRGB in [0, 1]
-    poses_lr: float = 0.1  # First step of a moved camera: rotation and shift, each in pixels
-    decay: float = 0.4  # Factor on all step sizes above but poses_lr at the end; less beyond 300 steps
-    beta1: float = 0.8  # Largest decay of Adam's first moment, see gsmerge.fit.schedule.first_decay
+    means_lr: float = 0.1  # Step size of a mean, in units of the Gaussian's size
+    scales_lr: float = 0.2  # Step size of a log scale
+    quats_lr: float = 0.03  # Step size of a quaternion
+    opacities_lr: float = 0.3  # Step size of an opacity's logit
+    colors_lr: float = 0.03  # Step size of a colour, sRGB in [0, 1]
+    poses_lr: float = 0.1  # First step size of a camera that moves, of its rotation and of its shift, in pixels
+    # At the end, the step sizes of Gaussians are multiplied by this, or by less in runs of more than 300 steps
+    decay: float = 0.4
+    beta1: float = 0.8  # Largest decay of Adam's first moment; gsmerge.fit.schedule.first_decay may give less
     beta2: float = 0.9  # Decay of Adam's second moment
     max_mean_shift: float = 2.0  # Largest shift of a mean, in units of the Gaussian's size
     max_scale_change: float = 2.5  # Largest change of a log scale
     max_opacity_change: float = 4.0  # Largest change of an opacity's logit
-    # Share of the limits of mean and scales for a Gaussian that only one photo shows: that photo
-    # determines its colour, not its depth. With two photos or more the limits apply in full
+    # A Gaussian that only one photo shows may use this share of the limits of mean and scales, because the photo
+    # determines its colour but not its depth. With two photos or more it may use them in full
     single_view_share: float = 0.3
-    # Least scale, in pixels of the photo nearest to the Gaussian: thinner Gaussians show as
-    # needles when a viewer enlarges them. 0: no limit
+    # Least scale, in pixels of the photo nearest to the Gaussian, because thinner Gaussians look like needles when a
+    # viewer enlarges them. 0 sets no limit
     min_scale: float = 0.5
-    # A Gaussian is large if its three sigma reach `long_share` of the width of the nearest photo. Once a run
-    # has grown, a large Gaussian is at most `max_ratio` times as long as its second axis, since longer Gaussians show
-    # as strokes from other viewpoints. Earlier there is no such limit, since few Gaussians find their places better
-    # while they may be long
+    # A Gaussian is long if three standard deviations exceed `long_share` of the width of the nearest photo. After the
+    # growth of a run, a long Gaussian may be at most `max_ratio` times as long as its second axis, because longer
+    # ones look like strokes from other viewpoints. Before the growth there is no such limit, because the few Gaussians
+    # find their places better if they may be long
     long_share: float = 0.25
     max_ratio: float = 3.0
-    average_share: float = 0.2  # Share of the steps, the last ones, over which the parameters are averaged
+    average_share: float = 0.2  # The parameters are averaged over this share of the steps, which are the last ones
     ssim_lambda: float = 0.35  # Share of structural similarity in the loss; the rest is L1
-    # Weight in the loss of the L1 of differences between neighbouring pixels, at the end of a run. It
-    # grows from 0, since the gradients of edges mean little before the edges lie in their places
+    # Weight in the loss, at the end of a run, of the L1 error of differences between neighbouring pixels. It grows from
+    # 0, because these differences mean little before the edges in a picture are in their places
     edge_weight: float = 2.4
-    # Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024):
-    # Gaussians that the photos do not need fade, instead of hiding surfaces in other views
+    # Weight of the mean opacity in the loss (3DGS-MCMC, Kheradmand et al. 2024). It lets Gaussians fade that the photos
+    # do not need, and that would hide surfaces in other views
     opacity_reg: float = 0.03
-    # Weight in the loss of the mean size, in units of each Gaussian's size at its start. Fewer Gaussians
-    # overlap then, and a step takes a third less time
+    # Weight in the loss of the mean scale, in units of each Gaussian's size at its start. With it fewer Gaussians
+    # overlap, and a step takes a third less time
     scale_reg: float = 0.01
-    outside_every: int = 7  # Steps from one outside view to the next, see gsmerge.fit.outside
-    # Share of the steps before the first outside view, 1 for none. Early in a run, Gaussians in gaps help
-    # the other Gaussians
+    outside_every: int = 7  # Steps from one view from outside to the next, see gsmerge.fit.outside
+    # Share of the steps before the first view from outside; 1 for none. Early in a run, Gaussians in gaps help the
+    # others to find their places
     outside_from: float = 0.15
-    # Least exposure of a view, as a factor on the mean, that scores compensate; smaller differences come from holes and
-    # highlights as often as from the camera
+    # Scores compensate the exposure of views only if one differs from the mean by this factor. Smaller differences come
+    # from holes and highlights as often as from the camera
     min_gain: float = 1.15
 
     def scaled(self, factor: float) -> Tuning:
@@ -79,15 +81,15 @@ class FitOptions(Settings):
         "it.")  # fmt: skip
     fit_steps: int | None = setting(None, "Number of steps of the full fit; each step draws one view.",
         "By default 320, scaled by `effort` and by the numbers of views and Gaussians.", least=1)  # fmt: skip
-    photo_scale: float | Literal["auto"] = setting("auto", "Photo scale, relative to the view size, for two of every "
-        "five later steps; at most the scale of the photos that are given.",
+    photo_scale: float | Literal["auto"] = setting("auto", "Size of the photos in two of every five later steps, "
+        "relative to the views; at most the size of the photo files.",
         "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf)  # fmt: skip
     dropout: float | None = setting(None, "Share of the Gaussians that are left out of each step.",
         "By default 0.1 for at most five views and at least 150 steps, 0.05 for at least 600 steps and 30 steps per "
         "view, otherwise 0.", least=0, below=1)  # fmt: skip
-    half_res_share: float | None = setting(None, "Share of the steps, the first ones, that draw a quarter of the "
-        "pixels.", "By default 0.7, with at least 600 steps 0.5, with fewer than 20 steps 1. Less if there are more "
-        "Gaussians than 4.4 % of the pixels.", least=0, most=1)  # fmt: skip
+    half_res_share: float | None = setting(None, "Share of the steps, at the start of a run, that draw a quarter of "
+        "the pixels.", "By default 0.7, with at least 600 steps 0.5, with fewer than 20 steps 1. Less if there are "
+        "more Gaussians than 4.4 % of the pixels.", least=0, most=1)  # fmt: skip
     holdout: float = setting(0.05, "Share of the photos' patches that is held out, to decide whether a fit is "
         "accepted.", above=0, below=1)  # fmt: skip
     min_contribution: float = setting(1 / 255, "Least blending weight of a Gaussian. A fit removes Gaussians that "
@@ -110,15 +112,15 @@ class FitOptions(Settings):
 
     @property
     def steps(self) -> int:
-        """Number of steps of the full fit."""
+        """The number of steps of the full fit."""
         return STEPS if self.fit_steps is None else self.fit_steps
 
     @property
     def half_res_part(self) -> float:
-        """Share of the steps, the first ones, that draw a quarter of the pixels."""
+        """The share of the steps, at the start of a run, that draw only a quarter of the pixels."""
         if self.half_res_share is not None:
             return self.half_res_share
-        too_few_steps = 20  # shorter runs have no time for full-size photos
+        too_few_steps = 20  # runs with fewer steps have no time for whole photos
         if self.steps < too_few_steps:
             return 1.0
         most = 0.5 if self.steps >= LONG_STEPS else 1.0  # details come last, and long runs have the time for them
@@ -127,5 +129,5 @@ class FitOptions(Settings):
 
     @property
     def grows(self) -> bool:
-        """Whether the fit starts with fewer Gaussians than requested and adds the rest during its steps."""
+        """True if the fit starts with fewer Gaussians than requested, and adds the rest after half of its steps."""
         return self.fit == "full" and self.steps >= self.grow_steps

@@ -1,4 +1,4 @@
-"""Endings of the files that ``gsmerge render`` writes."""
+"""List the endings of the files that ``gsmerge render`` writes."""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 GIF = ".gif"

@@ -1,4 +1,4 @@
-"""Settings that turn, scale and move a scene when it is written, and limit its harmonics."""
+"""Declare the settings that turn, scale and move a scene when it is written, and limit its harmonics."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class PlacementOptions(Settings):
 
     @property
     def asked(self) -> bool:
-        """Whether the scene is changed at all."""
+        """True if any setting changes the scene."""
         return self.moves or self.sh_degree is not None
 
     @property
     def moves(self) -> bool:
-        """Whether the scene is turned, scaled or moved."""
+        """True if the scene is turned, scaled or moved."""
         return any(value is not None for value in (self.up, self.scale, self.rotate, self.translate))
 
 

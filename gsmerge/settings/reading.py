@@ -1,4 +1,4 @@
-"""Hints for reading a file of Gaussians whose values do not show their encoding, or suggest a wrong one."""
+"""Declare hints for reading files of Gaussians whose values do not show their encoding, or suggest a wrong one."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ ColorChoice = Literal["auto", "sh", "rgb"]
 QuatChoice = Literal["wxyz", "xyzw"]
 Order = Literal["auto", "view-major", "view-fastest", "none"]
 
-SCENE_ARGUMENTS = ("cameras", "images", "masks", "protect", "opacity")  # of read_scene, besides hints
-NONE = "none"  # in place of a path: read the scene without cameras, photos or masks. Path(NONE) is a file of that name
+SCENE_ARGUMENTS = ("cameras", "images", "masks", "protect", "opacity")  # arguments of read_scene other than hints
+NONE = "none"  # this text in place of a path means to read the scene without such files; Path("none") is a file
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
-"""Declare settings: default, help and possible values of each.
+"""Declare settings, each with its default, its help and its possible values.
 
-The checks of values, the help in Python, the options of the command line and docs/reference are all derived from these
+The checks of values, the help in Python, the options of the command line and docs/reference all follow from these
 declarations. This package imports neither NumPy nor torch, so that ``--help`` is fast.
 """
 
@@ -22,41 +22,41 @@ KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", s
 
 @dataclass(frozen=True)
 class Setting:
-    """Declaration of one setting: default, help and range. :func:`setting` makes it, :func:`settings_of` names it."""
+    """The declaration of a setting. :func:`setting` makes it; :func:`settings_of` adds its name and its type."""
 
-    help: str  # shown by the command line too; names of values in single backticks
-    more: str = ""  # further sentences, shown by Python's help and docs/reference only
-    choices: Sequence[Any] | Callable[[], Sequence[Any]] = ()  # possible values, where the type does not list them
-    least: float | None = None
-    most: float | None = None
-    above: float | None = None
-    below: float | None = None
-    unit: str = ""
-    unique: bool = False  # true: a list must not repeat a value
-    filled: bool = False  # true: a list must have at least one value
-    internal: bool = False  # true: the program sets it, users cannot
-    name: str = ""
-    kind: Any = None
+    help: str  # first sentences of the help, which the command line shows too; names of values are in single backticks
+    more: str = ""  # further sentences, which only Python's help and docs/reference show
+    choices: Sequence[Any] | Callable[[], Sequence[Any]] = ()  # possible values, if the type does not list them
+    least: float | None = None  # smallest value
+    most: float | None = None  # largest value
+    above: float | None = None  # values must be larger than this
+    below: float | None = None  # values must be smaller than this
+    unit: str = ""  # unit of the value, for messages
+    unique: bool = False  # true if a list must not repeat a value
+    filled: bool = False  # true if a list must have at least one value
+    internal: bool = False  # true if only the program sets it
+    name: str = ""  # name of the field
+    kind: Any = None  # type of the field
     default: Any = None
 
     @property
     def text(self) -> str:
-        """Full help text of the setting."""
+        """The whole help of the setting."""
         return f"{self.help} {self.more}".strip()
 
     @property
     def is_group(self) -> bool:
-        """Whether the value is itself a dataclass of settings, such as those of one stage."""
+        """True if the value is itself a dataclass of settings, such as those of a stage."""
         return is_dataclass(self.kind)
 
     @property
     def is_list(self) -> bool:
-        """Whether the value is a list; choices and range then apply to its elements."""
+        """True if the value is a list. Choices and range then apply to its elements."""
         return get_origin(self.kind) is tuple
 
     @property
     def kinds(self) -> list[Any]:
-        """Types that a value may have."""
+        """The types that a value may have, other than listed words."""
         kinds = [kind for kind in _types(self.kind) if get_origin(kind) is not Literal]
         return [kind for kind in kinds if kind is NoneType] if self.choices else kinds
 
@@ -68,12 +68,13 @@ class Setting:
         return (*listed, *(word for kind in literals for word in get_args(kind)))
 
     def fits(self, value: Any) -> bool:
-        """Return whether a value has one of the types, without checking choices and range."""
+        """Return true if a value has one of the types, without a check of choices and range."""
         if self.is_list:
             return isinstance(value, list | tuple) and all(map(self._fits, value))
         return self._fits(value)
 
     def _fits(self, value: Any) -> bool:
+        """Return true if a value, or an element of a list, has one of the types."""
         is_bool = type(value).__name__.startswith("bool")  # of Python or NumPy, which is not imported here
         for kind in _types(self.kind):
             if get_origin(kind) is Literal:
@@ -89,6 +90,7 @@ class Setting:
         return False
 
     def _in_range(self, value: Any) -> bool:
+        """Return true if a value of the right type is one of the choices and in the range."""
         if self.choices:
             return value is None or value in self.words
         is_number = isinstance(value, Real)
@@ -96,12 +98,13 @@ class Setting:
         return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
 
     def values(self) -> str:
-        """Describe the possible values: choices, a range, or a type."""
+        """Return the possible values as a text for messages: choices, a range, or a type."""
         kinds = [kind for kind in self.kinds if kind is not NoneType]
         texts = [self._describe_range(kind) if kind in (int, float) else KIND_NAMES.get(kind, "") for kind in kinds]
         return join_words([*texts, *map(str, self.words)])
 
     def _describe_range(self, kind: type) -> str:
+        """Return the possible numbers as a text, such as "a whole number from 1 to 8"."""
         low = f"above {_number(self.above)}" if self.least is None else _number(self.least)
         high = f"below {_number(self.below)}" if self.most is None else _number(self.most)
         if self.least is None and self.above is None:
@@ -116,18 +119,19 @@ class Setting:
         if value is self.default:
             return
         if not self.is_list:
-            self._check(value)
+            self._check_element(value)
             return
         if not isinstance(value, list | tuple):
             raise ValueError(f"{self.name}: expected a list of {self.values()}, got {value!r}")
         if self.filled and not value:
             raise ValueError(f"{self.name}: expected at least one value, got none")
         for element in value:
-            self._check(element)
+            self._check_element(element)
         if self.unique and len(set(value)) < len(value):
             raise ValueError(f"{self.name}: expected every value once, got {','.join(map(str, value))}")
 
-    def _check(self, value: Any) -> None:
+    def _check_element(self, value: Any) -> None:
+        """Raise ValueError if a value that is no list, or an element of a list, is not allowed."""
         if self._fits(value) and self._in_range(value):
             return
         hint = suggest_name(value, self.words)
@@ -135,7 +139,7 @@ class Setting:
 
 
 def setting(default: Any, help: str, more: str = "", **declared: Any) -> Any:
-    """Declare a setting as a field of a :class:`Settings` class; ``declared`` are fields of :class:`Setting`."""
+    """Return a field of a :class:`Settings` class, which is a setting; ``declared`` are fields of :class:`Setting`."""
     return field(default=default, metadata={"setting": Setting(help, more, default=default, **declared)})
 
 
@@ -143,7 +147,7 @@ class Settings:
     """Base class of frozen dataclasses whose fields are settings; invalid values raise ValueError."""
 
     def __init_subclass__(cls) -> None:
-        """Write the declarations of the fields into the docstring."""
+        """Append the help of all fields to the docstring of the class."""
         declared = [(name, f) for name, f in vars(cls).items() if isinstance(f, Field) and "setting" in f.metadata]
         lines = [f"    {name}: {f.metadata['setting'].text}" for name, f in declared]
         cls.__doc__ = "\n".join([cleandoc(cls.__doc__ or ""), "", "Args:", *lines])
@@ -157,11 +161,11 @@ class Settings:
             declared.check(value)
 
 
-_declared: dict[type, dict[str, Setting]] = {}  # by class; resolving the types of its fields takes time
+_declared: dict[type, dict[str, Setting]] = {}  # results of settings_of, which takes time to resolve types
 
 
 def settings_of(options: type) -> dict[str, Setting]:
-    """Return the declarations of a class of settings by field name."""
+    """Return the declarations of the settings of a class, by field name, in the order of the fields."""
     if options not in _declared:
         kinds = get_type_hints(options)
         entries = {f.name: f.metadata["setting"] for f in fields(options) if "setting" in f.metadata}
@@ -171,7 +175,7 @@ def settings_of(options: type) -> dict[str, Setting]:
 
 @cache
 def flat_settings(options: type) -> dict[str, Setting]:
-    """Return all settings by flat name; the settings of a stage replace the stage."""
+    """Return the declarations of all settings that users can give, by flat name, in place of the groups."""
     flat: dict[str, Setting] = {}
     for name, declared in settings_of(options).items():
         if not declared.internal:
@@ -180,7 +184,7 @@ def flat_settings(options: type) -> dict[str, Setting]:
 
 
 def change_settings(options: T, values: Mapping[str, Any]) -> T:
-    """Change settings by flat name, including those of stages."""
+    """Return ``options`` with new values of settings by flat name, also of those in groups."""
     changes: dict[str, Any] = {}
     for name, declared in settings_of(type(options)).items():
         names = flat_settings(declared.kind) if declared.is_group and not declared.internal else {name}
@@ -192,13 +196,13 @@ def change_settings(options: T, values: Mapping[str, Any]) -> T:
 
 
 def join_words(words: Iterable[str]) -> str:
-    """Join words as "a, b or c"."""
+    """Join words to a text such as "a, b or c"."""
     listed = list(words)
     return " or ".join(filter(None, (", ".join(listed[:-1]), *listed[-1:])))
 
 
 def suggest_name(word: Any, names: Iterable[Any]) -> str:
-    """Return "; perhaps NAME", the end of a message about an unknown word, or "" if no name resembles it."""
+    """Return the end "; perhaps NAME" of a message about an unknown word, or an empty text if no name resembles it."""
     from difflib import get_close_matches
 
     lower = {str(name).lower(): name for name in names}
@@ -213,4 +217,5 @@ def _types(kind: Any) -> list[Any]:
 
 
 def _number(value: float | None) -> str:
+    """Return a number as a text, without the zeros of a float."""
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""Settings of the stages before and after the fit, in their order."""
+"""Declare the settings of the stages before and after the fit, in their order."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ MatchMethod = Literal["overlap", "aabb", "none"]
 KRule = Literal["saliency", "distortion"]
 
 SEGMENTATIONS = ("rdseg", "bass", "bass-st", "grid")
-SHARE = "4.4%"  # superpixels per pixel by default
-MAX_CHILDREN = 8  # most Gaussians of a superpixel
-MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # K differs between groups, and is one of these values
-USUAL_K = 1  # the K of "auto", except for a single camera without a long fit
-MATCH_NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours to compare; measurements: docs/internals/notebook.md
+SHARE = "4.4%"  # default number of superpixels per pixel
+MAX_CHILDREN = 8  # most Gaussians that a superpixel may become
+MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # with this option, K is one of these numbers for each group
+USUAL_K = 1  # the K of the option "auto", except for a single camera without a long fit
+MATCH_NEIGHBORS = {"overlap": 16, "aabb": 1}  # default numbers of neighbours to compare, see docs/internals/notebook.md
 CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, optionally with three angles in degrees"
 CROP_NUMBERS = {"sphere": (4,), "box": (6, 9)}
 DROPS = ("floaters", "sky", "transparent", "unseen")
@@ -74,13 +74,13 @@ class SegmentOptions(Settings):
 
     @property
     def per_view(self) -> int | None:
-        """Number of superpixels of each view; None if the option is a share of its pixels or "auto"."""
+        """Number of superpixels of each view; None if the option is a share of the pixels or "auto"."""
         text = str(self.superpixels)
         return int(text) if text.removeprefix("-").isdecimal() else None
 
     @property
     def share(self) -> float:
-        """Superpixels per pixel; the default share where the option gives a number or "auto"."""
+        """Number of superpixels per pixel; the default share if the option is a number per view or "auto"."""
         is_share = self.per_view is None and self.superpixels != AUTO
         return parse_share(str(self.superpixels) if is_share else SHARE)
 
@@ -151,7 +151,7 @@ class CleanOptions(Settings):
     """Settings of clean-up: Gaussians to leave out of the result."""
 
     crop: str | None = setting(None, "Keep only the Gaussians inside sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in "
-        "the scene's world units. Counts, fit and scores are of these.",
+        "the scene's world units. The number of Gaussians, the fit and the scores refer to these.",
         "Three more numbers of a box turn it about its centre, in degrees about x, y and z.")  # fmt: skip
     drop: str | None = setting(None, "Kinds of Gaussians to leave out, separated by commas: floaters, sky, "
         "transparent, unseen.",
@@ -172,22 +172,22 @@ class CleanOptions(Settings):
 
     @property
     def drops(self) -> tuple[str, ...]:
-        """Names of the kinds of Gaussians to drop."""
+        """The kinds of Gaussians to leave out, by name."""
         return () if self.drop is None else tuple(name.strip() for name in self.drop.split(","))
 
     @property
     def asked(self) -> bool:
-        """Whether any clean-up is asked for."""
+        """True if the options ask for any clean-up."""
         return self.crop is not None or bool(self.drops)
 
     @property
     def visible_drops(self) -> list[str]:
-        """Names of the settings in use that remove what photos show."""
+        """Names of the settings in use that leave out what photos show."""
         return ["drop sky"] if "sky" in self.drops else []
 
 
 def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse a crop into its shape and numbers.
+    """Parse a crop into its shape, "sphere" or "box", and its numbers.
 
     Example:
         >>> parse_crop("sphere:0,0,2,1.5")
@@ -209,7 +209,7 @@ def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
 
 @dataclass(frozen=True)
 class Engine(Settings):
-    """Settings of where scenes or blocks are compacted; the result does not depend on them."""
+    """Settings that say where scenes or blocks are compacted; the result does not depend on them."""
 
     engine: str = setting("local", "Where scenes or blocks are compacted. local: on this machine; ray: on a Ray "
         "cluster, which needs the package `ray`.", choices=("local", "ray"))  # fmt: skip
@@ -233,5 +233,5 @@ class BlockOptions(Settings):
 
     @property
     def asked(self) -> list[str]:
-        """Name and value of a number of blocks, for messages; empty without one."""
+        """The setting as a text for messages, if it is a number of blocks; otherwise empty."""
         return [f"blocks {self.blocks}"] if isinstance(self.blocks, int) else []

@@ -1,1 +1,1 @@
-"""Stages of a run, one file for each; they share only the lower layers."""
+"""The stages of a run, each in a file of its own. What several stages use is in the packages below this one."""

@@ -1,4 +1,4 @@
-"""Groups and Gaussians -> members: the pixel that each Gaussian belongs to; Gaussians that no view sees have none."""
+"""Groups and Gaussians -> members: find the pixel to which each Gaussian belongs, if a view sees the Gaussian."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from gsmerge.types import Groups, Scene
 
 @stage("members")
 def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Members:
-    """Return all Gaussians of a canonical scene with pixels as members; UsageError if no view sees any Gaussian.
+    """Return all Gaussians of a canonical scene as members, each with its pixel; UsageError if no view sees any.
 
-    A Gaussian belongs to the superpixel of its pixel. With ``by_contribution``, if views have no Gaussians of their
-    own, it belongs to the one superpixel of all views with the largest sum of its blending weights (paper, supplement
-    "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure these sums.
+    A Gaussian belongs to the superpixel of its pixel. If views have no Gaussians of their own, ``by_contribution``
+    assigns each Gaussian to the superpixel, of any view, in which the sum of its blending weights is largest (paper,
+    supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure these sums.
     """
     members = scene_members(scene)
     if by_contribution and not scene.has_own_pixels:
@@ -38,7 +38,7 @@ def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Me
 
 @dataclass(frozen=True, eq=False)
 class Owners:
-    """The superpixel to which each of n Gaussians contributes most."""
+    """For each of n Gaussians, the superpixel of all views to which it contributes most."""
 
     values: np.ndarray  # [n] float32, blending weights summed over the superpixel, in pixels; 0 if unseen
     views: np.ndarray  # [n] int32, view of the superpixel; -1 if unseen
@@ -46,7 +46,7 @@ class Owners:
 
 
 def find_owners(scene: Scene, groups: Groups) -> Owners:
-    """Find the one superpixel of all views to which each Gaussian contributes most; the first view wins a tie."""
+    """Find the superpixel of all views to which each Gaussian contributes most; of equal ones, the first view's."""
     count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
@@ -63,13 +63,13 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
 
 
 def view_owners(tiled: TiledView, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return each Gaussian's largest contribution ``[m]`` to a superpixel of one view, and that superpixel ``[m]``."""
+    """Return each Gaussian's largest contribution ``[m]`` to a superpixel of one view, and its label ``[m]``."""
     labels = np.ascontiguousarray(labels, np.int32)
     return dominant_labels(*tiled.lists, labels, count)
 
 
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
-    """Return the middle pixel of each Gaussian's superpixel, ``[n]`` int64 over all views, -1 if unseen."""
+    """Return the middle pixel ``[n]`` int64 of each Gaussian's superpixel, counted through all views; -1 if unseen."""
     counts = np.asarray(groups.counts)
     pixels_per_view, offsets = groups.labels[0].size, np.cumsum(counts) - counts
 
@@ -81,7 +81,7 @@ def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
 
 
 def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the pixel ``[count]`` int64 nearest to the centroid of each superpixel; 0 for an empty one."""
+    """Return the pixel ``[count]`` int64 nearest to the centroid of each superpixel; 0 if the superpixel is empty."""
     height, width = labels.shape
     flat = labels.reshape(-1)
     y, x = np.divmod(np.arange(height * width), width)

@@ -1,4 +1,4 @@
-"""Fitted Gaussians -> wanted Gaussians: cropped to a box or a sphere, without floaters, sky and unseen Gaussians."""
+"""Fitted Gaussians -> wanted Gaussians: leave out what is outside a crop, floaters, sky, and unseen Gaussians."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
 
-BOX_QUANTILES = (1, 99)  # percentiles of the positions along each axis that bound the scene's box
-FLOATER_NEIGHBORS = 8  # number of nearest Gaussians; a floater touches none of them
-# A Gaussian hangs across the scene if its second or its largest scale exceeds the first or second share in CURTAIN of
-# half the diagonal of the scene's box, and also exceeds CURTAIN_FACTOR times the median of this scale. Exports, and
-# results without a fit, have no such Gaussians
+BOX_QUANTILES = (1, 99)  # the scene's box reaches from the first to the second percentile of positions on each axis
+FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of this many nearest Gaussians
+# A Gaussian hangs across the scene like a curtain if its second largest scale exceeds the first share of half the
+# diagonal of the scene's box, or its largest scale exceeds the second share. This scale must also exceed CURTAIN_FACTOR
+# times its median over all Gaussians. Exports, and results without a fit, have no such Gaussians
 CURTAIN, CURTAIN_FACTOR = (0.1, 0.33), 8.0
 FLOATER_GAUSSIANS = 200_000  # the share of floaters is estimated from at most about this many Gaussians
 
@@ -28,24 +28,24 @@ Counts = dict[str, int]
 
 
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
-    """Return a mask ``[n]`` of the centres ``[n,3]`` outside of a box ten times as large as the scene's box.
+    """Return a mask ``[n]`` of the centres ``means [n,3]`` outside of a box ten times as large as the scene's box.
 
-    The scene's box reaches from the 1st to the 99th percentile of the ``samples``, or else of the centres, along each
-    axis.
+    The scene's box reaches along each axis from the 1st to the 99th percentile of ``samples [m,3]``, or of the centres
+    if there are no samples.
     """
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
     half = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
-    outlier_box = 10.0  # Gaussians are far from the scene if they lie outside of a box this many times as large
+    outlier_box = 10.0  # side of the larger box, in sides of the scene's box
     return np.asarray((np.abs(means - (low + high) / 2) > outlier_box * half).any(1))
 
 
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
     """Return a mask ``[n]`` of finite Gaussians that are isolated, far beyond the scene, or hang across it.
 
-    A Gaussian is isolated under two conditions. None of its eight nearest neighbours is within three times the sum of
-    both largest scales. The distance to its nearest neighbour is more than three times the median of these distances.
-    See :func:`beyond_scene` and :func:`curtains` for the other two kinds. With ``rows [m]``, only these Gaussians are
-    tested, and the mask is ``[m]``.
+    A Gaussian is isolated if it touches none of its eight nearest neighbours, and if the nearest of them is more than
+    three times as far away as the median. Two Gaussians touch if their distance is at most three times the sum of
+    their largest scales. :func:`beyond_scene` and :func:`curtains` find the other two kinds. If ``rows [m]`` are given,
+    only these Gaussians are tested, and the mask is ``[m]``.
     """
     rows = np.arange(len(gaussians)) if rows is None else rows
     means, sizes = gaussians.means.astype(np.float64), _sorted_scales(gaussians)[1].astype(np.float64)
@@ -54,20 +54,20 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     nearest, touched = _nearest_of(means, sizes, rows, 1)
     apart_factor = 3.0  # the nearest Gaussian of a floater is farther away than this many times the median distance
     isolated = ~touched & (nearest > apart_factor * np.median(nearest))
-    candidates = np.flatnonzero(isolated)  # most Gaussians touch the nearest one; few need the search for more
+    candidates = np.flatnonzero(isolated)  # few, because most Gaussians touch their nearest neighbour
     if len(candidates):
         isolated[candidates] = ~_nearest_of(means, sizes, rows[candidates], FLOATER_NEIGHBORS)[1]
     return isolated | beyond_scene(means[rows], means) | curtains(gaussians, rows)
 
 
 def _nearest_of(means: np.ndarray, sizes: np.ndarray, rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance ``[m]`` from each of ``rows [m]`` to the nearest row, and a mask ``[m]``: touches a near one.
+    """Return the distance ``[m]`` from each of ``rows [m]`` to its nearest neighbour, and a mask ``[m]``.
 
-    ``means [n,3]`` and ``sizes [n]`` are those of all rows, of which the ``count`` nearest are near.
+    The mask is true for rows that touch one of their ``count`` nearest neighbours. ``means [n,3]`` and the largest
+    scales ``sizes [n]`` are those of all Gaussians.
     """
     ids, distances = find_nearest(means, count, rows)
-    # Two Gaussians touch if their distance is at most this many times the sum of their largest scales
-    touch_factor = 3.0
+    touch_factor = 3.0  # Gaussians touch if their distance is at most this many times the sum of their largest scales
     return distances[:, 0], (distances <= touch_factor * (sizes[rows, None] + sizes[ids])).any(1)
 
 
@@ -79,7 +79,7 @@ def _sorted_scales(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 
 
 def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[m]``: which Gaussians ``rows [m]`` hang across the scene, far larger than the median."""
+    """Return a mask ``[m]`` of the Gaussians among ``rows [m]`` that hang across the scene like curtains."""
     low, high = np.percentile(gaussians.means.astype(np.float64), BOX_QUANTILES, axis=0)
     radius = np.sqrt(((high - low) ** 2).sum()) / 2
     is_wide = [
@@ -90,7 +90,7 @@ def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
 
 
 def floater_share(gaussians: Gaussians) -> float:
-    """Estimate the share of finite Gaussians that are :func:`floaters`; 0 without Gaussians."""
+    """Estimate the share of finite Gaussians that are :func:`floaters`, from a sample of them; 0 without Gaussians."""
     rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // FLOATER_GAUSSIANS)))
     return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
 
@@ -98,11 +98,11 @@ def floater_share(gaussians: Gaussians) -> float:
 def clean(
     gaussians: Gaussians, options: CleanOptions, cameras: Cameras | None, photos: np.ndarray | None, to_world: ToWorld
 ) -> tuple[np.ndarray, Counts]:
-    """Choose the Gaussians to keep; return their rows, and the number of dropped Gaussians by reason.
+    """Choose the Gaussians to keep; return their rows, and the number of dropped Gaussians for each reason.
 
-    The reasons are ``cropped`` and the names in ``options.drops``. Gaussians and ``cameras`` are canonical;
-    ``to_world`` maps Gaussians to the frame of the crop. The sky is found in the ``photos [v,h,w,3]``. Without cameras,
-    a Gaussian is unseen if none of several placed cameras shows it.
+    The reasons are ``cropped`` and the names in ``options.drops``. Gaussians and ``cameras`` are canonical. The crop is
+    in the world's frame, to which ``to_world`` maps Gaussians. The sky is found in the ``photos [v,h,w,3]``. If there
+    are no cameras, some are placed, and a Gaussian is unseen if none of these shows it.
     """
     rows, counts = np.arange(len(gaussians)), Counts()
 
@@ -129,7 +129,7 @@ def clean(
 
 
 def describe_counts(counts: Counts, *, placed: bool) -> str:
-    """Say how many Gaussians :func:`clean` dropped for each reason; ``placed``: in placed cameras, not in views."""
+    """Describe how many Gaussians :func:`clean` dropped for each reason; ``placed`` is true if cameras were placed."""
     words = {
         "cropped": "outside of the crop",
         "sky": "sky",
@@ -142,6 +142,6 @@ def describe_counts(counts: Counts, *, placed: bool) -> str:
 
 
 def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:
-    """Keep the ``count`` Gaussians with the largest products of opacity and the two largest scales, in their order."""
+    """Return the ``count`` Gaussians with the largest products of opacity and two largest scales, in their order."""
     area = np.sort(gaussians.scales, axis=1)[:, 1:].prod(1)
     return gaussians[np.sort(np.argsort(-gaussians.opacities * area, kind="stable")[:count])]

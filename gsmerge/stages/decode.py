@@ -1,4 +1,4 @@
-"""Feature Gaussians -> Gaussians: K children of every group by closed formulas, corrected by networks if any."""
+"""Feature Gaussians -> Gaussians: make K children of every group by closed formulas; networks may correct them."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, PicturedScene, Scene
 from gsmerge.values.arrays import as_array
 
-GROUPS_PER_TASK = 8192  # groups that a thread decodes at a time
-PLANE_WEIGHT = 1 / 16  # weight of squared distances from a group's plane, in the unit of the children's features
+GROUPS_PER_TASK = 8192  # number of groups that a thread divides at a time
+PLANE_WEIGHT = 1 / 16  # weight of squared distances from a child's plane, relative to squared differences of colour
 
 
 def decode(
@@ -29,24 +29,26 @@ def decode(
     counts: np.ndarray | None = None,
     networks: Corrector = ANALYTIC,
 ) -> Gaussians:
-    """Decode each Feature Gaussian into K Gaussians, or fewer if its members are equal.
+    """Decode each Feature Gaussian into K Gaussians, its children; there are fewer if its members are equal.
 
     The members are halved repeatedly across their widest direction in colour and position, and each part becomes a
-    child. So the children of K = 2 are unions of those of K = 4. Heads with absolute outputs make exactly K children of
-    every group instead. ``counts [g]``, at least 1, sets K for each group and is required for mixed K. Gaussians of one
-    group are adjacent.
+    child. So the children for K = 2 are unions of those for K = 4. Heads with absolute outputs make exactly K children
+    of every group instead. ``counts [g]`` are the K of each group, at least 1; None: ``options.max_k`` for all. The
+    children of a group are adjacent. Those below ``options.min_opacity`` are left out.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
-    children, parents = repeat(features, counts) if networks.makes_children else divide(features, members, counts)
+    children, parents = (
+        repeat_groups(features, counts) if networks.makes_children else divide_groups(features, members, counts)
+    )
     gaussians = networks.decode(children, parents, features)
     return gaussians[gaussians.opacities >= options.min_opacity]
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:
-    """Return all Gaussians of a scene unchanged if ``count`` is at least their number; otherwise None."""
+    """Return all Gaussians of a scene unchanged if ``count`` is at least their number; otherwise return None."""
     if count is None or count < len(scene.gaussians):
         return None
     return Decoded(scene.gaussians, len(scene.gaussians), exact=True, is_input=True)
@@ -56,8 +58,8 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOptions, *, grows: bool) -> Decoded:
     """Decode merged views into the Gaussians that a fit starts from.
 
-    If an exact count is requested, this is their number, unless the fit ``grows`` to it. Otherwise there are K for each
-    group.
+    If an exact number was requested, there are as many, unless the fit ``grows`` to this number later. Otherwise there
+    are K for each group.
     """
     count, exact = merged.segmentation.count, merged.segmentation.exact
     if exact and not grows:
@@ -70,7 +72,10 @@ def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOpti
 
 
 def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, options: DecodeOptions) -> Gaussians:
-    """Decode ``count`` Gaussians, more for groups in which they lower distortion most; None: K per Feature Gaussian."""
+    """Decode ``count`` Gaussians, more for groups in which they lower distortion most.
+
+    If ``count`` is None, decode K for each Feature Gaussian. Faint ones are left out, so there may be fewer.
+    """
     features, members, networks = merged.features, merged.members, merged.networks
     children = None
     if count is not None:
@@ -81,7 +86,7 @@ def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, 
 
 
 def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> Gaussians:
-    """Decode ``count`` visible Gaussians, more for groups in which they lower distortion most."""
+    """Decode exactly ``count`` visible Gaussians, more for groups in which they lower distortion most."""
     features, members, networks = merged.features, merged.members, merged.networks
     with_faint = replace(options, min_opacity=0.0)
     return deal_visible(
@@ -96,14 +101,14 @@ def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> 
 def deal_visible(
     order: np.ndarray, num_groups: int, total: int, min_opacity: float, make: Callable[[np.ndarray], Gaussians]
 ) -> Gaussians:
-    """Make ``total`` visible Gaussians; children of other groups replace Gaussians fainter than ``min_opacity``.
+    """Make ``total`` Gaussians that are visible, so not fainter than ``min_opacity``.
 
-    Each group gets one Gaussian. Further Gaussians go to the groups ``order [d]``, see :func:`deal_order`. ``make``
-    takes the number of Gaussians for each group ``[g]`` and makes them, including faint ones. There are fewer than
-    ``total`` if the groups have too few members.
+    Each group gets one Gaussian. Further Gaussians go to the groups ``order [d]`` in turn, see :func:`deal_order`.
+    ``make`` takes the number of Gaussians for each group ``[g]`` and makes them. For each one that is too faint, the
+    next group in the order gets one more. There are fewer than ``total`` if the groups have too few members.
     """
     extra = max(0, total - num_groups)
-    refills = 3  # rounds that replace Gaussians too faint to be seen; a few of the new Gaussians are faint again
+    refills = 3  # most rounds that replace faint Gaussians; a few of the new Gaussians are faint again
     for _ in range(refills + 1):
         gaussians = make(1 + np.bincount(order[:extra], minlength=num_groups))
         missing = total - int((gaussians.opacities >= min_opacity).sum())
@@ -119,7 +124,11 @@ def deal_visible(
 def mixed_counts(
     features: FeatureGaussians, members: Members, saliency: np.ndarray, options: DecodeOptions
 ) -> np.ndarray:
-    """Choose K = 1, 2 or 4 for every group by its rank in ``saliency`` (paper supplement, per-superpixel K)."""
+    """Choose K for every group, 1 to 4, by the rule of the options (paper supplement, per-superpixel K).
+
+    ``saliency`` is that of every pixel of all views. The rule "distortion" deals out as many Gaussians in all as the
+    ranks of the saliency would.
+    """
     counts = counts_by_saliency(group_saliency(features, members, saliency), options)
     if options.k_rule == "distortion":
         return split_counts(features, members, int((counts - 1).sum()), MIXED_COUNTS[-1])
@@ -127,7 +136,7 @@ def mixed_counts(
 
 
 def group_saliency(features: FeatureGaussians, members: Members, saliency: np.ndarray) -> np.ndarray:
-    """Average the saliency of all views' pixels over each group's members, ``[g]``; without a pixel it is 0."""
+    """Return the mean saliency ``[g]`` of the pixels of each group's members; a member without a pixel counts as 0."""
     starts, pixels = features.starts, members.pixels[features.members]
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
     return np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
@@ -141,11 +150,11 @@ def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarr
 
 
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
-    """Return the number of Gaussians to decode merged views into; None: K for each Feature Gaussian.
+    """Return the number of Gaussians to decode merged views into, or None for K of each Feature Gaussian.
 
-    If an exact count was requested and no fit grows to it, this is the number. If superpixels are empty, other groups
-    get their Gaussians: a Gaussian in a near and a far view belongs to the near view, so superpixels of the far view
-    may be empty. Heads that make exactly K Gaussians of every group cannot do that.
+    If an exact number was requested and no fit grows to it, this is the number. Otherwise other groups get the
+    Gaussians of empty superpixels. Superpixels of a far view may be empty, because Gaussians that a near view shows too
+    belong to the near view. Heads that make exactly K Gaussians of every group cannot give one group more.
     """
     segmentation, num_empty = merged.segmentation, len(merged.segmentation.groups) - merged.num_groups
     if segmentation.exact and not grows:
@@ -155,21 +164,24 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
     return min(segmentation.count, options.max_k * (len(merged.features) + num_empty))
 
 
-def repeat(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Repeat each Feature Gaussian as ``counts [g]`` equal Gaussians, which heads replace; also return their groups."""
+def repeat_groups(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+    """Repeat each Feature Gaussian as ``counts [g]`` equal Gaussians, which heads replace.
+
+    Returns the Gaussians, and the group ``[n]`` of each.
+    """
     parents = np.repeat(np.arange(len(features)), counts)
     return feature_to_gaussians(features)[parents], parents
 
 
-def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Divide Feature Gaussians into children, faint ones included; also return the group ``[n]`` of each child.
+def divide_groups(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+    """Divide each Feature Gaussian into at most ``counts [g]`` children.
 
-    ``counts [g]`` are the largest numbers of children.
+    Returns the children, faint ones included, and the group ``[n]`` of each child, ascending.
     """
     is_divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if is_divided.any():
-        starts, ids, child_parents = halve(features, members, np.flatnonzero(is_divided), counts)
+        starts, ids, child_parents = halve_groups(features, members, np.flatnonzero(is_divided), counts)
         moments = pool_members(members, starts, ids)
         extinctions = moments.extinctions * features.gains[child_parents]
         children = to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
@@ -181,36 +193,36 @@ def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> 
     return gaussians, parents
 
 
-def halve(
+def halve_groups(
     features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Divide the Gaussians of groups into ``counts [g]`` children by halving.
+    """Divide the members of some ``groups`` into at most ``counts [g]`` children each, by repeated halving.
 
-    Returns the start ``[n+1]`` of each child in a list of rows, that list ``[m]``, whose rows are those of ``members``,
-    and the group ``[n]`` of each child.
+    Returns the start ``[n+1]`` of each child in a list of members, this list ``[m]`` of rows of ``members``, and the
+    group ``[n]`` of each child.
     """
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
-    def run(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        local, group = gather_groups(starts, ids, rows)
+    def halve_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        row_starts, row_ids = gather_groups(starts, ids, rows)
         m = members
         child_starts, child_ids, parents = bisect(
-            local, group, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], counts[rows]
+            row_starts, row_ids, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], counts[rows]
         )
         return np.diff(child_starts), child_ids, rows[parents]
 
-    parts = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
+    parts = parallel_map(halve_rows, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
     sizes, child_ids, parents = (np.concatenate(column) for column in zip(*parts, strict=True))
     return np.concatenate([[0], np.cumsum(sizes)]), child_ids, parents
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
-    """Give ``extra`` Gaussians to groups in which they lower distortion most; return the children ``[g]`` per group.
+    """Return the number of children ``[g]`` of each group, if ``extra`` of them go where they lower distortion most.
 
-    If a child lowers distortion only together with the next child, both count with their mean gain, which is the slope
-    of the convex hull of the group's distortion. So a larger ``extra`` never removes a child. The sum is ``g + extra``,
-    or the largest number of children that the members allow.
+    Each group has at least one child, so the sum is ``g + extra``, or as much as the members allow. If a child lowers
+    distortion only together with the next child, both count with their mean gain, which is a slope of the convex hull
+    of the group's distortion. So a larger ``extra`` never takes a child away.
     """
     if extra < 0:
         raise ValueError(f"extra: expected at least 0, got {extra}")
@@ -222,7 +234,10 @@ def split_counts(features: FeatureGaussians, members: Members, extra: int, max_c
 
 
 def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
-    """Return the groups ``[d]`` in the order in which they get further Gaussians, the largest gain first."""
+    """Return the groups ``[d]`` in the order in which they get further children; the largest gain comes first.
+
+    A group stands in this order once for each child after its first.
+    """
     if max_children == 1 or len(features) == 0:
         return np.zeros(0, np.int64)
     gains = hull_gains(_child_errors(features, members, max_children))
@@ -232,30 +247,40 @@ def deal_order(features: FeatureGaussians, members: Members, max_children: int =
 
 
 def _child_errors(features: FeatureGaussians, members: Members, max_children: int) -> np.ndarray:
-    """Return the distortion ``[g,max_children]`` with 1, 2, ... children; NaN if the members give fewer children."""
+    """Return the distortion ``[g,max_children]`` of groups with 1, 2, ... children; NaN if there cannot be as many."""
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
-    def run(rows: np.ndarray) -> np.ndarray:
-        local, group = gather_groups(starts, ids, rows)
+    def measure_rows(rows: np.ndarray) -> np.ndarray:
+        row_starts, row_ids = gather_groups(starts, ids, rows)
         m = members
         return split_errors(
-            local, group, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
+            row_starts,
+            row_ids,
+            m.means,
+            m.sh0,
+            m.opacities,
+            centres[rows],
+            footprints[rows],
+            max_children,
+            PLANE_WEIGHT,
         )
 
     groups = np.arange(len(features))
     tasks = [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)]
-    return np.concatenate(parallel_map(run, tasks))
+    return np.concatenate(parallel_map(measure_rows, tasks))
 
 
 def hull_gains(errors: np.ndarray) -> np.ndarray:
-    """Return the gain ``[f,c-1]`` of each further child, along the lower convex hull of the errors ``[f,c]``.
+    """Return how much each further child of a group lowers its error: ``[f,c-1]`` from errors ``[f,c]``.
 
-    The gain of a child that does not exist is -inf. Along the hull the gains fall from child to child.
+    The gains are slopes of the lower convex hull of the errors, so they fall from child to child. The gain of a child
+    that cannot exist is -inf.
     """
     num_groups, num_children = errors.shape
     gains = np.full((num_groups, num_children - 1), -np.inf)
-    corner, rows = np.zeros(num_groups, int), np.arange(num_groups)  # `corner`: the last one of each hull so far
+    # `corner` is the number of the last corner of each group's hull so far
+    corner, rows = np.zeros(num_groups, int), np.arange(num_groups)
     for _ in range(num_children - 1):
         steps = np.arange(num_children)[None] - corner[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):

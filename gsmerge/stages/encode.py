@@ -1,6 +1,6 @@
-"""Groups -> Feature Gaussians: one per superpixel by closed formulas, corrected by the networks' encoder if any.
+"""Groups -> Feature Gaussians: pool each superpixel by closed formulas; networks may correct the result.
 
-Groups start fainter if the depths of the views disagree about them.
+A group becomes fainter if the depths of other views contradict it.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from gsmerge.values.arrays import to_float32
 if TYPE_CHECKING:
     from gsmerge.networks.weights import RunnableNetworks
 
-# Factors on the optical depth of a group if more views see through it than have a surface at its position: ALONE if no
-# other view has a surface there, DISPUTED if some do
+# A group is contradicted if more views see through it than have a surface at its position. Its optical depth is
+# multiplied by ALONE if no other view has a surface there, and by DISPUTED if some have
 ALONE, DISPUTED = 0.15, 0.39
 
 
 def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
-    """Combine networks with the members and cameras of a scene; without networks, return the empty correction."""
+    """Combine networks with the members and cameras of a scene; without networks, return ``ANALYTIC``."""
     if networks is None:
         return ANALYTIC
     from gsmerge.networks.apply import NetworkContext
@@ -38,9 +38,9 @@ def make_corrector(networks: RunnableNetworks | None, members: Members, cameras:
 
 @stage("encode")
 def encode(scene: Scene, members: Members, groups: Groups, rule: Rule = "depth") -> FeatureGaussians:
-    """Pool every superpixel into one Feature Gaussian, in order of view and label.
+    """Pool every superpixel that has members into one Feature Gaussian, in order of view and label.
 
-    Superpixels without a valid member are omitted. ``rule``: see :func:`gsmerge.geometry.pooling.pool_members`.
+    :func:`gsmerge.geometry.pooling.pool_members` explains the ``rule``.
     """
     starts, ids, views = member_rows(scene, members, groups)
     return from_moments(pool_members(members, starts, ids, rule), starts, ids, views)
@@ -50,16 +50,19 @@ def encode(scene: Scene, members: Members, groups: Groups, rule: Rule = "depth")
 def correct(
     features: FeatureGaussians, members: Members, cameras: Cameras, networks: Corrector, *, weaken: bool
 ) -> FeatureGaussians:
-    """Correct pooled Feature Gaussians with the encoder network, if any, which also adds latents.
+    """Correct pooled Feature Gaussians with the encoder of the networks, which also adds latents.
 
-    ``weaken``: lower the optical depth of groups that other views see through. This makes holes, which a long fit
-    closes.
+    ``weaken`` makes groups fainter that other views see through. This makes holes, which a long fit closes.
     """
     return networks.encode(weaken_contradicted(features, members, cameras) if weaken else features)
 
 
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """List members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``, without empty superpixels."""
+    """List the members of all superpixels that are not empty.
+
+    Returns the start ``[g+1]`` of each superpixel in a list of members, this list ``[m]`` int32 of rows of ``members``,
+    and the view ``[g]`` of each superpixel.
+    """
     counts = np.asarray(groups.counts)
     offsets, flat = np.cumsum(counts) - counts, groups.labels.reshape(-1)
     labels = np.empty(len(members.pixels), np.int32)
@@ -77,7 +80,7 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
 
 
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
-    """Make Feature Gaussians of pooled groups, with neutral gains."""
+    """Make Feature Gaussians of the ``moments`` of groups, with gains of 1 and without latents."""
     count = len(moments.means)
     names = ("means", "covars", "weights", "masses", "extinctions", "footprints")
     return FeatureGaussians(
@@ -93,9 +96,9 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 
 
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
-    """Lower the optical depth of groups if more views see through them than have a surface at their position."""
+    """Lower the gain, and so the optical depth, of groups that more views see through than have a surface there."""
     f = features
-    nearest_views = 64  # number of nearest views that are compared; more views hardly change the result
+    nearest_views = 64  # each group is compared with this many nearest views; more hardly change the result
     _, same_share, behind_share, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, nearest_views).T
     factors = np.where(behind_share > same_share, np.where(same_share > 0, DISPUTED, ALONE), 1)
     return replace(features, gains=features.gains * factors.astype(np.float32))

@@ -1,8 +1,8 @@
-"""Fitted Gaussians -> filled Gaussians: fill gaps seen from cameras between or just beside the views.
+"""Fitted Gaussians -> filled Gaussians: fill the gaps that cameras between or just beside the views would show.
 
 New views uncover places that no photo shows. So the result of a fit is drawn from cameras between the views and just
-beside them. Gaps in these pictures are filled with Gaussians. They continue the farthest surface beside the gap, at
-depths that no view contradicts.
+beside them. Gaps in these pictures are filled with new Gaussians, which continue the farthest surface beside the gap,
+at depths that no view contradicts.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 
 # Chosen on seven training captures
-FILLED_SHARE = 0.03  # most new Gaussians, as a share of the fitted ones
-FILL_LEVEL = 8  # side of a drawing's pixel in pixels of the views; it is coarse, because the filling is blurred anyway
-FILL_MARGIN = 0.05  # margin of the drawings on each side, as a share of their sides
-# Transmittance above which a pixel is a gap, and below which it shows a surface
+FILLED_SHARE = 0.03  # largest number of new Gaussians, as a share of the fitted ones
+FILL_LEVEL = 8  # width of a drawing's pixel, in pixels of the views; drawings are coarse, since fillings are blurred
+FILL_MARGIN = 0.05  # margin that is added to each side of a drawing, as a share of its width or height
+# A pixel is a gap if its transmittance is above the first number, and shows a surface if it is below the second
 GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05
 # A surface is not continued if it is nearer than NEARER_SHARE times the farthest depth in a window around the pixel,
 # whose half side is WINDOW_SHARE times the width
 WINDOW_SHARE, NEARER_SHARE = 0.08, 0.85
 MOST_FILLED_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
-DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # candidate depths of a Gaussian, relative to the surface's depth
-BESIDE_PIXELS = 2  # a Gaussian reaches into a picture from at most this many pixels beside it
-FRONT_SHARE = 0.98  # a camera would see a Gaussian in front of this share of a surface's depth
+DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # depths that are tried for a new Gaussian, in depths of the surface
+BESIDE_PIXELS = 2  # a new Gaussian reaches at most this many pixels beyond its own pixel
+FRONT_SHARE = 0.98  # a Gaussian hides a surface if its depth is less than this share of the surface's depth
 
 
 @stage("fill")
@@ -49,23 +49,22 @@ def fill_between(
     """Make Gaussians that fill gaps seen from cameras between or just beside those of the photos.
 
     There are at most ``most`` new Gaussians, and at most ``FILLED_SHARE`` times the number of ``fitted`` ones. Gaps
-    seen from half-way cameras come first. The new Gaussians continue the farthest surface beside a gap. No photo and no
-    view from ``outside`` contradicts them, because they stand where these views do not see them. Each is in the field
-    of view of some photo, unless ``beyond``. Scenes of more than ``MOST_FILLED_VIEWS`` views get none, because photos
-    show nearly everything between them.
+    that cameras half-way between two views show are filled first. The new Gaussians stand where no photo and no view
+    from ``outside`` would show them. Each is in the field of view of some photo, unless ``beyond`` is true. Scenes of
+    more than ``MOST_FILLED_VIEWS`` views get none, because their photos show nearly everything between them.
     """
     added, max_count = fitted[:0], min(most, int(FILLED_SHARE * len(fitted)))
     if max_count == 0 or not 1 < len(cameras) <= MOST_FILLED_VIEWS:
         return added
     cameras = _small_cameras(cameras)
-    # Position of a camera just beside the views, as a share of the distance to the nearest view. Chosen on seven
+    # Position of a camera just beside a view, as a share of the way to the nearest view, so below 0. Chosen on seven
     # training captures
     beside = -0.1
     between, splats = _widen(between_cameras(cameras, beside)), make_splats(fitted)
     if len(between) == 0:  # all views look in different directions
         return added
     drawings = parallel_map(lambda view: _draw(splats, between, view), range(len(between)))
-    depths = parallel_map(lambda view: blend_depths(_tile(splats, cameras, view)), range(len(cameras)))
+    depths = parallel_map(lambda view: blend_depths(_tile_camera(splats, cameras, view)), range(len(cameras)))
     seen = _find_seen(cameras, depths), _find_seen(between, [drawing[:2] for drawing in drawings]).without_gaps()
 
     def continue_surfaces(view: int) -> Gaussians:
@@ -78,36 +77,39 @@ def fill_between(
 
 
 def _on_covered_pixels(gaussians: Gaussians, covering: Gaussians, camera: Cameras) -> np.ndarray:
-    """Mark ``gaussians [n]`` on pixels of a camera that ``covering`` Gaussians cover; each covers its nearest four."""
+    """Return a mask ``[n]`` of the Gaussians on pixels that others cover; each covers the four pixels nearest to it.
+
+    The pixels are those of ``camera``, and ``covering`` are the Gaussians that cover.
+    """
     covered, last = np.zeros((camera.height + 2, camera.width + 2), bool), (camera.width + 1, camera.height + 1)
     (positions,), (depths,) = project(covering.means, camera)
     corners = positions[depths > 0, None] + np.array([(0.5, 0.5), (0.5, 1.5), (1.5, 0.5), (1.5, 1.5)])
     x, y = np.clip(np.floor(corners), 0, last).astype(np.int64).reshape(-1, 2).T
     covered[y, x] = True
-    covered[[0, -1]] = covered[:, [0, -1]] = False  # the rim stands for everything outside the picture
+    covered[[0, -1]] = covered[:, [0, -1]] = False  # the outermost pixels stand for everything outside the picture
     x, y = np.clip(np.floor(project(gaussians.means, camera)[0][0] + 1), 0, last).astype(np.int64).T
     return covered[y, x]
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Surfaces and gaps that c cameras of one size see in a scene."""
+    """The surfaces and gaps that c cameras with pictures of one size see in a scene."""
 
     cameras: Cameras
-    farthest: np.ndarray  # [c,h,w] largest mean depth within the pixels that a new Gaussian reaches
-    clear: np.ndarray  # [c,h,w] bool, gaps
+    farthest: np.ndarray  # [c,h,w] largest mean depth of the pixels that a new Gaussian at this pixel would reach
+    clear: np.ndarray  # [c,h,w] bool, true for gaps
 
     def without_gaps(self) -> Seen:
-        """Return a copy that contradicts nothing in gaps, for cameras between the photos, whose gaps are filled."""
+        """Return a copy that contradicts no Gaussian in a gap, for the cameras whose gaps are to be filled."""
         return Seen(self.cameras, np.where(self.clear, np.float32(0), self.farthest), np.zeros_like(self.clear))
 
     def show(self, points: np.ndarray) -> np.ndarray:
-        """Return a mask ``[n]`` of the points ``[n,3]`` that lie in the field of view of some camera."""
+        """Return a mask ``[n]`` of the ``points [n,3]`` that lie in the field of view of some camera."""
         pixels, z = project(points, self.cameras)
         return ((z > 0) & is_inside(pixels, self.cameras)).any(0)
 
     def contradict(self, points: np.ndarray) -> np.ndarray:
-        """Return a mask ``[n]`` of the points ``[n,3]`` that stand in front of a surface, or in a gap of a camera."""
+        """Return a mask ``[n]`` of the ``points [n,3]`` that hide a surface or appear in a gap of some camera."""
         (pixels, z), size = project(points, self.cameras), np.array([self.cameras.width, self.cameras.height])
         inside = (z > 0) & ((pixels >= -BESIDE_PIXELS) & (pixels < size + BESIDE_PIXELS)).all(2)
         camera, point = np.nonzero(inside)
@@ -117,7 +119,7 @@ class Seen:
 
 
 def lies_between(known: np.ndarray) -> np.ndarray:
-    """Mark the pixels with ``known [h,w]`` pixels both to the left and to the right, or both above and below."""
+    """Return a mask ``[h,w]`` of pixels that have ``known [h,w]`` ones on both sides, or both above and below."""
     sides = []
     for mask in (known, known.T):
         before, after = (np.logical_or.accumulate(ordered, axis=1) for ordered in (mask, mask[:, ::-1]))
@@ -126,32 +128,32 @@ def lies_between(known: np.ndarray) -> np.ndarray:
 
 
 def _small_cameras(cameras: Cameras) -> Cameras:
-    """Return the cameras with pixels ``FILL_LEVEL`` times as large."""
+    """Return the cameras with smaller pictures, whose pixels are ``FILL_LEVEL`` times as wide."""
     width, height = (max(FILL_LEVEL, round(side / FILL_LEVEL)) for side in (cameras.width, cameras.height))
     scales = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
     return replace(cameras, Ks=cameras.Ks.astype(np.float64) * scales, width=width, height=height)
 
 
 def _widen(cameras: Cameras) -> Cameras:
-    """Return the cameras with a margin on each side."""
+    """Return the cameras with larger pictures, which have a margin of ``FILL_MARGIN`` on each side."""
     right, down = (round(FILL_MARGIN * side) for side in (cameras.width, cameras.height))
     Ks = cameras.Ks + np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
     return replace(cameras, Ks=Ks, width=cameras.width + 2 * right, height=cameras.height + 2 * down)
 
 
-def _tile(splats: Splats, cameras: Cameras, view: int) -> TiledView:
-    """Tile Gaussians in one of the cameras."""
+def _tile_camera(splats: Splats, cameras: Cameras, view: int) -> TiledView:
+    """Tile the Gaussians for a drawing by one of the cameras."""
     return tile_view(splats, cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height, near=NEAR_PLANE)
 
 
 def _draw(splats: Splats, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw the mean depths ``[h,w]``, transmittance ``[h,w]`` and colours ``[h,w,3]`` of one camera."""
-    tiled = _tile(splats, cameras, view)
+    """Draw what one camera sees; return mean depths ``[h,w]``, transmittances ``[h,w]`` and colours ``[h,w,3]``."""
+    tiled = _tile_camera(splats, cameras, view)
     return *blend_depths(tiled), blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0]
 
 
 def _find_seen(cameras: Cameras, drawings: Sequence[tuple[np.ndarray, np.ndarray]]) -> Seen:
-    """Find surfaces and gaps from the mean depths ``[h,w]`` and transmittance ``[h,w]`` of each camera."""
+    """Find the surfaces and gaps in drawings: mean depths ``[h,w]`` and transmittances ``[h,w]`` of each camera."""
     around = np.ones((2 * BESIDE_PIXELS + 1,) * 2, np.uint8)
     farthest = np.stack([cv2.dilate(depths, around) for depths, _ in drawings])
     return Seen(cameras, farthest, np.stack([transmittance > GAP_TRANSMITTANCE for _, transmittance in drawings]))
@@ -166,11 +168,11 @@ def _continue_surfaces(
     *,
     beyond: bool,
 ) -> Gaussians:
-    """Make Gaussians in the gaps of a ``camera``, which continue the farthest surface beside each gap.
+    """Make Gaussians in the gaps of the ``drawing`` of a camera, which continue the farthest surface beside each gap.
 
-    The candidate depths of a Gaussian are ``DEPTH_FACTORS`` times the depth of that surface. The Gaussian stands at the
-    first depth that no view contradicts. If all depths are contradicted, there is no Gaussian. ``seen`` are the
-    surfaces in the photos' cameras and in the cameras between them.
+    The depths that are tried for a Gaussian are ``DEPTH_FACTORS`` times the depth of that surface. The Gaussian gets
+    the first depth that no view contradicts, and is left out if views contradict all. ``seen`` has what the photos'
+    cameras see, and what the cameras between them see.
     """
     gaps, surface_depths, colors = _spread_into_gaps(drawing, round(WINDOW_SHARE * camera.width), beyond=beyond)
     eye, rays = camera.centres[0], _rays(gaps, camera)
@@ -194,7 +196,7 @@ def _spread_into_gaps(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Spread the depths and colours of the farthest surfaces at most ``reach`` pixels into the gaps of a drawing.
 
-    Returns the pixels of gaps that are filled, ``[h,w]`` bool, and the depth ``[n]`` and the colour ``[n,3]`` of each.
+    Returns a mask ``[h,w]`` of the n pixels that are filled, the depth ``[n]`` of each, and its colour ``[n,3]``.
     """
     depths, transmittance, image = drawing
     solid, clear = transmittance < SURFACE_TRANSMITTANCE, transmittance > GAP_TRANSMITTANCE
@@ -213,7 +215,7 @@ def _spread_into_gaps(
 
 
 def _rays(mask: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Return rays ``[n,3]`` in the world, to depth 1, through the pixels of a ``mask [h,w]``."""
+    """Return the vectors ``[n,3]``, in the world, from the camera to depth 1 on the rays of the pixels of ``mask``."""
     y, x = np.nonzero(mask)
     pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
     return matmul(matmul(pixels, invert(camera.Ks[0]).T), camera.viewmats[0][:3, :3])

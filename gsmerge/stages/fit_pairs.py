@@ -1,4 +1,4 @@
-"""Merged pairs -> fitted: fit a scene that no photo shows to renders of the scene itself."""
+"""Merged pairs -> fitted Gaussians: fit a scene without photos to renders of the scene itself."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.stages.pair_merge import POWERS, merge_neighbors
 from gsmerge.types import Decoded
 
-SHORT = 60  # steps of a fit that tells which of two starts becomes better
-# Step sizes of a fit to renders, relative to the usual, if all Gaussians stay: a start is near to the renders, and the
-# distance from one Gaussian to the next is as the root of their number
+SHORT = 60  # steps of the short fits by which the better one of two starts is chosen
+# If all Gaussians stay, the step sizes of a fit to renders are this share of the usual ones, because the start is close
+# to the renders. If fewer stay, they are farther apart, and steps are larger by the root of the ratio of the numbers
 RENDERS_STEP = 0.09
 
 
 def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int) -> float:
-    """Choose the power of the masses with which most views look best after a short fit of ``count`` Gaussians."""
+    """Choose the power of the masses in costs of merging, by the median PSNR of views after a short fit of each."""
     photos = scene_photos(prepared.scene)
-    tuning = replace(options.tuning, outside_from=1.0)  # no steps outside, where nothing is scored
+    tuning = replace(options.tuning, outside_from=1.0)  # no steps for views from outside, which are not scored
     short = replace(options, fit_steps=min(options.steps, SHORT), tuning=tuning)
 
     def score(power: float) -> float:
         with record_part(silent=True):
-            start = merge_pairs(count, power, prepared)
+            start = merge_scene(count, power, prepared)
             gaussians = fit_around(start, prepared, short, seed).gaussians
         psnrs = [score_photos(gaussians, photos, [view], every=4).psnr for view in range(len(photos))]
         return float(np.median(psnrs))
@@ -37,17 +37,17 @@ def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int)
     return max(POWERS, key=score) if count < len(prepared.scene.gaussians) else POWERS[0]
 
 
-def merge_pairs(count: int, power: float, prepared: Prepared) -> Decoded:
-    """Merge neighbours pair by pair into ``count`` Gaussians."""
+def merge_scene(count: int, power: float, prepared: Prepared) -> Decoded:
+    """Merge the Gaussians of a scene pair by pair into ``count``, which are the start of a fit."""
     gaussians = merge_neighbors(prepared.scene.gaussians, count, power)
     return Decoded(gaussians, count, exact=True, is_input=gaussians is prepared.scene.gaussians)
 
 
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
-    """Fit a start to renders of the scene; a long fit also uses renders of views around its own.
+    """Fit a start to renders of the scene; a long fit also uses renders from cameras around the scene's own views.
 
-    If the scene has no views of its own, no fit sees those on which it is scored. A start that the fit shows worse is
-    returned as it is.
+    If all views of the scene were placed, those on which the fit is scored take no part in it. If the fit makes most
+    views worse, the start is returned.
     """
     share = len(start.gaussians) / len(prepared.scene.gaussians)
     options = replace(options, tuning=options.tuning.scaled(min(1.0, RENDERS_STEP / math.sqrt(share))))

@@ -1,4 +1,4 @@
-"""Feature Gaussians -> matches: clusters that show the same piece of surface in different views."""
+"""Feature Gaussians -> matches: cluster those that show the same piece of surface in different views."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ UPPER_TRIANGLE = [0, 1, 2, 4, 5, 8]  # entries xx xy xz yy yz zz of a flattened 
 def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     """Cluster Feature Gaussians of different views that show the same piece of surface.
 
-    The result does not depend on the order of the Feature Gaussians, because leaders are chosen by weight, and by
-    position if weights are equal. Each fully transparent Feature Gaussian forms a cluster of one.
+    Each cluster grows from a leader. Leaders are chosen by weight, and by position if weights are equal, so the result
+    does not depend on the order of the Feature Gaussians. Each one that is fully transparent stays alone.
     """
     count = len(features)
     clusters = np.full(count, -1, np.int64)
@@ -35,14 +35,14 @@ def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
 
 
 def _find_clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
-    """Return the cluster ``[m]`` of each of the ``rows [m]``, and the number of clusters."""
+    """Return the cluster ``[m]`` of each Feature Gaussian among ``rows [m]``, and the number of clusters."""
     means, views = features.means[rows].astype(np.float64), features.views[rows]
     covars = np.ascontiguousarray(features.covars[rows].astype(np.float64).reshape(-1, 9)[:, UPPER_TRIANGLE])
     colors = SH_C0 * features.sh0[rows, 0].astype(np.float64)
     neighbors = nearest_of_other_views(means, views, options.num_neighbors)
     boxes = options.match == "aabb"
     latents = as_array(features.latents)
-    has_latents = boxes and bool(latents.any())  # networks without an encoder leave them zero
+    has_latents = boxes and bool(latents.any())  # without an encoder all latents are zero, and colours are compared
     latents = normalize(latents[rows] if has_latents else np.zeros((len(rows), 0), latents.dtype))
     scores = np.empty(neighbors.shape)
     limits = options.max_color, options.similarity

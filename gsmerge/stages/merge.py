@@ -1,4 +1,4 @@
-"""Feature Gaussians and matches -> Feature Gaussians: every cluster pooled into one, then refined."""
+"""Feature Gaussians and matches -> Feature Gaussians: pool every cluster into one."""
 
 from __future__ import annotations
 
@@ -15,32 +15,35 @@ from gsmerge.values.arrays import Array, as_tensor, to_float32
 
 @dataclass(frozen=True, eq=False)
 class MergedViews:
-    """Feature Gaussians merged across views, with everything that decoding needs."""
+    """Feature Gaussians after merging across views, with everything that decoding needs."""
 
-    features: FeatureGaussians  # The Feature Gaussians
+    features: FeatureGaussians  # One for each cluster
     members: Members  # The scene's Gaussians, indexed by `features.members`
     segmentation: Segmentation  # The superpixels, and the number of Gaussians to make
-    num_groups: int  # Superpixels with Gaussians, before merging
-    networks: Corrector = ANALYTIC  # Corrections of the decoded Gaussians
+    num_groups: int  # Number of superpixels with members, before merging
+    networks: Corrector = ANALYTIC  # Networks that correct the decoded Gaussians
 
 
 @stage("match")
 def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = ANALYTIC) -> FeatureGaussians:
-    """Pool each cluster into one Feature Gaussian; clusters of one come first, unchanged.
+    """Pool each cluster into one Feature Gaussian. Those that are alone in their cluster come first, unchanged.
 
-    Members are weighted by their opacities times their gains. Masses and integrated optical depths are summed, so equal
-    Gaussians on top of each other get the opacity 1 - prod(1 - alpha). Covariances are summed in float64 about the
-    cluster's mean, so the order of the members changes the result only by rounding.
+    The parts of a cluster are weighted by their opacities times their gains. Masses and integrated optical depths are
+    summed, so equal Gaussians on top of each other get the opacity 1 - prod(1 - alpha). Covariances are summed in
+    float64 about the cluster's mean, so the order of the parts changes the result only by rounding.
     """
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
         return features
     pooled = networks.merge(pool_runs(features, order, cuts), features, order, cuts)
-    return FeatureGaussians.concat([take(features, alone), pooled])
+    return FeatureGaussians.concat([take_features(features, alone), pooled])
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows that are alone in their cluster, the other rows by cluster, and the starts of these clusters."""
+    """Return the rows that are alone in their cluster, the other rows in order of cluster, and where clusters start.
+
+    The starts are positions among these other rows.
+    """
     clusters = matches.clusters
     alone = np.bincount(clusters, minlength=matches.count)[clusters] == 1
     order = np.flatnonzero(~alone)
@@ -50,15 +53,15 @@ def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.flatnonzero(alone), order, np.flatnonzero(begins_cluster)
 
 
-def take(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
-    """Select Feature Gaussians by an integer ``index``, with their members."""
+def take_features(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
+    """Return the Feature Gaussians in the rows ``index``, with their members."""
     starts, members = _gather(features, index)
     names = [n for n in features.__dataclass_fields__ if n not in ("starts", "members")]
     return FeatureGaussians(starts=starts, members=members, **{n: getattr(features, n)[index] for n in names})
 
 
 def _gather(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the members of the indexed Feature Gaussians, as starts and rows."""
+    """Return the start ``[m+1]`` of the members of each Feature Gaussian in the rows ``index [m]``, and the members."""
     begin, sizes = features.starts[index], np.diff(features.starts)[index]
     starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
     positions = (begin - starts[:-1]).astype(np.int32).repeat(sizes)  # in the members of all Feature Gaussians
@@ -67,7 +70,10 @@ def _gather(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, 
 
 
 def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
-    """Pool each run of rows in ``order`` into one Feature Gaussian; runs start at ``cuts``."""
+    """Pool the Feature Gaussians of each cluster into one.
+
+    The rows of a cluster are a run of ``order``, and ``cuts`` are the starts of these runs.
+    """
 
     def rows(array: np.ndarray) -> np.ndarray:
         return array[order].astype(np.float64)
@@ -104,7 +110,7 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
 
 
 def _pool_latents(latents: Array, share: np.ndarray, run: np.ndarray, count: int) -> Array:
-    """Return weighted sums ``[count,d]`` of latents ``[m,d]`` over runs; differentiable for tensors."""
+    """Return the weighted sum of the ``latents [m,d]`` of each run, ``[count,d]``; tensors pass gradients."""
     if isinstance(latents, np.ndarray):
         sums = np.zeros((count, latents.shape[1]), np.float32)
         np.add.at(sums, run, latents * share[:, None])

@@ -1,8 +1,8 @@
-"""Gaussians -> fewer Gaussians by their positions and colours alone, for scenes without views.
+"""Gaussians -> fewer Gaussians: merge neighbours without pictures, for scenes without views.
 
-Neighbours within a cell of a k-d tree are merged pair by pair, the cheapest pairs of all cells first, in rounds with
-different cells. Masses, which are opacity times visible area, add up, so a surface stays as opaque as it was. If the
-opacity would exceed one, scales grow instead.
+Neighbours within a cell of a k-d tree are merged pair by pair, the cheapest pairs of all cells first. Each round has
+other cells. A mass is opacity times visible area. Masses add up, so a surface stays as opaque as it was. If the opacity
+of a merged Gaussian would exceed one, its scales grow instead.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from gsmerge.types import Gaussians
 from gsmerge.values.arrays import to_float32
 
 # Chosen on training scenes by the PSNR of views from random cameras (docs/internals/notebook.md#bare-files)
-COLOR_WEIGHT = 0.6  # weight of squared distances of harmonics of degree 0, relative to costs in nats
-# Costs are multiplied by a power of the masses. The first power favours large parts of the pictures, for scenes; the
-# second favours detail, for objects
+COLOR_WEIGHT = 0.6  # weight of squared differences of sh0 in a cost, whose other part is a divergence in nats
+# Costs are multiplied by the masses to one of these powers. The first one keeps what is large in pictures, which suits
+# scenes. The second one keeps detail, which suits objects
 POWERS = 1.0, 0.3
-FLATNESS = 0.01  # least scale, relative to the largest, so that the logarithm of the volume stays finite
+FLATNESS = 0.01  # least scale as a share of the largest scale, so that the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4  # least opacity of Gaussians that are merged, so that masses stay positive
-MOST_WIDENING = 0.05  # most growth of scales for each doubling of the merged number; without it gaps would open
+MOST_WIDENING = 0.05  # scales grow by at most this share for each doubling of the merged number, to close gaps
 CELLS_PER_TASK = 256  # cells that a thread merges at a time
-NEXT_AXIS = [1, 2, 0]  # the axis after each axis, so that products with it cover the three pairs of axes
+NEXT_AXIS = [1, 2, 0]  # products of each axis with its next axis are those of the three pairs of axes
 
 
 @dataclass(eq=False)
 class Cloud:
-    """Moments of n Gaussians, the form in which they are merged."""
+    """The moments of n Gaussians, which are what merging combines."""
 
     means: np.ndarray  # [n,3] float64
-    covars: np.ndarray  # [n,6] float32 upper triangles
+    covars: np.ndarray  # [n,6] float32 upper triangles of covariances
     masses: np.ndarray  # [n] float32
-    weights: np.ndarray  # [n] float32, weights of costs
+    weights: np.ndarray  # [n] float32 factors of the costs of merging
     sh: np.ndarray  # [n,3k] float32
-    sizes: np.ndarray  # [n] int32, number of input Gaussians that were merged into each
-    rows: np.ndarray  # [n] int64, row of the first of them in the input
+    sizes: np.ndarray  # [n] int32, number of input Gaussians in each
+    rows: np.ndarray  # [n] int64, row of the first of these input Gaussians
 
     def __len__(self) -> int:
         return len(self.means)
@@ -54,10 +54,10 @@ class Cloud:
 
 @stage("reduce")
 def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) -> Gaussians:
-    """Merge finite Gaussians in any frame into ``count`` Gaussians, at least one; none is dropped.
+    """Merge finite Gaussians in any frame into ``count`` Gaussians, at least one.
 
     If there are at most ``count`` Gaussians, they are returned unchanged. Costs are weighted by the masses to the
-    ``power``.
+    ``power``, see ``POWERS``.
     """
     count = max(1, count)
     if len(gaussians) <= count:
@@ -71,7 +71,7 @@ def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) 
 
 
 def cloud_of(g: Gaussians) -> Cloud:
-    """Compute the moments of Gaussians; flat Gaussians get a little thickness."""
+    """Return the moments of Gaussians; flat Gaussians get a little thickness, so that they have a volume."""
     count = len(g)
     covars, masses = np.empty((count, 6), np.float32), np.empty(count, np.float32)
     quats, scales = (np.ascontiguousarray(column, np.float32) for column in (g.quats, g.scales))
@@ -82,14 +82,17 @@ def cloud_of(g: Gaussians) -> Cloud:
 
 
 def _merge_round(cloud: Cloud, count: int) -> Cloud:
-    """Merge the cheapest pairs of all cells until ``count`` Gaussians remain, or until there are no pairs."""
-    order, starts = _divide(cloud.means)
+    """Merge the cheapest pairs of all cells, at most until ``count`` Gaussians remain; return the new cloud.
+
+    If no pair has a finite cost, the Gaussians with the largest masses are kept.
+    """
+    order, starts = _divide_into_cells(cloud.means)
     pairs, costs = np.zeros((len(cloud), 2), np.int32), np.full(len(cloud), np.inf, np.float32)
     colors = np.ascontiguousarray(cloud.sh[:, :3])
 
     def merge_cells(begin: int) -> None:
         end = min(begin + CELLS_PER_TASK, len(starts) - 1)
-        # Least share of a cell's Gaussians that remains after a round; longer chains of merges make haze
+        # Least share of a cell's Gaussians that remains after a round; with fewer, merged Gaussians look like haze
         cell_share = 0.2
         agglomerate(
             cloud.means, cloud.covars, cloud.masses, cloud.weights, colors, order, starts, COLOR_WEIGHT, cell_share,
@@ -98,30 +101,36 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
 
     parallel_map(merge_cells, range(0, len(starts) - 1, CELLS_PER_TASK))
     cheapest_pairs = pairs[_cheapest(costs, len(cloud) - count)]
-    if len(cheapest_pairs) == 0:  # no cost is a number: keep the Gaussians with the largest masses
+    if len(cheapest_pairs) == 0:
         return cloud[np.sort(np.argsort(-cloud.masses, kind="stable")[:count])]
     return merge_rows(cloud, cheapest_pairs)
 
 
 def merge_rows(cloud: Cloud, pairs: np.ndarray) -> Cloud:
-    """Merge disjoint pairs of rows ``[m,2]`` int32; the merged Gaussian takes the place of the first row."""
+    """Merge pairs of rows ``[m,2]`` int32, one after another; each result takes the place of the first row.
+
+    Changes ``cloud``, and returns it without the second rows.
+    """
     merge_pairs(pairs, cloud.means, cloud.covars, cloud.masses, cloud.weights, cloud.sh, cloud.sizes)
     remains = np.ones(len(cloud), bool)
     remains[pairs[:, 1]] = False
     return cloud[remains]
 
 
-def _divide(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Divide means ``[n,3]`` into cells of neighbours; return their order ``[n]`` and the cell starts ``[c+1]``."""
+def _divide_into_cells(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Divide Gaussians with ``means [n,3]`` into cells of at most ``CELL`` neighbours.
+
+    Returns the rows ``[n]`` in the order of the cells, and the start ``[c+1]`` of each cell in this order.
+    """
     count = len(means)
     starts = np.array([0, count])
-    while (starts[1:] - starts[:-1]).max() > CELL:  # halves runs as the k-d tree does
+    while (starts[1:] - starts[:-1]).max() > CELL:  # halve all cells, as the k-d tree halves its nodes
         starts = np.sort(np.concatenate([starts, (starts[1:] + starts[:-1]) // 2]))
     return make_tree(means)[0], starts
 
 
 def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices, ascending, of the ``count`` lowest finite costs ``[n]``; among equal costs the first."""
+    """Return the indices, ascending, of the ``count`` lowest finite ``costs [n]``; of equal costs the first count."""
     finite = np.isfinite(costs)
     count = min(count, int(finite.sum()))
     if count == 0:
@@ -132,10 +141,10 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
 
 
 def gaussians_of_cloud(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
-    """Convert moments to Gaussians; Gaussians that were not merged are copied from ``source``.
+    """Convert moments to Gaussians; those that were not merged are copied from ``source``, the input of the merging.
 
     If a mass would need an opacity above one, scales grow instead, at most by the share ``wider`` for each doubling of
-    the merged number.
+    the number of input Gaussians in a merged one.
     """
     scales, quats = principal_axes(cloud.covars[:, FULL_MATRIX].reshape(-1, 3, 3))
     squares = scales * scales

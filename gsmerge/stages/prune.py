@@ -1,7 +1,7 @@
-"""Fitted Gaussians -> pruned Gaussians: Gaussians that nobody sees are dropped.
+"""Fitted Gaussians -> pruned Gaussians: drop Gaussians that nobody sees.
 
-After a fit many Gaussians are faint, or hidden by others. They change no photo by more than rounding to eight bits
-does, but every viewer has to load and draw them.
+After a fit many Gaussians are faint or hidden by others. Without them, photos change less than by rounding to eight
+bits, but every viewer would have to load and draw them.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from gsmerge.raster.photos import Photos, blank_photos, photo_errors
 from gsmerge.runtime.record import stage
 from gsmerge.types import Cameras, Gaussians
 
-ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of the change by rounding to eight bits
-TARGET_CHANGE = 0.9 * ROUNDING  # change at which the next limit aims
+ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of the change that rounding to eight bits makes
+TARGET_CHANGE = 0.9 * ROUNDING  # each next limit is chosen so that it should make this change
 ENOUGH_CHANGE = 0.75 * ROUNDING  # change at which the search for a larger limit ends
-# Sizes of the pixels relative to the photos' pixels: first for the blending weights, then for the compared pictures.
-# These pixels are samples of the photo, with the same low-pass, so the root mean square is the same
+# Distance from one drawn pixel to the next, in pixels of the photos: first where blending weights are measured, then
+# where pictures are compared. Pixels are drawn with the low-pass of the photos, so the root mean square is the same
 COMPARED_LEVELS = 2, 4
 
 
 @stage("prune")
 def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gaussians]:
-    """Split Gaussians into seen and unseen by ``cameras``; the unseen are sorted, the most visible first.
+    """Split Gaussians into those that ``cameras`` see and those that they do not; return both.
 
-    A Gaussian is unseen if its largest blending weight is below a limit. The limit is as large as possible, while no
-    camera's picture changes by more than ``ROUNDING`` (root mean square) without the unseen Gaussians. Gaussians
-    outside of all pictures count as seen.
+    A Gaussian is unseen if its largest blending weight is below a limit. The limit is as large as possible, while the
+    picture of no camera changes by more than ``ROUNDING`` (root mean square) without the unseen Gaussians. The unseen
+    ones are returned in order of this weight, the largest first. Gaussians outside of all pictures count as seen.
     """
     peaks, inside = peak_weights(gaussians, blank_photos(cameras, COMPARED_LEVELS[0]))
     peaks[~inside] = np.inf
-    max_compared_views = 8  # most views in which pictures with and without the Gaussians are compared
+    max_compared_views = 8  # pictures with and without the Gaussians are compared in at most this many views
     views = pick_views(len(cameras), max_compared_views)
     limit = _find_limit(gaussians, peaks, blank_photos(cameras[views], COMPARED_LEVELS[1])) if views else 0.0
     unseen = np.flatnonzero(peaks < limit)
@@ -43,9 +43,13 @@ def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gau
 
 
 def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> float:
-    """Try limits; return the largest below which all Gaussians can be left out unnoticed, or 0 if there is none."""
-    start_limit = 0.02  # limit of the first trial; Gaussians are left out if their largest blending weight is below it
-    # changes are unnoticed up to the limit ``low``, and not from ``high`` on
+    """Return the largest limit that was tried and not noticed, or 0 if each one was noticed.
+
+    A limit is noticed if a picture changes by more than ``ROUNDING`` without the Gaussians whose largest blending
+    weight in ``peaks [n]`` is below it.
+    """
+    start_limit = 0.02  # limit of the first trial
+    # up to the limit `low` changes are not noticed, and from `high` on they are
     splats, low, high, limit = make_splats(gaussians), 0.0, math.inf, start_limit
 
     def clip(_: int, image: np.ndarray, __: np.ndarray) -> np.ndarray:
@@ -67,7 +71,7 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
     for _ in range(trials):
         is_noticed = (change := measure_change(limit)) > ROUNDING
         low, high = (low, limit) if is_noticed else (limit, high)
-        factor = math.sqrt(TARGET_CHANGE / max(change, 1e-9))  # the change grows about with the square of the limit
+        factor = math.sqrt(TARGET_CHANGE / max(change, 1e-9))  # a change grows about with the square of its limit
         limit *= min(factor, min_decrease if is_noticed else max_increase)
         if low and (change > ENOUGH_CHANGE or not low < limit < high):
             break

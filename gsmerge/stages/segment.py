@@ -1,9 +1,9 @@
-"""Scene -> groups: the superpixels of every view, either the same number in each, or cut from a region tree.
+"""Scene -> groups: cut every view into superpixels, either the same number in each, or as a region tree says.
 
-The tree has few superpixels where little is lost, and many where much is gained. Distortion is measured in image space.
-It is the squared colour error plus the squared error of the depth relative to a plane, so a flat wall costs nothing
-from any angle, and far things count as much as near ones. All views of a scene share one threshold, so every Gaussian
-lowers the distortion about equally.
+The tree merges neighbouring superpixels in order of the distortion that this adds, in all views together. A cut through
+the tree has few superpixels where merges lose little, and many elsewhere, so every Gaussian lowers the distortion about
+equally. Distortion is measured in the image. It is the squared error of colours plus the squared relative error of
+depths from a plane. So a flat wall costs nothing from any angle, and far things count as much as near ones.
 """
 
 from __future__ import annotations
@@ -32,27 +32,28 @@ from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 
 DEPTH_WEIGHT = 1.0  # weight of squared relative depth errors, relative to squared colour errors (sRGB in [0, 1])
-# Largest side of a region, as a share of the image's longer side, because the rasterizer's affine approximation bends
-# larger Gaussians. It is exceeded only if the budget is too small for more regions.
+# Largest side of a region, as a share of the image's longer side. In larger Gaussians the error of the rasterizer's
+# affine approximation shows. A region is larger only if the budget allows no more regions
 MAX_EXTENT = 1 / 8
-# dB of predicted quality per relative increase of the count; below it, more Gaussians gain too little
+# More Gaussians gain too little if the slope of the curve is less: dB of predicted quality per relative increase of the
+# number of Gaussians
 REGION_KNEE_SLOPE = 1.0
-KNEE_FLOOR = 3e-4  # squared error per pixel and channel that remains at every count (noise, views that disagree)
+KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no number of Gaussians removes, such as noise
 
 
 @dataclass(frozen=True, eq=False)
 class SuperpixelChoices:
-    """Settings and limits for cutting a scene into superpixels."""
+    """What decides how a scene is cut into superpixels."""
 
-    options: SegmentOptions  # Method and number
+    options: SegmentOptions  # Method, and number of superpixels
     limits: CountLimits  # Limits of the number of Gaussians
-    start_share: float  # Share of the Gaussians to start with; a fit adds the rest
-    shared: SharedTree | None  # The region tree of all counts of a run; None: each count builds its own
+    start_share: float  # Share of the Gaussians that the fit starts with; it adds the rest
+    shared: SharedTree | None  # Region tree for all counts that a run tries; None if each count builds its own
 
 
 @dataclass(eq=False)
 class SharedTree:
-    """The region tree from which all counts of a run are cut; it is built for the first of them."""
+    """The region tree from which all counts that a run tries are cut; the first call of :meth:`get` builds it."""
 
     tree: RegionTree | None = None
 
@@ -66,10 +67,10 @@ class SharedTree:
 
 @stage("segment")
 def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int | None) -> Segmentation:
-    """Cut every view into superpixels: as the options say, or so that they give exactly ``count`` Gaussians.
+    """Cut every view into superpixels, for exactly ``count`` Gaussians, or for the number in the options if None.
 
-    For an exact count the region tree is cut, which gives a plain wall few superpixels and a fern many. The tree is
-    also cut if pixels differ in importance. If the shared tree is too coarse, a finer tree is built.
+    An exact count is cut from the region tree, which gives a plain wall few superpixels and a fern many. Scenes whose
+    pixels differ in importance are always cut from the tree. If the shared tree is too coarse, a finer tree is built.
     """
     limits, options, num_views = choices.limits, choices.options, len(scene)
     if count is None and scene.importance is not None:
@@ -86,12 +87,12 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
 
 @stage("segment")
 def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
-    """Build the tree of all coarser segmentations of a scene, fine enough for ``count`` Gaussians.
+    """Build the region tree of a scene, which starts with enough superpixels for ``count`` Gaussians.
 
     The squared colour error of a pixel is multiplied by its importance.
     """
     images, leaves = scene.images, max(limits.per_view, -(-count // len(scene)))
-    if scene.importance is not None:  # errors are squared, so colours are multiplied by the square root
+    if scene.importance is not None:  # colours are multiplied by its square root, because their errors are squared
         images = images * np.sqrt(scene.importance)[..., None]
         leaves = int(leaves * scene.importance.max())
     groups = segment(scene.images, options, min(leaves, scene.pixels_per_view))
@@ -99,7 +100,7 @@ def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimit
 
 
 def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
-    """Find the number of Gaussians at the knee of the scene's distortion curve, within the limits."""
+    """Return the number of Gaussians at the knee of the scene's distortion curve, but within the limits."""
     limits, shared = choices.limits, choices.shared or SharedTree()
     tree = shared.get(scene, choices)
     usable = tree.counts >= tree.min_regions  # counts without regions larger than MAX_EXTENT
@@ -108,27 +109,27 @@ def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
 
 @dataclass(frozen=True, eq=False)
 class RegionTree:
-    """Hierarchy of superpixels: all merges in every view, from the finest cut to one region per view, in order."""
+    """All merges of neighbouring regions, from the superpixels of all views to a single region in each view."""
 
-    groups: Groups  # The superpixels that it starts from
-    parents: tuple[np.ndarray, ...]  # For each view [2·leaves-1] int32: the union that a region is part of, or -1
-    order: np.ndarray  # [m] int64, all merges, cheapest first; the merges of view v are numbered from `offsets[v]` on
-    offsets: np.ndarray  # [v+1] int64, number of merges in the views before
-    distortions: np.ndarray  # [m+1] float64 mean squared error after the first i merges
-    min_regions: int  # Fewest regions before any is larger than `MAX_EXTENT`
+    groups: Groups  # The superpixels before all merges, which are the leaves of the tree
+    parents: tuple[np.ndarray, ...]  # For each view [2·leaves-1] int32: the region that a merge makes of each, or -1
+    order: np.ndarray  # [m] int64, the numbers of all merges, cheapest first; those of view v start at `offsets[v]`
+    offsets: np.ndarray  # [v+1] int64, number of merges in all views before each
+    distortions: np.ndarray  # [m+1] float64 mean squared error after 0 to m merges
+    min_regions: int  # Least number of regions of which none is larger than `MAX_EXTENT`
 
     def __len__(self) -> int:
-        """Return the number of superpixels at the start."""
+        """Return the number of superpixels before all merges."""
         return len(self.groups)
 
     @property
     def counts(self) -> np.ndarray:
-        """Number of regions ``[m+1]`` after 0 to m merges."""
+        """Numbers of regions ``[m+1]`` after 0 to m merges."""
         return len(self) - np.arange(len(self.distortions))
 
 
 def front_depths(scene: Scene) -> np.ndarray:
-    """Return the depth of the Gaussian in front of every pixel, ``[v,h,w]`` float32, world units."""
+    """Return the depth ``[v,h,w]`` float32, in world units, of the front Gaussian of every pixel."""
     cameras, means, fronts = scene.cameras, scene.gaussians.means, scene.get_pixels().fronts
 
     def view_depths(view: int) -> np.ndarray:
@@ -139,11 +140,11 @@ def front_depths(scene: Scene) -> np.ndarray:
 
 
 def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> RegionTree:
-    """Merge neighbouring superpixels in order of added distortion, until each view is a single region.
+    """Merge neighbouring superpixels in order of the distortion that this adds, until each view is a single region.
 
-    ``images [v,h,w,3]`` are sRGB in [0, 1]. ``depths [v,h,w]`` of at most 0 count as very near. ``groups`` are
-    4-connected, and none is empty. Pixels outside ``valid [v,h,w]`` do not count, and superpixels without a valid pixel
-    merge first. Raises ValueError if the arguments do not fit together.
+    ``images [v,h,w,3]`` are sRGB in [0, 1]. ``depths [v,h,w]`` of 0 or less count as very near. ``groups`` are
+    4-connected, and none is empty. Pixels that are not ``valid [v,h,w]`` do not count, and superpixels without valid
+    pixels are merged first. Raises ValueError if the arguments do not fit together.
     """
     _check_pictures(images, depths, groups, valid)
     extent = max(1.0, MAX_EXTENT * max(images.shape[1:3]))
@@ -155,7 +156,8 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
         rows = np.empty((2 * count, TREE_COLUMNS))
         start = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
         pairs = adjacent_pairs(labels)
-        # Weight of squared pixels, relative to squared colours; without it regions become snakes that no Gaussian fits
+        # Weight of squared distances in pixels, relative to squared differences of colours. Without it regions become
+        # long and winding, and no Gaussian fits them
         compactness = 1e-5
         return *merge_order(pairs, rows, DEPTH_WEIGHT, compactness, extent), start, int((usable > 0).sum())
 
@@ -171,7 +173,7 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
 
 
 def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> None:
-    """Raise ValueError if shapes differ, or if a superpixel is empty."""
+    """Raise ValueError if shapes do not fit together, or if a superpixel is empty."""
     shape = list(groups.labels.shape)
     for name, array, expected in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
         if list(array.shape) != expected:
@@ -183,20 +185,20 @@ def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, vali
 
 
 def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return depths in units of their median, float32; 0 for pixels that do not count."""
+    """Return depths in units of their median, float32; 0 for pixels that are not valid or have no finite depth."""
     usable = valid & np.isfinite(depths)
     positive = usable & (depths > 0)
     median = float(np.median(depths[positive])) if positive.any() else 1.0
-    depth_range = 1e3  # depths are clipped to this factor of the view's median
+    depth_range = 1e3  # depths are clipped to at most this factor above or below the median
     clipped = np.clip(depths / median, 1 / depth_range, depth_range)
     return np.ascontiguousarray(np.where(usable, clipped, 0), np.float32)
 
 
 def cut_tree(tree: RegionTree, budget: int) -> Groups:
-    """Cut the tree into exactly ``budget`` regions over all views, at least one in each.
+    """Cut the tree into exactly ``budget`` regions in all views together, at least one in each view.
 
     A ``budget`` above the number of superpixels gives all superpixels. The regions of a smaller budget are unions of
-    regions of a larger budget. Raises ValueError if ``budget`` is below the number of views.
+    those of a larger budget. Raises ValueError if ``budget`` is below the number of views.
     """
     num_views = len(tree.parents)
     if budget < num_views:
@@ -217,9 +219,10 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
 def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
-    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. Its slope at N is measured between N / 1.25 and N, in dB per
-    relative increase of N. The knee is the largest N with a slope of at least ``REGION_KNEE_SLOPE``, or the least N if
-    there is none. ``counts [m]`` are all different; ``distortions [m]`` are mean squared errors per pixel and channel.
+    The predicted quality of N Gaussians is q(N) = -10 log10(``KNEE_FLOOR`` + D(N)) dB, where D is the distortion. Its
+    slope at N is measured between N / 1.25 and N, in dB per relative increase of N. The knee is the largest N with a
+    slope of at least ``REGION_KNEE_SLOPE``, or the least N if there is none. ``counts [m]`` are all different, and
+    ``distortions [m]`` are mean squared errors per pixel and channel.
     """
     counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
     if len(counts) == 0 or counts.shape != distortions.shape:

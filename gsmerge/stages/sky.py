@@ -1,8 +1,9 @@
-"""Find sky Gaussians by the photos, without a network or a download.
+"""Find the Gaussians of the sky in photos, without a network or a download.
 
-In each photo the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. It also pales
-towards the horizon, as air does; otherwise, as under clouds, it has to be several times as far away as the rest.
-Ceilings and white walls share the first three properties. They seldom have the last two, and never in several views.
+In a photo, the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. It also becomes
+paler towards the horizon, as air does. If it does not, as under clouds, it must be several times as far away as the
+rest. Ceilings and white walls may be smooth, grey and at the upper border as well. But they seldom become paler or are
+far away, and never in several views.
 """
 
 from __future__ import annotations
@@ -20,23 +21,23 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
-GRADIENT_PIXELS = 480.0  # length in pixels of the longer side to which gradients are scaled
+GRADIENT_PIXELS = 480.0  # gradients are those of a photo with this many pixels on its longer side
 # Sky is blue and brighter than DARK_SKY, or brighter than WHITE_SKY with less chroma than GREY_SKY
 DARK_SKY, WHITE_SKY, GREY_SKY = 0.35, 0.75, 0.12
 FAR_RATIO = 3.0  # the sky is more than this many times as far away as the rest
-# Fewest views that show sky, and least share of all views; fewer may be mistaken
+# Sky has to show in this many views and in this share of all views. In fewer views, something else may look like sky
 LEAST_SKY_VIEWS, LEAST_SKY_SHARE = 2, 0.2
-SKY_GAUSSIANS = 200_000  # most Gaussians whose depths are compared
+SKY_GAUSSIANS = 200_000  # the depths of at most this many Gaussians are compared
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
-    """Return a mask ``[n]`` of canonical Gaussians that contribute mostly to the sky of the photos."""
+    """Return a mask ``[n]`` of the canonical Gaussians that contribute mostly to the sky of ``photos [v,h,w,3]``."""
     regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
     if not regions:
         return mask
-    # Most rounds; a round that adds less than this share of the sky found so far is the last
+    # There are at most this many rounds. A round is the last one if it adds less than this share of all sky so far
     max_rounds, last_share = 6, 0.02
-    for _ in range(max_rounds):  # each round finds sky that the sky of earlier rounds has hidden
+    for _ in range(max_rounds):  # each round finds Gaussians that those of earlier rounds have hidden
         rows = np.flatnonzero(~mask)
         is_sky = _mostly_inside(gaussians[rows], cameras, regions)
         mask[rows[is_sky]] = True
@@ -46,7 +47,7 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
 
 
 def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:
-    """Return a mask ``[h,w]`` of the sky for each view that shows sky, by view; none if too few views show sky."""
+    """Return a mask ``[h,w]`` of the sky for each view that shows sky, by view; empty if too few views show sky."""
     regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
     shown = {
         view: region
@@ -57,7 +58,7 @@ def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict
 
 
 def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Return a mask ``[n]`` of Gaussians that have most of their blending weights inside the views' regions."""
+    """Return a mask ``[n]`` of the Gaussians with most of their blending weight inside the regions, masks by view."""
     splats = make_splats(gaussians)
     inside, total = np.zeros(len(splats)), np.zeros(len(splats))
     for view, region in regions.items():
@@ -66,12 +67,12 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
         sums = apply_transposed(weights, np.stack([region, np.ones_like(region)], 2).astype(np.float32))
         inside[weights.ids] += sums[:, 0]
         total[weights.ids] += sums[:, 1]
-    min_share = 0.7  # a Gaussian is sky if at least this share of its blending weights lies in the sky
+    min_share = 0.7  # least share of the blending weight of a Gaussian that lies inside
     return np.asarray((inside > 0) & (inside >= min_share * total))
 
 
 def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
-    """Return whether a region ``[h,w]`` is several times as far away as the rest of the picture."""
+    """Return true if a region ``[h,w]`` of a camera's picture is several times as far away as the rest."""
     (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // SKY_GAUSSIANS))], camera)
     inside = (depths > 0) & is_inside(pixels, camera)
     x, y = pixels[inside].astype(int).T
@@ -82,24 +83,27 @@ def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
 
 
 def sky_region(photo: np.ndarray) -> np.ndarray:
-    """Return a mask ``[h,w]`` of smooth blue or white regions at a photo's upper border; empty if they are small."""
+    """Return a mask ``[h,w]`` of smooth blue or white regions at a photo's upper border, if they are large enough."""
     height, width = photo.shape[:2]
     scale = max(height, width) / GRADIENT_PIXELS
     sigma = max(1.5 * scale, 0.5)
     upper = photo[: round(4 * sigma) + 3]  # the blurred upper border depends on these rows alone
-    least_area, least_top = 0.02, 0.4  # least share of the picture, and of its upper border, that is sky
+    least_area, least_top = 0.02, 0.4  # the sky has at least these shares of the picture and of its upper border
     if _like_sky(blur(upper, sigma), scale)[0].mean() < least_top:
         return np.zeros((height, width), bool)
     soft = blur(photo, sigma)
     _, labels = cv2.connectedComponents(_like_sky(soft, scale).astype(np.uint8), connectivity=4)
     region = np.isin(labels, np.setdiff1d(labels[0], 0))
-    max_warmth = 0.03  # red exceeds blue by at most this much, in nine tenths of the region
+    max_warmth = 0.03  # largest difference of red from blue in nine tenths of the sky
     is_no_sky = region.mean() < least_area or np.percentile((soft[..., 2] - soft[..., 0])[region], 10) < -max_warmth
     return np.zeros_like(region) if is_no_sky else region
 
 
 def _like_sky(soft: np.ndarray, scale: float) -> np.ndarray:
-    """Return a mask ``[h,w]`` of the pixels of a blurred photo that are smooth, and blue or white."""
+    """Return a mask ``[h,w]`` of the pixels of a blurred photo that are smooth and either blue or white.
+
+    ``scale`` is the length of the photo's longer side in units of ``GRADIENT_PIXELS``.
+    """
     right, down = (reduce(np.maximum, np.moveaxis(np.abs(slope), 2, 0)) / 8 for slope in sobel(soft))
     red, green, blue = colors = np.moveaxis(soft, 2, 0)
     bright, dark = reduce(np.maximum, colors), reduce(np.minimum, colors)  # takes a tenth of the time of max(2)
@@ -110,12 +114,12 @@ def _like_sky(soft: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
-    """Return whether the colours of a region lose saturation towards the picture's lower border."""
+    """Return true if the colours of a region lose saturation towards the lower border of the picture."""
     colors, rows = photo[region], np.nonzero(region)[0]
     bright = colors.max(1)
     saturation = (bright - colors.min(1)) / np.maximum(bright, 1e-6)
     low, high = np.percentile(saturation, (10, 90))
-    # Largest correlation of saturation with the row; least spread of saturation
+    # Saturation must differ by the second number, and its correlation with the row must not exceed the first
     max_correlation, min_spread = -0.12, 0.08
     if high - low < min_spread or np.ptp(rows) == 0:
         return False

@@ -1,11 +1,12 @@
 """Partition each view into superpixels of similar colour and regular shape (paper section 4.1).
 
-The default, ``rdseg``, places superpixels where they lower the squared colour error most. It cuts more rectangles than
-requested, the best cuts first, merges them with Ward's rule to the exact number, and then moves border pixels exactly.
-``bass`` is Bayesian adaptive superpixel segmentation from a hexagonal grid. ``bass-st`` starts from seeds drawn by the
-Shi-Tomasi response instead, as in the paper. ``grid`` makes plain rectangles. If these are a few pixels large and no
-fit follows, they are as good as the other methods and cost nothing. The number of superpixels is exactly the requested
-number. None is empty, each is 4-connected, and the result is the same bit for bit in each run.
+The default, ``rdseg``, places superpixels where they lower the squared colour error most. It first cuts the image into
+more rectangles than requested, the best cuts first. It merges these with Ward's rule to the exact number. Then it moves
+pixels at borders between superpixels if this lowers the error. ``bass`` is Bayesian adaptive superpixel segmentation
+from a hexagonal grid. ``bass-st`` starts from seeds that are drawn by the Shi-Tomasi response instead, as in the paper.
+``grid`` makes plain rectangles. If these are a few pixels large and no fit follows, they are as good as the results of
+the other methods, and cost nothing. There are exactly as many superpixels as requested. None is empty, each is
+4-connected, and each run gives the same bits.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ from gsmerge.settings.stages import SegmentOptions
 from gsmerge.types import Groups
 from gsmerge.values.arrays import Array, as_array, like
 
-RECTANGLES, EARLY_SWEEPS = 2.0, 0  # rectangles per superpixel that rdseg merges, and sweeps before the merges
+RECTANGLES, EARLY_SWEEPS = 2.0, 0  # defaults of rdseg: rectangles per superpixel, and sweeps before they are merged
 
 
 def segment(images: np.ndarray, options: SegmentOptions, count: int | None = None) -> Groups:
     """Cut every view into the same number of superpixels.
 
-    ``images [v,h,w,3]`` are float in [0, 1] or uint8; ``count`` is the number per view, None: the options' number.
+    ``images [v,h,w,3]`` are float in [0, 1] or uint8. ``count`` is the number per view; if None, the options give it.
     """
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
@@ -105,9 +106,9 @@ def superpixels(
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
     """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows; their numbers per row differ by at most one."""
-    min_rows = -(-count // width)  # rows of rectangles that can hold them all
+    min_rows = -(-count // width)  # least number of rows in which each rectangle has a pixel
     num_rows = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
-    first_labels = np.arange(num_rows + 1) * count // num_rows  # of each row of rectangles
+    first_labels = np.arange(num_rows + 1) * count // num_rows  # first label of each row of rectangles
     row = np.arange(height) * num_rows // height  # row of rectangles that contains each row of pixels
     num_columns = np.diff(first_labels)[row]
     return (first_labels[row][:, None] + np.arange(width) * num_columns[:, None] // width).astype(np.int32)
@@ -135,7 +136,7 @@ def saliency(image: Array) -> Array:
 
 
 def scene_saliency(images: np.ndarray) -> np.ndarray:
-    """Return the :func:`saliency` ``[v·h·w]`` of every pixel of all views ``[v,h,w,3]``."""
+    """Return the :func:`saliency` of every pixel of all views ``[v,h,w,3]`` as one array ``[v·h·w]``."""
     return np.concatenate(parallel_map(lambda image: corner_response(_as_pixels(image)).reshape(-1), images))
 
 
@@ -148,18 +149,18 @@ def _as_pixels(array: np.ndarray) -> np.ndarray:
     if not np.issubdtype(array.dtype, np.floating):
         raise ValueError(f"image: expected uint8 or float, got {array.dtype}")
     low, high = array.min(), array.max()
-    range_slack = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
+    range_slack = 1e-3  # colours may leave [0, 1] by this much, because resampling makes such values
     if not (low >= -range_slack and high <= 1 + range_slack):  # also refuses NaN
         raise ValueError(f"image: expected values in [0, 1], got {low:g} to {high:g}")
     return np.ascontiguousarray(array, np.float32)
 
 
 def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int, compactness: float) -> np.ndarray:
-    """Cut into rectangles, merge them to the exact number, move border pixels; return padded labels."""
+    """Cut an image by the method ``rdseg``; return labels with a border of one pixel that belongs to no superpixel."""
     height, width, _ = pixels.shape
     spread = np.float32(compactness**0.5)
     num_rectangles = int(rectangles * count)
-    pixel_start = 0.45  # rectangles per pixel; above this share, the pixels themselves are merged instead of rectangles
+    pixel_start = 0.45  # with more rectangles per pixel than this, the pixels themselves are merged instead
     if num_rectangles > pixel_start * height * width:
         num_regions = height * width  # every pixel is its own region
         labels = pad_labels(np.arange(num_regions, dtype=np.int32).reshape(height, width))
@@ -168,12 +169,12 @@ def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int,
         labels, num_regions = split_rectangles(pixels, num_rectangles, block_side, float(compactness))
         labels = refine(labels, pixels, num_regions, early_sweeps, spread)
     labels = merge_regions(labels, pixels, num_regions, count, spread)
-    num_sweeps = 2  # most sweeps over the pixels, each of which may change to a neighbouring region
+    num_sweeps = 2  # most sweeps in which each pixel may change to a neighbouring region
     return refine(labels, pixels, count, num_sweeps, spread)
 
 
 def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
-    """Run BASS from seeds on a hexagonal grid, or drawn by saliency; return padded labels."""
+    """Cut an image by BASS from seeds on a hexagonal grid or drawn by saliency; return labels padded as by rdseg."""
     from gsmerge.kernels.superpixels.bass import infer_labels
 
     height, width, _ = pixels.shape
@@ -181,7 +182,7 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
         seeds = hexagonal_seeds(height, width, count)
     else:
         seeds = seeds_from_density(seed_density(corner_response(pixels), count), count)
-    # CIELAB / 100; OpenCV computes it by tables, with the same bits on every processor
+    # CIELAB divided by 100; OpenCV computes it by tables, so the bits are the same on every processor
     colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
     labels = pad_labels(voronoi(seeds, height, width))
     return infer_labels(labels, colours, count)

@@ -31,7 +31,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
-from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat
+from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat_groups
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
 from gsmerge.stages.superpixels import scene_saliency
@@ -337,7 +337,7 @@ def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
     counts = np.full(len(state), options.max_k)
     if options.k == MIXED:
         counts = counts_by_saliency(state.saliency, options)
-    children, parents = repeat(state.refined, counts)
+    children, parents = repeat_groups(state.refined, counts)
     described = make_group_features(state.refined, state.views, state.group, state.cameras)
     no_members = gaussian_members(children[:0], np.zeros(0, np.float32))
     context = NetworkContext(state.networks, no_members, state.cameras)

@@ -13,7 +13,7 @@ from scripts import load_script
 from sweeps import sweep
 
 from gsmerge.kernels import build as module
-from gsmerge.kernels.build import build, compiler, find_platform, hash_sources
+from gsmerge.kernels.build import build_libraries, compiler, find_platform, hash_sources
 
 HEADS = {"linux": b"\x7fELF", "macosx": b"\xcf\xfa\xed\xfe", "win": b"MZ"}
 PLATFORMS = (  # the first has one target alone, which takes the least time
@@ -25,7 +25,7 @@ PLATFORMS = (  # the first has one target alone, which takes the least time
 @sweep("tag", PLATFORMS, often=0)
 def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) -> None:
     where = find_platform(tag)
-    paths = build(tmp_path, platform=tag)
+    paths = build_libraries(tmp_path, platform=tag)
     assert [path.name for path in paths] == [where.library_name(target) for target in where.targets]
     for path in paths:
         content = path.read_bytes()
@@ -33,26 +33,28 @@ def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) ->
         assert all(name in content for name in (b"blend_backward", b"sources_hash", hash_sources().encode()))
     assert sorted(tmp_path.iterdir()) == sorted(paths)
     if tag == "manylinux_2_17_aarch64":  # of one target, which takes the least time
-        assert [path.read_bytes() for path in build(tmp_path / "again", platform=tag)] == [paths[0].read_bytes()]
+        assert [path.read_bytes() for path in build_libraries(tmp_path / "again", platform=tag)] == [
+            paths[0].read_bytes()
+        ]
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "darwin" or shutil.which("gcc") is None, reason="needs gcc, not clang by its name")
 def test_another_compiler_can_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_CC", "gcc -Wno-error")
-    for path in build(tmp_path):
+    for path in build_libraries(tmp_path):
         assert ctypes.c_char_p.in_dll(ctypes.CDLL(str(path)), "sources_hash").value == hash_sources().encode()
 
 
 def test_a_compiler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_CC", "no-such-compiler -O2")
     with refuses(OSError, "GSMERGE_CC", "'no-such-compiler'"):
-        build(tmp_path)
+        build_libraries(tmp_path)
 
 
 def test_an_error_of_the_compiler_is_shown_and_nothing_is_left(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"(?s)building kernels-.* failed\n.*error:"):
-        build(tmp_path, ("-include", "no-such-header.h"))
+        build_libraries(tmp_path, ("-include", "no-such-header.h"))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -78,10 +80,10 @@ def test_a_failed_build_keeps_the_libraries_of_an_earlier_one(
     def fail(*_: object, **__: object) -> list[Path]:
         raise OSError("no compiler")
 
-    monkeypatch.setattr(script.native_build, "build", fail)
+    monkeypatch.setattr(script.native_build, "build_libraries", fail)
     with pytest.raises(OSError, match="no compiler"):
         command.run()
     assert list(tmp_path.iterdir()) == [earlier]
-    monkeypatch.setattr(script.native_build, "build", lambda *_, **__: (new.touch(), [new])[1])
+    monkeypatch.setattr(script.native_build, "build_libraries", lambda *_, **__: (new.touch(), [new])[1])
     command.run()
     assert list(tmp_path.iterdir()) == [new]

@@ -25,10 +25,10 @@ def _fresh(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("GSMERGE_TARGET", "GSMERGE_NATIVE"):
         monkeypatch.delenv(name, raising=False)
     load_library.cache_clear()
-    module._open.cache_clear()
+    module._open_library.cache_clear()
     yield
     load_library.cache_clear()
-    module._open.cache_clear()
+    module._open_library.cache_clear()
 
 
 class OldProcessor:
@@ -45,8 +45,8 @@ x86_only = pytest.mark.skipif(find_platform().machine != "x86_64", reason="needs
 
 
 def set_level(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
-    monkeypatch.setattr(module, "_open", lambda target: (target.name, OldProcessor(level))[1])
-    monkeypatch.setattr(module._open, "cache_clear", lambda: None, raising=False)
+    monkeypatch.setattr(module, "_open_library", lambda target: (target.name, OldProcessor(level))[1])
+    monkeypatch.setattr(module._open_library, "cache_clear", lambda: None, raising=False)
 
 
 def test_the_most_demanding_target_is_taken() -> None:

@@ -11,7 +11,7 @@ from scenes import make_features, random_rotation
 
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge, take
+from gsmerge.stages.merge import merge, take_features
 from gsmerge.types import FeatureGaussians, Matches
 
 FEW = settings(max_examples=20, deadline=None, derandomize=True)
@@ -36,7 +36,7 @@ def test_order_of_features(seed: int, count: int, method: str) -> None:
     rng = np.random.default_rng(seed)
     features, options = random_features(rng, count), MatchOptions(match=method, overlap=0.3)
     order = rng.permutation(count)
-    shuffled = take(features, order)
+    shuffled = take_features(features, order)
     one, other = match(features, options), match(shuffled, options)
     assert as_sets(one, np.arange(count)) == as_sets(other, order)
     a, b = merge(features, one), merge(shuffled, other)

@@ -1,12 +1,13 @@
-// Split groups of members into children, by repeated bisection across the widest direction.
+// Split groups of members into children, by halving them repeatedly across their widest direction.
 #include "trig.h"
 
-enum { FEATURES = 6, ROW = 8 };  // features of a member, and their number in memory, where the last two are zero
-static const double COLOR = 0.28209479177387814;  // from a spherical harmonic of degree 0 to rgb
+// number of features of a member, and length of its row, in which the last two numbers are zero
+enum { FEATURES = 6, ROW = 8 };
+static const double COLOR = 0.28209479177387814;  // factor from a spherical harmonic of degree 0 to rgb
 static const double PIXEL = 0.012;  // difference in colour that counts as much as one pixel
 typedef double v8d __attribute__((vector_size(64), aligned(8)));
 
-// Members of one group in feature space, colour then position; and True if errors are requested.
+// The members of one group as features, first colour and then position; `measured` is true if errors are requested.
 typedef struct {
   double *features, *weights;
   int64_t *spare;
@@ -26,7 +27,7 @@ static inline double dot(v8d a, v8d b) {
   return (p[0] + p[4]) + (p[2] + p[6]) + ((p[1] + p[5]) + (p[3] + p[7]));
 }
 
-// Principal axis of a scatter by power iteration; returns the scatter along it.
+// Write the principal axis of a scatter, by power iteration, and return the scatter along it.
 static double find_axis(const v8d *scatter, double *axis) {
   int widest = 0;
   for (int c = 1; c < FEATURES; c++) widest = scatter[c][c] > scatter[widest][widest] ? c : widest;
@@ -35,7 +36,7 @@ static double find_axis(const v8d *scatter, double *axis) {
     double length = sqrtf8(dot(direction, direction));
     if (length <= 1e-30) return 0.0;
     direction /= length;
-    v8d product = {0};  // the scatter is symmetric: its rows are its columns
+    v8d product = {0};  // rows in place of columns, because the scatter is symmetric
     for (int c = 0; c < FEATURES; c++) product += scatter[c] * direction[c];
     direction = product;
   }
@@ -43,7 +44,7 @@ static double find_axis(const v8d *scatter, double *axis) {
   return sqrtf8(dot(direction, direction));
 }
 
-// Smallest eigenvalue of the scatter of the positions: squared distances from their plane.
+// Smallest eigenvalue of the scatter of the positions, which is the sum of squared distances from their plane.
 static double find_thickness(const v8d *scatter) {
   double a = scatter[3][3], b = scatter[4][4], c = scatter[5][5];
   double d = scatter[4][3], e = scatter[5][3], f = scatter[5][4], middle = (a + b + c) / 3.0;
@@ -56,8 +57,8 @@ static double find_thickness(const v8d *scatter) {
   return maxd(middle + 2.0 * p * cos8(angle + 2.0943951023931953), 0.0);  // 2 pi / 3
 }
 
-// Mean, axis and spread of some members, and their squared error. The error is that of colour plus
-// the weighted one of the distance from a plane, normalised as if every member weighed one.
+// Compute mean, axis and spread of some members, and their squared error. This is the error of the colour plus the
+// weighted error of the distance from a plane, scaled as if the mean weight of members were one.
 static void measure_run(const space *s, const int64_t *members, int64_t n, run *out) {
   double total = 0.0;
   v8d mean = {0}, scatter[FEATURES] = {{0}};
@@ -79,7 +80,7 @@ static void measure_run(const space *s, const int64_t *members, int64_t n, run *
   out->error = (double)n / total * (colour + s->plane_weight * find_thickness(scatter));
 }
 
-// Orders members by the side of the mean on which they lie; returns the size of the first side.
+// Order members by the side of the mean on which they lie; return the number of members on the first side.
 static int64_t part_members(const space *s, int64_t *members, int64_t n, const run *across) {
   v8d mean = *(const v8d *)across->mean, axis = *(const v8d *)across->axis;
   int64_t low = 0, high = n;
@@ -93,8 +94,8 @@ static int64_t part_members(const space *s, int64_t *members, int64_t n, const r
   return low;
 }
 
-// Cuts an order of n members into at most count runs, bounded by cuts; returns their number. The
-// error with r runs is written to errors[r - 1].
+// Cut an order of n members into at most `count` runs, and return the number of runs. `cuts` gets their bounds, and
+// errors[r - 1] the error with r runs.
 static int64_t split(const space *s, int64_t *order, int64_t n, int64_t count, run *runs,
                      int64_t *cuts, double *errors) {
   int64_t num = 1;
@@ -126,7 +127,7 @@ static int64_t split(const space *s, int64_t *order, int64_t n, int64_t count, r
   return num;
 }
 
-// Writes the features of the members of one group; false if a row is outside the arrays.
+// Write the features of the members of one group; return false if a row is outside the arrays.
 static bool fill_features(const space *s, const int32_t *rows, int64_t size, int64_t n,
                           const float *means, const float *sh0, const float *opacities,
                           const double *centre, double footprint) {

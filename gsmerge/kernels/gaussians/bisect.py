@@ -1,4 +1,4 @@
-"""Split the members of every group into children, by repeated bisection across the widest direction."""
+"""Split the members of every group into children, by halving them repeatedly across their widest direction."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8
 
-# the arguments from features to room are work space for the longest group and the most children; errors may be empty
+# `features` to `room` are work space for the longest group and the most children; `errors` may have no columns
 _split_groups = declare(
     "split_groups", STATUS, starts=i8("ends", least=0, ascending=True), ids=i4("m"), means=f4("n", 3),
     sh0=f4("n", 1, 3), opacities=f4("n"), centres=f8("groups", 3), footprints=f8("groups"),
@@ -18,40 +18,42 @@ _split_groups = declare(
 
 
 def gather_groups(starts, ids, rows):
-    """Gather the starts and ids of the members of the groups ``rows``, group after group."""
+    """Return the starts ``[r+1]`` and the ids of the members of the groups ``rows [r]``, group after group."""
     sizes = starts[rows + 1] - starts[rows]
     local = np.concatenate([[0], np.cumsum(sizes)])
     return local, ids[np.repeat(starts[rows] - local[:-1], sizes) + np.arange(local[-1])]
 
 
 def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children):
-    """Divide every group: the child with the largest spread is halved until there are ``num_children``.
+    """Divide the members of every group into ``num_children`` children, one number or ``[g]``, at least 1.
 
-    A member's features are its colour, and its position relative to ``centres [g,3]`` in units of ``footprints [g]``.
-    Groups of identical members give fewer children. Children nest: the children for 2 are unions of the children for 4.
-    ``num_children`` is one number or ``[g]``, at least 1.
+    The child with the largest spread of features is halved again and again. The features of a member are its colour,
+    and its position relative to ``centres [g,3]`` in units of ``footprints [g]``. Groups of equal members give fewer
+    children. The children for 2 are unions of the children for 4.
 
-    Returns ``child_starts [m+1]`` into the returned ``child_ids``, and ``parents [m]``.
+    Returns the start ``[m+1]`` of each child in a list of members, this list, and the group ``[m]`` of each child.
     """
     num_groups = len(starts) - 1
     counts = np.array(np.broadcast_to(num_children, num_groups), np.int64)
-    return _split(starts, ids, means, sh0, opacities, centres, footprints, counts, np.empty((num_groups, 0)), 0.0)
+    return _split_into_children(
+        starts, ids, means, sh0, opacities, centres, footprints, counts, np.empty((num_groups, 0)), 0.0
+    )
 
 
 def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_children, plane_weight):
-    """Compute the squared error ``[g,max_children]`` of every group with 1, 2, ... children.
+    """Return the squared error ``[g,max_children]`` of every group with 1, 2, ... children of :func:`bisect`.
 
-    It is NaN for more children than the group can be split into. Children are those of :func:`bisect`. The error of a
-    member is its squared distance from the child's mean colour, plus ``plane_weight`` times that from the plane fitted
-    to the child, in features. Members weigh one on average, opaque members more.
+    It is NaN for more children than the group can have. The error of a member is its squared distance from the child's
+    mean colour, plus ``plane_weight`` times that from a plane through the child, both in features. The mean weight of
+    the members is one, and opaque members weigh more.
     """
     num_groups = len(starts) - 1
     counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)
-    _split(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight)
+    _split_into_children(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight)
     return errors
 
 
-def _split(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight):
+def _split_into_children(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight):
     """Return the children of every group as :func:`bisect` does, and write their errors to ``errors [g, any]``."""
     sizes = np.diff(starts)
     counts = np.minimum(counts, np.maximum(sizes, 1))

@@ -1,4 +1,5 @@
-// Overlap of neighbouring Gaussians, and clusters of those that overlap.
+// Measure the overlap of neighbouring Gaussians, and cluster those that overlap. A pair of neighbours is an edge of a
+// graph of Gaussians.
 #include "exp_log.h"
 
 // Determinant of a symmetric 3 x 3 given as xx xy xz yy yz zz.
@@ -9,7 +10,7 @@ static inline double find_det(const double *a) {
 
 static inline double find_volume(const double *cov) { return sqrtf8(maxd(find_det(cov), 0.0)); }
 
-// exp(-d' C^-1 d / 8) (|A| |B|)^(1/4) / |C|^(1/2) with C = (A + B) / 2 (Bhattacharyya 1943).
+// Bhattacharyya's coefficient (1943): exp(-d' C^-1 d / 8) (|A| |B|)^(1/4) / |C|^(1/2) with C = (A + B) / 2.
 static inline double find_overlap(const double *mean_a, const double *cov_a, double volume_a,
                                   const double *mean_b, const double *cov_b) {
   double half[6];
@@ -46,7 +47,7 @@ API double box_overlap(const double *restrict mean_a, const double *restrict cov
   return whole > 0.0 ? shared / whole : 0.0;
 }
 
-// Eight lanes are used, since rows of sixteen floats would cross cache lines.
+// Cosine of two vectors of length 1. It uses eight lanes, because rows of sixteen floats would cross cache lines.
 static inline double find_cosine(const float *a, const float *b, int64_t d) {
   v8f sum = {0};
   int64_t c = 0;
@@ -86,7 +87,7 @@ API int32_t edge_scores(const int64_t *restrict neighbors, const double *restric
   return 0;
 }
 
-// Position of the best score that is left, -1 if there is none.
+// Position of the largest score that is left; -1 if there is none.
 static inline int64_t find_best(const double *left, int64_t k) {
   double top = -__builtin_inf();
   int64_t best = -1;
@@ -159,7 +160,7 @@ API int32_t find_components(const int64_t *restrict neighbors, const double *res
       int64_t a = find_root(parents, i), b = find_root(parents, neighbors[e]);
       parents[maxi(a, b)] = mini(a, b);
     }
-  for (int64_t i = 0; i < n; i++) {  // a root comes before all members of its tree
+  for (int64_t i = 0; i < n; i++) {  // a root comes before all others of its tree
     int64_t root = find_root(parents, i);
     clusters[i] = root == i ? count++ : clusters[root];
   }

@@ -9,12 +9,18 @@ from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native
 
 @native(f8(), mean_a=f8(3), cov_a=f8(6), mean_b=f8(3), cov_b=f8(6))
 def bhattacharyya(mean_a, cov_a, mean_b, cov_b):
-    """Return the Bhattacharyya coefficient of two Gaussians, 1 for equal ones; covariances as xx xy xz yy yz zz."""
+    """Return the Bhattacharyya coefficient of two Gaussians, from 0 to 1 for equal ones.
+
+    Covariances are given as xx xy xz yy yz zz.
+    """
 
 
 @native(f8(), mean_a=f8(3), cov_a=f8(6), mean_b=f8(3), cov_b=f8(6))
 def box_overlap(mean_a, cov_a, mean_b, cov_b):
-    """Return the intersection over union of the axis-aligned boxes of one standard deviation (paper section 4.4)."""
+    """Return the intersection over union of the boxes of two Gaussians (paper section 4.4).
+
+    A box is aligned with the axes, and reaches one standard deviation from the mean to each side.
+    """
 
 
 @native(
@@ -22,18 +28,18 @@ def box_overlap(mean_a, cov_a, mean_b, cov_b):
     views=i8("g"), max_color=f8(), similarity=f8(), boxes=i4(), out=f8("g", "k", out=True),
 )  # fmt: skip
 def edge_scores(neighbors, means, covars, colors, latents, views, max_color, similarity, boxes, out):
-    """Write the overlap of every Gaussian with each of its neighbours.
+    """Write the overlap of every Gaussian with each of its neighbours, which is an edge of a graph of Gaussians.
 
     Args:
-        neighbors: ``[g,k]`` int64 ids of neighbours; below 0: none.
+        neighbors: ``[g,k]`` int64 rows of neighbours; below 0 for none.
         covars: ``[g,6]`` float64, as xx xy xz yy yz zz.
         colors: ``[g,3]`` float64 base colours.
-        latents: ``[g,d]`` float32 of length 1; d may be 0.
+        latents: ``[g,d]`` float32, each of length 1; d is 0 if there are none.
         views: ``[g]`` int64; a view below 0 means no view.
-        max_color: Largest difference of colours; used if d is 0.
-        similarity: Least cosine of the latents.
-        boxes: Use :func:`box_overlap` in place of :func:`bhattacharyya`.
-        out: ``[g,k]`` float64; -1 if there is no neighbour, if both are of one view, or if they are not similar.
+        max_color: Largest difference of the colours of similar Gaussians, if there are no latents.
+        similarity: Least cosine of the latents of similar Gaussians.
+        boxes: 1 to measure overlap by :func:`box_overlap`, 0 to measure it by :func:`bhattacharyya`.
+        out: ``[g,k]`` float64, written; -1 if there is no neighbour, or it is of the same view or not similar.
     """
 
 
@@ -44,18 +50,19 @@ _find_stars = declare(
 
 
 def leader_clusters(order, neighbors, scores, views, threshold, max_size):
-    """Cluster Gaussians around leaders: each free one, in ``order``, leads its free neighbours that overlap enough.
+    """Cluster Gaussians around leaders, so that each cluster is a star and no chain.
 
-    A cluster has at most ``max_size`` members, at most one per view, chosen by overlap. All members are neighbours of
-    the leader, so clusters cannot form chains. Returns the cluster of each Gaussian and the number of clusters.
+    In ``order``, each Gaussian that is in no cluster yet becomes a leader. Those of its neighbours that overlap enough
+    and are in no cluster join it, the ones with the most overlap first, at most one from each view. Returns the cluster
+    ``[n]`` int64 of each Gaussian and the number of clusters.
 
     Args:
-        order: ``[n]`` int64: all Gaussians.
-        neighbors: ``[n,k]`` int64 ids of neighbours; below 0: none.
+        order: ``[n]`` int64 rows of all Gaussians.
+        neighbors: ``[n,k]`` int64 rows of neighbours; below 0 for none.
         scores: ``[n,k]`` float64 overlaps with the neighbours.
         views: ``[n]`` int64; a view below 0 means no view.
         threshold: Least overlap.
-        max_size: Most Gaussians in a cluster.
+        max_size: Largest number of Gaussians in a cluster, with the leader.
     """
     n, k = neighbors.shape
     clusters, count = np.empty(n, np.int64), np.zeros(1, np.int64)
@@ -70,10 +77,10 @@ _find_components = declare(
 
 
 def connected_components(neighbors, scores, threshold):
-    """Find the connected components of the graph of Gaussians that overlap enough (paper section 4.4).
+    """Cluster Gaussians by the connected components of a graph whose edges are overlaps (paper section 4.4).
 
-    ``neighbors`` and ``scores`` are as in :func:`leader_clusters`. Returns the cluster ``[n]`` int64 of each Gaussian
-    and the number of clusters.
+    A Gaussian and its neighbour are connected if their score is at least ``threshold``. ``neighbors`` and ``scores``
+    are as in :func:`leader_clusters`. Returns the cluster ``[n]`` int64 of each Gaussian and the number of clusters.
     """
     parents, clusters = np.empty((2, len(neighbors)), np.int64)
     count = np.zeros(1, np.int64)

@@ -1,11 +1,11 @@
-// Measure the agreement of points with the Gaussians of other views, in each view at one pixel.
+// Measure how points agree with the Gaussians of other views, in each view at the one pixel to which a point projects.
 #include "exp_log.h"
 
 enum { COLUMNS = 6 };
 
-// The surface that points are compared with: Gaussians, the Gaussian of each pixel, and the limits of agreement.
+// What points are compared with: Gaussians, the front Gaussian of each pixel, and the limits of agreement.
 typedef struct {
-  const int32_t *fronts;  // the Gaussian of each pixel, below 0: none
+  const int32_t *fronts;  // row of the front Gaussian of each pixel, below 0 if there is none
   const float *means, *opacities, *sh0;
   double color_scale, near, far, min_opacity;
   int64_t width, height, count;
@@ -15,7 +15,7 @@ static inline double along(const double *row, double x, double y, double z) {
   return row[0] * x + row[1] * y + row[2] * z + row[3];
 }
 
-// Compares a point with one view at the pixel that it projects to, and adds the result; false for an invalid Gaussian.
+// Compare a point with one view at the pixel to which it projects, and add the result; false for an invalid row.
 static inline bool add_view(const surface *s, const double *m, const double *K, int64_t first,
                             const double *point, const float *color, double *out) {
   double x = point[0], y = point[1], z = point[2], depth = along(m + 8, x, y, z);
@@ -58,7 +58,8 @@ API int32_t sum_cross_view(const double *restrict points, const float *restrict 
     int64_t view = own[start], count = view < 0 ? views : most;
     for (stop = start + 1; stop < last && own[stop] == view; stop++);
     if (view >= views) return OUTSIDE;
-    for (int64_t q = 0; q < count; q++) {  // the outer loop, since neighbouring points read neighbouring pixels
+    // views are the outer loop, because neighbouring points read neighbouring pixels
+    for (int64_t q = 0; q < count; q++) {
       int64_t v = view < 0 ? q : asked[most * view + q];
       for (int64_t i = start; i < stop && v != view; i++)
         if (!add_view(&s, viewmats + 16 * v, Ks + 9 * v, v * width * height, points + 3 * i,

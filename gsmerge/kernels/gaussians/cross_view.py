@@ -1,8 +1,8 @@
-"""Find the nearest points of other views, and measure the agreement of points with the Gaussians of other views.
+"""Find the nearest points of other views, and measure how points agree with the Gaussians of other views.
 
-Nearest points are found by a balanced k-d tree in arrays, searched without recursion. Node i of the tree is a run of
-``order``. Its children 2 i + 1 and 2 i + 2 are the halves of the run, which is partitioned at its middle along one
-axis. Agreement is measured in each view at the single pixel that a point projects to.
+Nearest points are found by a balanced k-d tree. Node i of the tree is a run of the array ``order``. Its children
+2 i + 1 and 2 i + 2 are the two halves of this run, which are on different sides of a plane across one axis. Agreement
+is measured in each view at the one pixel to which a point projects.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i1, i4, i8, native
 
-SUM_COLUMNS = 6  # of the sums of :func:`sum_cross_view`
+SUM_COLUMNS = 6  # number of sums of sum_cross_view
 
 
 @native(
@@ -19,18 +19,18 @@ SUM_COLUMNS = 6  # of the sums of :func:`sum_cross_view`
     splits=f8("nodes", out=True),
 )  # fmt: skip
 def build_tree(points, order, axes, splits):
-    """Build the tree of finite points ``[n,3]``.
+    """Build the k-d tree of finite ``points [n,3]``.
 
     Args:
-        order: ``[n]`` int64 rows of the points, in any order; reordered.
+        order: ``[n]`` int64 rows of the points, in any order, which this function changes.
         axes: ``[nodes]`` int8, written: axis along which each node is divided.
         splits: ``[nodes]`` float64, written: coordinate at which each node is divided.
     """
 
 
 def make_tree(points):
-    """Return order, axes and splits of the tree of finite points ``[n,3]`` in C order."""
-    leaf = 16  # runs of at most so many points are not divided
+    """Return the k-d tree of finite ``points [n,3]`` in C order: its order, axes and splits, see :func:`build_tree`."""
+    leaf = 16  # runs of at most this many points are not divided
     nodes = 4 << (len(points) // leaf).bit_length()
     order, axes, splits = np.arange(len(points)), np.zeros(nodes, np.int8), np.zeros(nodes)
     build_tree(points, order, axes, splits)
@@ -44,30 +44,30 @@ _search_tree = declare(
 
 
 def nearest_of_others(points, views, order, axes, splits, first, last, most, out):
-    """Write the nearest points of other views to rows ``first`` to ``last`` of ``out [n,k]``.
+    """Write the nearest points of other views, for the points from ``first`` to before ``last``.
 
     Args:
-        points: As given to :func:`build_tree`.
-        views: ``[n]`` int64; a point with a view below 0 belongs to no view, and any other point counts for it.
-        order: As written by :func:`build_tree`, like ``axes`` and ``splits``.
+        points: Those of the tree.
+        views: ``[n]`` int64. A point with a view below 0 belongs to no view, so all others are of other views.
+        order: As :func:`build_tree` wrote it, like ``axes`` and ``splits``.
         first: First row.
         last: Last row, exclusive.
-        most: Number of points that are compared with each, in whole leaves of the tree.
-        out: ``[n,k]`` int64: nearest first, -1 if there are fewer.
+        most: The search for a point ends once it was compared with this many others.
+        out: ``[n,k]`` int64, written: rows of the k nearest points, nearest first; -1 if there are fewer.
     """
     _search_tree(points, views, order, axes, splits, first, last, most, np.empty(out.shape[1]), out)
 
 
 @native(STATUS, values=f8("n"), order=i8("m", out=True, least=0, below="n"), low=i8(least=0), high=i8(), place=i8())
 def partition(values, order, low, high, place):
-    """Reorder a run of an order so that one place holds the value that sorting would put there.
+    """Reorder a part of ``order`` so that one position has the value that sorting would put there.
 
-    No value before the place is larger, and no value after it is smaller.
+    No value before this position is larger, and no value after it is smaller.
 
     Args:
-        values: ``[n]`` float64 numbers, unchanged.
-        order: ``[m]`` int64 places in ``values``; those from ``low`` to before ``high`` are reordered.
-        place: Place in ``order``, from ``low`` to before ``high``.
+        values: ``[n]`` float64 numbers, which do not change.
+        order: ``[m]`` int64 indices of ``values``, reordered from ``low`` to before ``high``.
+        place: The position in ``order``, from ``low`` to before ``high``.
     """
 
 
@@ -87,18 +87,18 @@ def sum_cross_view(
 
     Args:
         colors: ``[g,3]`` float32 base colours minus 0.5.
-        own: ``[g]`` int64 view of each point, which is left out; below 0: none, so all views are compared.
-        asked: ``[v,most]`` int32 views that are compared with the points of each view.
+        own: ``[g]`` int64 view of each point, which is left out; below 0 if the point is compared with all views.
+        asked: ``[v,most]`` int32 views with which the points of each view are compared.
         width: Width of the views, pixels.
         height: Height of the views, pixels.
-        fronts: ``[v,h,w]`` int32 Gaussian of each pixel, -1 for none.
+        fronts: ``[v,h,w]`` int32 row of the front Gaussian of each pixel, -1 for none.
         color_scale: Factor from ``sh0`` to colours.
-        near: Largest difference of the logarithms of two depths of one surface.
-        far: Larger differences are clipped to this.
-        min_opacity: More transparent Gaussians show no surface.
+        near: Largest difference of the logarithms of two depths of the same surface.
+        far: Differences of the logarithms of depths are clipped to this.
+        min_opacity: A Gaussian with less opacity shows no surface.
         first: First point.
         last: Last point, exclusive.
-        out: ``[g,6]`` float64; the sums are added: number of views that see the point; number of those whose surface is
-            at the point, behind it, and in front of it; absolute difference of colours if the surface is at the point;
-            difference of the logarithms of depths.
+        out: ``[g,6]`` float64, to which six sums are added. They are the number of views that see the point; the
+            numbers of those whose surface is at the point, behind it, and in front of it; the absolute difference of
+            colours if the surface is at the point; and the difference of the logarithms of depths.
     """

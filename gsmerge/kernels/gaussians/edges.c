@@ -1,13 +1,14 @@
-// Cut Gaussians at the edges of photos: compute the moments of the part inside.
+// Cut Gaussians at the edges of photos, by computing the moments of their parts inside.
 //
-// The planes through a camera and the four edges of its photo bound its field of view. The photo in which a Gaussian
-// lies deepest decides. Its depth in a photo is the least distance from the four planes, in standard deviations of the
-// Gaussian across each plane. If the Gaussian reaches past the nearest of these planes, the part beyond is left out
-// (moments of a truncated normal distribution).
+// The edges of a photo are the four planes through the camera and the borders of the picture, which bound the field of
+// view. How deep a Gaussian lies in a photo is its least distance from these planes, in standard deviations of the
+// Gaussian across each plane. It is cut in the photo in which it lies deepest. If it reaches past the nearest plane of
+// this photo, the part beyond is left out (moments of a truncated normal distribution).
 #include "native.h"
 
-enum { NUM_EDGES = 4, CUTS = 2 };  // planes of a photo; cuts of a Gaussian, as a corner has two edges
-static const double REACH = 2.0;   // standard deviations to which a Gaussian reaches; beyond it no Gaussian is cut
+enum { NUM_EDGES = 4, CUTS = 2 };  // edges of a photo; most cuts of a Gaussian, because a corner has two edges
+// a Gaussian ends at this many standard deviations; farther from an edge it is not cut
+static const double REACH = 2.0;
 
 typedef struct {
   double room, sigma;    // distance of the mean inside the plane, and standard deviation across the plane
@@ -28,7 +29,7 @@ static inline void covariance(double *c, const float *q, const float *s) {
       c[3 * i + j] = r[3 * i] * v[0] * r[3 * j] + r[3 * i + 1] * v[1] * r[3 * j + 1] + r[3 * i + 2] * v[2] * r[3 * j + 2];
 }
 
-// True if a ball lies wholly inside of some photo.
+// True if a ball lies wholly inside the field of view of some photo.
 static inline bool is_held(const double *mean, double radius, const double *normals, const double *offsets, int64_t v) {
   for (int64_t view = 0; view < v; view++) {
     int inside = 0;
@@ -39,7 +40,8 @@ static inline bool is_held(const double *mean, double radius, const double *norm
   return false;
 }
 
-// The plane nearest to a Gaussian, of the photo in which it lies deepest; the first of equal ones.
+// The edge nearest to a Gaussian, of the photo in which it lies deepest; of equal ones the first. _find_nearest_edges
+// of gsmerge/fit/edges.py finds it by the same rule, for Gaussians that are split and not cut.
 static inline Plane nearest_plane(const double *mean, const double *c, const double *normals, const double *offsets,
                                   int64_t v) {
   Plane deepest = {-1e300, 1.0, normals};
@@ -56,7 +58,8 @@ static inline Plane nearest_plane(const double *mean, const double *c, const dou
   return deepest;
 }
 
-// Density over distribution function of the normal distribution at x in [-2, 2], to 1e-6, by Chebyshev interpolation.
+// Density of the normal distribution divided by its distribution function, at x in [-2, 2]. Chebyshev interpolation is
+// exact up to 1e-6.
 static inline double hazard(double x) {
   static const double terms[] = {0.7978845608028657, -0.6366256964745176, 0.10900567804265883, 0.019158206345196927,
                                  -0.00017911589947197377, -0.0013142822301547019, -0.0003737371729142186,
@@ -67,7 +70,7 @@ static inline double hazard(double x) {
   return sum;
 }
 
-// Replace mean and covariance by those of the part inside of a plane.
+// Replace mean and covariance by those of the part of the Gaussian inside a plane.
 static inline void cut(double *mean, double *c, Plane plane) {
   const double *n = plane.normal;
   double across[3] = {dot3(c, n), dot3(c + 3, n), dot3(c + 6, n)}, h = hazard(plane.room);

@@ -1,10 +1,10 @@
-"""Cut Gaussians at the edges of photos: compute the moments of the part inside."""
+"""Cut Gaussians at the edges of photos, which are the planes through the camera and the borders of the picture."""
 
 from __future__ import annotations
 
 from gsmerge.kernels.signature import STATUS, f4, f8, i8, native, u1
 
-NUM_EDGES = 4  # planes of a photo
+NUM_EDGES = 4  # a photo has this many edges
 
 
 @native(
@@ -15,10 +15,13 @@ NUM_EDGES = 4  # planes of a photo
 def cut_at_edges(quats, scales, normals, offsets, first, last, means, covars, is_cut):
     """Cut rows ``first`` to ``last - 1`` of Gaussians that reach past the edges of all v photos.
 
-    The photo in which a Gaussian lies deepest decides, and the nearest edge of that photo. Both are measured in
-    standard deviations of the Gaussian across the plane of the edge. Within two standard deviations of the edge the
-    Gaussian is replaced by the moments of its part inside (truncated normal distribution), at most twice. Gaussians
-    farther outside do not change.
+    The cut is made at the nearest edge of the photo in which the Gaussian lies deepest. Distances from edges are
+    measured in standard deviations of the Gaussian across the plane of the edge. If the mean is within two standard
+    deviations of the edge, the Gaussian gets the moments of its part inside (truncated normal distribution). This is
+    done at most twice, because a corner has two edges. Gaussians farther outside do not change.
+
+    The edge of each cut is not returned. ``gsmerge.fit.edges`` splits Gaussians instead of cutting them, and finds the
+    edge again by the same rule.
 
     Args:
         normals: Outward unit normals of the planes through the cameras and the edges of their photos.

@@ -1,7 +1,7 @@
 // Find the pixels of Gaussians by projecting their centres, without drawing a picture.
 #include "exp_log.h"
 
-static const double REACH2 = 11.1;  // squared standard deviations at which a Gaussian ends: 2 ln 255
+static const double REACH2 = 11.1;  // squared number of standard deviations at which a Gaussian ends: 2 ln 255
 static const double DILATION = 0.3;  // dilation of Gaussians by the rasterizer, square pixels
 static const float OPAQUE = 0.99f;  // largest opacity in the rasterizer
 
@@ -9,12 +9,12 @@ static inline double along(const double *row, const float *p) {
   return row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + row[3];
 }
 
-// How far a coordinate lies outside the pixels 0 to before count; 0 inside.
+// How far a coordinate lies outside the range from 0 to `count`; 0 inside.
 static inline double beyond(double x, double count) {
   return x < 0.0 ? -x : x > count ? x - count : 0.0;
 }
 
-// Areas are negative where the centre is outside the picture.
+// See fronts.py. An area is negative if the centre is outside of the picture.
 API int64_t project_centres(const float *restrict means, const float *restrict scales,
                             const double *restrict viewmat, const double *restrict K, int64_t width,
                             int64_t height, double near, int32_t *restrict ids,

@@ -1,7 +1,7 @@
 """Find the pixels of Gaussians by projecting their centres, without drawing a picture.
 
-A Gaussian that reaches into a picture although its centre lies outside has the nearest pixel. It hides no other
-Gaussian there, and no pixel shows it.
+A Gaussian whose centre is outside of a picture, but which reaches into it, belongs to the nearest pixel. It hides no
+other Gaussian there, and is not in front at any pixel.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _weigh_centres = declare(
 
 
 def order_by_depth(depths):
-    """Return the order ``[m]`` int32 of depths ``[m]`` float32 above 0, nearest first; equal depths stay in order."""
+    """Return the order ``[m]`` int32 of ``depths [m]`` float32 above 0, nearest first; equal ones keep their order."""
     return depth_order(depths.view(np.uint32))
 
 
@@ -38,9 +38,9 @@ def project_centres(means, scales, viewmat, K, width, height, near):
         near: Gaussians at this depth or nearer are left out, world units.
 
     Returns:
-        Of the m Gaussians that reach into the picture: rows ``[m]`` int32, ascending; pixels ``[m]`` int32; depths
-        ``[m]`` float32; and areas ``[m]`` float32, the product of the two longest axes in pixels. If the centre is
-        outside the picture, the area is negative and multiplied by the falloff up to the picture.
+        For the m Gaussians that reach into the picture: rows ``[m]`` int32, ascending; pixels ``[m]`` int32; depths
+        ``[m]`` float32; and areas ``[m]`` float32, the products of the two longest axes in square pixels. If the centre
+        is outside of the picture, the area is multiplied by the falloff up to the picture, and negative.
     """
     n = len(means)
     ids, pixels, depths, areas = (np.empty(n, kind) for kind in (np.int32, np.int32, np.float32, np.float32))
@@ -52,13 +52,13 @@ def weigh_centres(order, ids, places, areas, opacities, fronts):
     """Compute the weights of Gaussians at the pixels or cells of their centres.
 
     Args:
-        order: ``[k]`` int32, the Gaussians that count, of m, nearest first.
+        order: ``[k]`` int32, those of the m Gaussians that count, nearest first.
         ids: ``[m]`` int32 rows.
-        places: ``[m]`` int32, the pixel or cell ``row * w + column`` of each.
+        places: ``[m]`` int32 pixel or cell of each, which is ``row * w + column``.
         areas: ``[m]`` float32, see :func:`project_centres`.
         opacities: ``[n]`` float32 of all Gaussians.
-        fronts: ``[h,w]`` int32, written: the Gaussian with the largest opacity times transmittance at each place, -1
-            without any.
+        fronts: ``[h,w]`` int32, written: row of the Gaussian with the largest opacity times transmittance at each
+            place; -1 if there is none.
 
     Returns:
         Opacity times transmittance times area ``[m]`` float32; 0 for Gaussians that do not count.

@@ -1,13 +1,14 @@
-// Find the nearest points of other views by a balanced k-d tree in arrays, searched without recursion.
+// Find the nearest points of other views by a balanced k-d tree, which is kept in arrays and searched without
+// recursion.
 #include "select.h"
 
-enum { LEAF = 16, DEPTH = 64 };  // most points of a leaf; the stack of the tree of 2^60 points
+enum { LEAF = 16, DEPTH = 64 };  // most points of a leaf; room on the stack, enough for 2^60 points
 
 typedef struct {
   int64_t node, low, high;  // a node of the tree, and its run of the order
 } branch;
 
-// Axis along which the points of a run are spread farthest.
+// The axis along which the points of a run differ most.
 static inline int widest_axis(const double *points, const int64_t *order, int64_t low,
                               int64_t high) {
   double least[3], most[3], widest = -1.0;
@@ -56,11 +57,10 @@ typedef struct {
 
 typedef struct {
   branch run;
-  double bound, offsets[3];  // squared distance of the query from the run's cell, and its parts
+  double bound, offsets[3];  // squared distance of the query from the cell of the run, and its parts along the axes
 } wait;
 
-// Descends to the leaf on the query's side, and puts the other sides on the stack; false for an
-// invalid tree.
+// Descend to the leaf on the query's side, and put the other sides on the stack; return false for an invalid tree.
 static inline bool descend(const tree *t, const double *query, wait *at, wait *stack, int *top) {
   while (at->run.high - at->run.low > LEAF) {
     int64_t node = at->run.node, middle = (at->run.low + at->run.high) / 2;
@@ -78,7 +78,7 @@ static inline bool descend(const tree *t, const double *query, wait *at, wait *s
   return true;
 }
 
-// Inserts a point into the sorted list of the nearest points.
+// Insert a point into the sorted list of the nearest points, in place of the last one.
 static inline void insert(double *distances, int64_t *ids, int64_t count, double distance,
                           int64_t id) {
   int64_t place = count - 1;
@@ -129,7 +129,7 @@ API int32_t search_tree(const double *restrict points, const int64_t *restrict v
   return 0;
 }
 
-// Quickselect by itself, for tests.
+// Run quickselect alone, for tests.
 API int32_t partition(const double *restrict values, int64_t *restrict order, int64_t low,
                       int64_t high, int64_t place, int64_t n, int64_t m) {
   if (low > place || place >= high || high > m) return OUTSIDE;

@@ -1,8 +1,8 @@
-// One optimiser step on all parameters of all Gaussians.
+// Take a step of the optimiser on all parameters of Gaussians.
 //
-// A Gaussian's row of fourteen parameters is one vector: mean 3, log scale 3, quaternion 4, opacity
-// logit 1, colour 3, and two unused lanes. Roots and exponentials, which take one number of a row,
-// are computed for all rows of a block together.
+// The fourteen parameters of a Gaussian are one vector: mean 3, log scale 3, quaternion 4, opacity logit 1, colour 3,
+// and two unused lanes. Roots and exponentials of single numbers of a row are computed for all rows of a block
+// together.
 #include "exp_log.h"
 
 enum { MEAN = 0, SIZE = 3, QUAT = 6, LOGIT = 10, COLOR = 11, COLUMNS = 14, BLOCK = 16 };
@@ -12,7 +12,7 @@ static const v16i OF_QUAT = {0, 0, 0, 0, 0, 0, -1, -1, -1, -1};
 static const v16i OF_LOGIT = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, -1};
 static const v16i OF_COLOR = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, -1, -1, -1};
 
-// A row, loaded as two overlapping halves, since the memory beside it belongs to other rows.
+// Load a row as two overlapping halves, because the memory beside it belongs to other rows.
 static inline v16f load_row(const float *p) {
   v8f low = *(const v8f *)p, high = *(const v8f *)(p + COLUMNS - 8);
   return PICK(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15, 15, 15);
@@ -26,7 +26,7 @@ static inline void store_row(float *p, v16f v) {
 static inline v16f min16(v16f a, v16f b) { return sel(a < b, a, b); }
 static inline v16f max16(v16f a, v16f b) { return sel(a > b, a, b); }
 
-// Sums over the mean and over the quaternion, in each of their lanes; other lanes are unchanged.
+// The sum over the mean in each lane of the mean, and over the quaternion in each of its lanes; other lanes unchanged.
 static inline v16f sum_groups(v16f v) {
   v16f z = {0};
   return (PICK(v, z, 0, 0, 0, 3, 4, 5, 6, 6, 6, 6, 10, 11, 12, 13, 14, 15) +
@@ -35,12 +35,12 @@ static inline v16f sum_groups(v16f v) {
           PICK(v, z, 16, 16, 16, 16, 16, 16, 9, 9, 9, 9, 16, 16, 16, 16, 16, 16));
 }
 
-// Values that all rows of a step share.
+// The numbers that all rows of a step share.
 typedef struct {
-  v16f rates;  // learning rates, with the bias correction of first moments
-  float beta1, beta2, second;  // decays of the moments, and the bias correction of second moments
+  v16f rates;  // learning rates, divided by the bias of first moments
+  float beta1, beta2, second;  // decays of both moments, and the bias correction of second moments
   float mean_limit, size_limit, logit_limit, ratio_limit, long_limit;
-  float opacity_reg, scale_reg;  // gradients that are added to those of opacities, and of scales in sizes
+  float opacity_reg, scale_reg;  // numbers added to the gradients of opacities, and of scales in units of a size
 } Step;
 
 static inline double power(double base, int64_t exponent) {
@@ -49,13 +49,13 @@ static inline double power(double base, int64_t exponent) {
   return result;
 }
 
-// A block of rows: their parameters, and values that are computed for all of them together.
+// A block of rows, with numbers that are computed for all of them together.
 typedef struct {
   float rows[BLOCK][LANES], distance[BLOCK], length[BLOCK], unit[BLOCK], share[BLOCK];
   float visible[BLOCK * 4];  // scales and opacity
 } Block;
 
-// Update the moments and the parameters of a row with the gradient in the block; parameters are not yet confined.
+// Update the moments and the parameters of a row with its gradient, without limits of the parameters.
 static inline void move(Block *b, int64_t j, Step s, const float *x, const float *x0, float *m,
                         float *v) {
   v16f gradient = load(b->rows[j]), energy = gradient * gradient;
@@ -76,7 +76,7 @@ static inline void move(Block *b, int64_t j, Step s, const float *x, const float
   store(b->rows[j], moved);
 }
 
-// Compute the factors of the means' distances from the start, and of the quaternions.
+// Compute the factors that bring the means of a block into their box, and the quaternions to length one.
 static inline void confine_groups(Block *b, Step s) {
   for (int j = 0; j < BLOCK; j++) {
     float far = sqrtf4(b->distance[j]), reach = b->share[j] * s.mean_limit * b->unit[j];
@@ -86,8 +86,8 @@ static inline void confine_groups(Block *b, Step s) {
   }
 }
 
-// Confine parameters to the box about the start, scales to the least size, colours to their range, and normalise the
-// quaternion.
+// Return a row with all limits: parameters inside the box about the start, scales of at least the least size, colours
+// in their range, and a quaternion of length one.
 static inline v16f confine(const Block *b, int64_t j, Step s, v16f x0, float least) {
   const float inf = __builtin_inff();
   v16f x = load(b->rows[j]);
@@ -102,7 +102,7 @@ static inline v16f confine(const Block *b, int64_t j, Step s, v16f x0, float lea
   return sel(OF_MEAN, nearer, sel(OF_QUAT, x * b->length[j], inside));
 }
 
-// Shorten the largest log scale to a ratio of the second one, or to a ratio of the least size if that is longer.
+// Limit the largest scale to a multiple of the second one, or to a multiple of the least size if that is longer.
 static inline v16f shorten(v16f x, Step s, float least) {
   float a = x[SIZE], b = x[SIZE + 1], c = x[SIZE + 2];
   float low = a < b ? a : b, high = a < b ? b : a, second = c < low ? low : c < high ? c : high;
@@ -110,8 +110,8 @@ static inline v16f shorten(v16f x, Step s, float least) {
   return sel(OF_SIZE, min16(x, splat(wide > most ? wide : most)), x);
 }
 
-// Convert the gradients of the rasterizer to the optimiser's parameters: means in units of the
-// Gaussian's size, log scales, logits.
+// Convert gradients of the rasterizer to those of the optimiser's parameters, which are means in units of the
+// Gaussian's size, log scales and logits.
 static inline void gather(Block *b, int64_t j, Step s, const float *scale, float opacity,
                           const float *mean, const float *quat, const float *grad_scale,
                           float grad_opacity, const float *color) {
@@ -123,7 +123,7 @@ static inline void gather(Block *b, int64_t j, Step s, const float *scale, float
   for (int c = 0; c < 3; c++) b->rows[j][COLOR + c] = color[c];
 }
 
-// Fetch a row, which may lie in two lines of the cache, before it is used.
+// Begin to load a row, which may lie in two lines of the cache, before it is used.
 static inline void fetch(int64_t at, const float *x, const float *x0, const float *m, const float *v) {
   const float *tables[4] = {x, x0, m, v};
   for (int k = 0; k < 4; k++) {

@@ -1,4 +1,4 @@
-"""Take optimiser steps on all parameters of Gaussians."""
+"""Take steps of the optimiser on all parameters of Gaussians."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, f4, i4, i8, native, u1
 
-# columns of the state: mean 3, log scale 3, quaternion 4, opacity logit 1, colour 3
+# First columns of the parameters: mean 3, log scale 3, quaternion 4, opacity logit 1, colour 3; and their number
 MEAN, SIZE, QUAT, LOGIT, COLOR, COLUMNS = 0, 3, 6, 10, 11, 14
 MAX_FIT_LOGIT, MIN_FIT_LOGIT = np.float32(6.9), np.float32(-5.5)
 
@@ -23,21 +23,21 @@ def adam(
     x, x0, m, v, units, box_shares, min_sizes, fixed, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates,
     limits, betas, regs, step, first, last, means, quats, scales, opacities, colors,
 ):  # fmt: skip
-    """Take an Adam step of rows ``ids[first]`` to ``ids[last - 1]`` of ``x [n,COLUMNS]``; clip to the box about ``x0``.
+    """Change the rows ``ids[first]`` to ``ids[last - 1]`` of parameters ``x [n,COLUMNS]`` by one Adam step.
 
-    With Nesterov momentum, the first moment of the next step is used, with the present gradient (Dozat, 2016). The
-    components of the mean share one second moment, and so do those of the quaternion, so that the step rotates with the
-    scene. The step is sparse: rows that a view does not show keep their parameters and moments.
+    Parameters are clipped to a box about ``x0``. The momentum is Nesterov's, which looks ahead to the first moment of
+    the next step (Dozat, 2016). The components of the mean share one second moment, and so do those of the quaternion,
+    so that steps rotate with the scene. Rows that are not in ``ids`` keep their parameters and moments.
 
     Args:
         box_shares: ``[n]`` share of the limits of mean and log scale that each Gaussian may use.
-        min_sizes: ``[n]`` least log scale of each, even if that is outside the box.
-        ids: ``[k]`` rows with a gradient, each once; the gradients have k rows.
+        min_sizes: ``[n]`` least log scale of each Gaussian, which counts even if it is outside the box.
+        ids: ``[k]`` rows with a gradient, each once. The gradients have k rows.
         rates: Learning rates of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
-        limits: Half sides of the box for mean (in sizes), log scale and logit; then by how much the largest log scale
-            may exceed the second one, or ``min_sizes`` if that allows more.
-        betas: Decay of the first and second moment.
-        regs: Added to the gradients of the opacity, and of scales in units of the Gaussian's size.
+        limits: Half sides of the box for mean (in sizes), log scale and logit. Then by how much the largest log scale
+            may exceed the second one, and by how much it may exceed ``min_sizes``, whichever allows more.
+        betas: Decays of the first and the second moment.
+        regs: Numbers added to the gradients of opacities, and of scales in units of the Gaussian's size.
         step: Number of the step, from 1.
         means, quats, scales, opacities, colors: Written: the new parameters as the rasterizer takes them.
     """

@@ -1,7 +1,7 @@
-// Merge Gaussians in pairs: the cheapest pair of a cell of neighbours becomes one Gaussian, again and again.
+// Merge Gaussians in pairs: in a cell of neighbours the cheapest pair becomes one Gaussian, again and again.
 #include "exp_log.h"
 
-enum { CELL = 64, COLUMNS = 15 };  // most Gaussians of a cell; numbers of each in the work space
+enum { CELL = 64, COLUMNS = 15 };  // most Gaussians of a cell; how many numbers of each are in the work space
 enum { X, Y, Z, COV, MASS = COV + 6, WEIGHT, LOGDET, COLOR };  // the columns, of CELL numbers each
 static const float LEAST = 1e-30f;  // least determinant and mass
 
@@ -23,8 +23,8 @@ static void measure(cell *s, int i) {
   s->columns[LOGDET][i] = log4(maxf(find_det(a), LEAST));
 }
 
-// Costs of merging one Gaussian with each of the others: Runnalls' bound for the pair, per mass, plus the squared
-// distance of the colours, times the sum of both weights.
+// Compute the costs of merging Gaussian i with each of the others: Runnalls' bound for the pair, per mass, plus the
+// squared difference of colours, times the sum of both weights.
 static void find_costs(cell *s, int i) {
   float own[COLUMNS], *costs = s->costs;
   for (int k = 0; k < COLUMNS; k++) own[k] = s->columns[k][i];
@@ -45,7 +45,7 @@ static void find_costs(cell *s, int i) {
   costs[i] = __builtin_inff();
 }
 
-// Place of the smallest of the first n costs, -1 if none is finite.
+// Index of the smallest of the first n costs; -1 if none is finite.
 static int find_least(const float *costs, int n) {
   float least = __builtin_inff();
   int best = -1;
@@ -62,7 +62,7 @@ static void find_best(cell *s, int i) {
   s->best_costs[i] = s->best[i] < 0 ? __builtin_inff() : s->costs[s->best[i]];
 }
 
-// Merges j into i, and moves the last Gaussian to the place of j.
+// Merge j into i, and move the last Gaussian to the place of j.
 static void join(cell *s, int i, int j) {
   float(*c)[CELL] = s->columns, mass = c[MASS][i] + c[MASS][j], q = c[MASS][j] / mass, pq = (1.f - q) * q;
   float x = c[X][j] - c[X][i], y = c[Y][j] - c[Y][i], z = c[Z][j] - c[Z][i];
@@ -85,7 +85,7 @@ static void join(cell *s, int i, int j) {
   s->best_costs[j] = s->best_costs[last];
 }
 
-// Updates the best partners after join(s, i, j).
+// Update the best partner of each Gaussian after join(s, i, j).
 static void update_best(cell *s, int i, int j) {
   int count = 0;
   for (int k = 0; k < s->n; k++) {
@@ -101,7 +101,7 @@ static void update_best(cell *s, int i, int j) {
   for (int e = 0; e < count; e++) find_best(s, s->stale[e]);
 }
 
-// Loads the Gaussians of a run of the order, in units of their root mean square extent.
+// Load the Gaussians of a cell, with lengths in units of their root mean square extent.
 static void load_cell(cell *s, const double *means, const float *covars, const float *masses,
                       const float *weights, const float *colors, const int64_t *order, int n) {
   float(*c)[CELL] = s->columns, size = 0.f;
@@ -181,7 +181,7 @@ API int32_t merge_pairs(const int32_t *restrict pairs, double *restrict means,
   return 0;
 }
 
-// Write covariances and masses; a mass is the opacity times the root of the sum of squared products of two scales.
+// Write covariances and masses, see pairs.py.
 API void gaussian_moments(const float *restrict quats, const float *restrict scales,
                           const float *restrict opacities, double flatness, float *restrict covars,
                           float *restrict masses, int64_t n) {

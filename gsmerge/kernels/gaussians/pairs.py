@@ -1,4 +1,4 @@
-"""Merge Gaussians in pairs, the cheapest pair of a cell of neighbours first."""
+"""Merge Gaussians in pairs, in each cell of neighbours the cheapest pair first."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native
 
 CELL = 64  # most Gaussians of a cell
-WORK = 17  # rows of the work space
+WORK = 17  # rows of the work space for a cell
 
 
 @native(
@@ -15,20 +15,21 @@ WORK = 17  # rows of the work space
     masses=f4("n", out=True),
 )  # fmt: skip
 def gaussian_moments(quats, scales, opacities, flatness, covars, masses):
-    """Write covariances ``[n,6]`` (xx, xy, xz, yy, yz, zz) and masses ``[n]``.
+    """Write the covariances ``[n,6]`` (xx, xy, xz, yy, yz, zz) and the masses ``[n]`` of Gaussians.
 
-    A mass is the opacity times the root of (ab)^2 + (bc)^2 + (ca)^2 of the scales, about the area seen from any side.
+    A mass is the opacity times the root of (ab)^2 + (bc)^2 + (ca)^2, where a, b and c are the scales. This root is
+    about proportional to the area that is seen from any side.
 
     Args:
         quats: ``[n,4]`` wxyz of any length.
         scales: ``[n,3]`` standard deviations.
         flatness: Least scale, as a share of the largest.
-        covars: Written.
-        masses: Written.
+        covars: Written, float32.
+        masses: Written, float32.
     """
 
 
-# ``work`` and ``spare`` are work space for a cell
+# `work` and `spare` are work space for a cell
 _agglomerate = declare(
     "agglomerate", STATUS, means=f8("n", 3), covars=f4("n", 6), masses=f4("n"), weights=f4("n"), colors=f4("n", 3),
     order=i8("n", least=0, below="n"), starts=i8("ends", least=0, ascending=True), color_weight=f8(),
@@ -40,23 +41,23 @@ _agglomerate = declare(
 def agglomerate(
     means, covars, masses, weights, colors, order, starts, color_weight, least_share, first, last, pairs, costs
 ):
-    """Merge in cells ``first`` to ``last`` the cheapest remaining pair, again and again, and write the merges.
+    """Plan merges of pairs in some cells, in each cell the cheapest pair that remains, again and again.
 
-    The cost of a pair is the sum of Runnalls' bound (2007) on the divergence of its merging, per mass, and the squared
-    distance of colours, times the sum of both weights. The written cost of a merge is at least that of the merge before
-    it in its cell, so the merges up to any cost are the first ones of every cell.
+    The Gaussians do not change. The cost of a pair is Runnalls' bound (2007) on the divergence that its merge causes,
+    per mass, plus the squared difference of colours, times the sum of both weights. A written cost is at least that of
+    the merge before it in the same cell. So the merges up to any cost are the first ones of each cell.
 
     Args:
         covars: ``[n,6]`` float32, upper triangles.
-        weights: ``[n]`` float32, which make costs of different cells comparable; weights of merged Gaussians add up.
+        weights: ``[n]`` float32 factors of the costs; weights of merged Gaussians add up.
         order: ``[n]`` int64 rows, cell by cell.
-        starts: ``[c+1]`` int64 starts of the cells in the order, at most ``CELL`` apart.
-        color_weight: Weight of squared distances of colours against nats.
-        least_share: Share of a cell's Gaussians that remains; at least one remains.
+        starts: ``[c+1]`` int64 starts of the cells in the order; a cell has at most ``CELL`` rows.
+        color_weight: Weight of squared differences of colours, relative to a divergence in nats.
+        least_share: Merges stop when this share of a cell's Gaussians is left, or a single one.
         first: First cell.
         last: Last cell, exclusive.
-        pairs: ``[n,2]`` int32, written from each cell's start on: the row that remains after a merge, and the other.
-        costs: ``[n]`` float32 costs of the merges, written like ``pairs``. Entries without a merge do not change.
+        pairs: ``[n,2]`` int32, written from each cell's start on: the row that stays after a merge, and the other row.
+        costs: ``[n]`` float32, written like ``pairs``: costs of the merges. Entries without a merge do not change.
     """
     work, spare = np.empty((WORK, CELL), np.float32), np.empty((3, CELL), np.int32)
     _agglomerate(
@@ -70,8 +71,8 @@ def agglomerate(
     weights=f4("n", out=True), sh=f4("n", "columns", out=True), sizes=i4("n", out=True),
 )  # fmt: skip
 def merge_pairs(pairs, means, covars, masses, weights, sh, sizes):
-    """Replace the first row of each pair by the Gaussian with the moments of both rows, one pair after another.
+    """Replace the first row of each pair by the Gaussian with the moments of both, one pair after another.
 
-    Masses, weights and ``sizes``, the numbers of merged Gaussians, add up. Harmonics are averaged by mass. The second
-    rows do not change.
+    A row may be in several pairs. Masses, weights and ``sizes``, which are numbers of input Gaussians, add up.
+    Harmonics are averaged by mass. The second row of a pair does not change.
     """

@@ -1,12 +1,12 @@
-// Group members, pool their moments, and compute principal axes.
+// Sort members into groups, compute the moments of each group, and turn covariances into principal axes.
 #include "exp_log.h"
 #include "select.h"
 
-// Most members whose median is found by counting; most Jacobi sweeps; members whose moments are computed together, and
-// that are loaded ahead
+// Up to FEW members a median is found by counting. SWEEPS is the largest number of Jacobi sweeps. The moments of LINE
+// members are computed together, and AHEAD members are loaded ahead.
 enum { FEW = 64, SWEEPS = 8, LINE = 32, AHEAD = 32 };
-static const double MAX_OPACITY = 0.995;  // optical depth is -ln(1 - opacity): 1 would be infinite
-static const double CAP = 3.0;  // members are shrunk to this many times the group's median extent
+static const double MAX_OPACITY = 0.995;  // the optical depth -ln(1 - opacity) of an opacity of 1 would be infinite
+static const double CAP = 3.0;  // members are shrunk to at most this many times the median extent of their group
 static const double FLOOR = 0.1;  // smallest standard deviation of a group, in pixel footprints
 static const double VOLUME = 15.749609945722419;  // (2 pi)^(3/2)
 
@@ -15,8 +15,7 @@ typedef struct {
   int64_t rest;  // number of coefficients of shN
 } members;
 
-// Counting sort of member ids by label, ascending, with the start of each label's members; labels
-// below 0 are left out.
+// Sort the ids of members by label, and write where the members of each label start. Labels below 0 are left out.
 API int32_t sort_labels(const int32_t *restrict labels, int64_t *restrict starts,
                         int32_t *restrict ids, int64_t n, int64_t ends) {
   if (n > INT32_MAX || ends < 1) return OUTSIDE;
@@ -30,7 +29,7 @@ API int32_t sort_labels(const int32_t *restrict labels, int64_t *restrict starts
   for (int64_t g = 1; g < ends; g++) starts[g] += starts[g - 1];
   for (int64_t i = 0; i < n; i++)
     if (labels[i] >= 0) ids[starts[labels[i]]++] = (int32_t)i;
-  // each start has moved to its list's end
+  // each start has moved to the end of its list
   for (int64_t g = ends - 1; g > 0; g--) starts[g] = starts[g - 1];
   starts[0] = 0;
   return 0;
@@ -38,8 +37,8 @@ API int32_t sort_labels(const int32_t *restrict labels, int64_t *restrict starts
 
 static inline double largest(const float *s) { return maxf(maxf(s[0], s[1]), s[2]); }
 
-// The median, of two the smaller one. For few members counting is faster than the mispredicted
-// branches of quickselect.
+// The median; for an even number the smaller of the two in the middle. For few members counting is faster than
+// quickselect, whose branches are mispredicted.
 static double find_median(const double *values, int64_t *order, int64_t n) {
   int64_t middle = (n - 1) / 2;
   for (int64_t j = 0; j < n && n <= FEW; j++) {
@@ -55,8 +54,8 @@ static double find_median(const double *values, int64_t *order, int64_t n) {
   return values[order[middle]];
 }
 
-// Shrink factor of each member, so that its extent is at most CAP times the median extent of the
-// group; extents are in footprints.
+// Write the factor by which each member is shrunk, so that its extent is at most CAP times the median extent of its
+// group. Extents are in footprints.
 static void cap_members(const members *m, const int32_t *ids, int64_t n, double *caps,
                         int64_t *order) {
   for (int64_t j = 0; j < n; j++)
@@ -65,15 +64,15 @@ static void cap_members(const members *m, const int32_t *ids, int64_t n, double 
   for (int64_t j = 0; j < n; j++) caps[j] = caps[j] > limit ? limit / caps[j] : 1.0;
 }
 
-// What up to LINE members add to the moments of their group. Each member is a lane, so that the compiler vectorises.
+// Numbers of up to LINE members, a lane for each, so that loops over them vectorise.
 typedef struct {
   double weights[LINE], opacities[LINE], scales[3][LINE], offsets[3][LINE];  // offsets are from the group's mean
   double covars[6][LINE], logs[LINE], areas[LINE];  // covars are the members' own, times their weights
   float quats[4][LINE];
 } lanes;
 
-// Covariances w R diag(s)^2 R^T as xx xy xz yy yz zz, with the rotation R of a quaternion wxyz of any length; the zero
-// quaternion means no rotation.
+// Compute the covariances w R diag(s)^2 R^T as xx xy xz yy yz zz. R is the rotation of a quaternion wxyz of any length;
+// the zero quaternion stands for no rotation.
 static inline void add_covariances(lanes *l, int64_t n) {
   for (int64_t j = 0; j < n; j++) {
     double w = l->quats[0][j], x = l->quats[1][j], y = l->quats[2][j], z = l->quats[3][j];
@@ -92,7 +91,7 @@ static inline void add_covariances(lanes *l, int64_t n) {
   }
 }
 
-// Weighted sums over a group: of weights, means and footprints.
+// Compute the sums over a group of the weights, the weighted means and the weighted footprints.
 static inline void sum_means(const members *m, const int32_t *ids, int64_t n, bool uniform,
                              double *sums) {
   for (int k = 0; k < 5; k++) sums[k] = 0.0;
@@ -129,8 +128,8 @@ static inline void fill_lanes(const members *m, const int32_t *ids, int64_t n, c
   if (caps) add_covariances(l, n);
 }
 
-// Moments of one group; see pool.py. A fully transparent group gets equal weights, so that it has a mean. Without caps,
-// the members' own covariances do not count.
+// Compute the moments of one group, see pool.py. A fully transparent group gets equal weights, so that it has a mean.
+// Without caps, the covariances of the members do not count.
 static void pool_group(const members *m, const int32_t *ids, int64_t n, const double *caps, double *out,
                        float *out_sh) {
   lanes l;
@@ -203,7 +202,7 @@ API int32_t pool_groups(const int64_t *restrict starts, const int32_t *restrict 
   return 0;
 }
 
-// One Jacobi rotation of the symmetric a that zeroes a[p][q]; u collects the eigenvectors.
+// Rotate the symmetric a so that a[p][q] becomes zero (Jacobi), and the columns of u, which become the eigenvectors.
 static inline void rotate_pair(double a[3][3], double u[3][3], int p, int q) {
   if (!(absf8(a[p][q]) > 1e-300)) return;
   double theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
@@ -225,8 +224,7 @@ static inline void rotate_pair(double a[3][3], double u[3][3], int p, int q) {
   }
 }
 
-// Unit quaternion wxyz, w >= 0, of orthonormal axes; the first axis of a left-handed set is
-// reversed.
+// Write the unit quaternion wxyz, w >= 0, of orthonormal axes. If they are left-handed, the first one is reversed.
 static inline void right_handed_quat(double r[3][3], double *out) {
   double det = r[0][0] * (r[1][1] * r[2][2] - r[1][2] * r[2][1])
       - r[0][1] * (r[1][0] * r[2][2] - r[1][2] * r[2][0])
@@ -261,7 +259,7 @@ API void decompose(const double *restrict covars, double *restrict out_scales,
       rotate_pair(a, u, 0, 2);
       rotate_pair(a, u, 1, 2);
     }
-    // ascending order of the diagonal; the middle one is the remaining one
+    // find the smallest and the largest number on the diagonal; the third one is in the middle
     int low = 0, high = 0;
     for (int k = 1; k < 3; k++) {
       low = a[k][k] < a[low][low] ? k : low;

@@ -1,4 +1,4 @@
-"""Group members together and replace each group by the Gaussian with the same moments."""
+"""Sort members into groups, compute the moments of each group, and turn covariances into scales and rotations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ _sort_labels = declare("sort_labels", STATUS, labels=i4("n"), starts=i8("ends", 
 
 
 def group_members(labels, count):
-    """Sort members by label; return int64 ``starts [count+1]`` and int32 members. Labels below 0 are left out.
+    """Sort members by label; return the start ``[count+1]`` int64 of each label in a list of rows, and this int32 list.
+
+    Members with labels below 0 are left out.
 
     Args:
         labels: ``[n]`` int32, below ``count``.
@@ -21,7 +23,7 @@ def group_members(labels, count):
     return starts, ids[: starts[-1]]
 
 
-# ``caps`` and ``order`` are work space for the longest group
+# `caps` and `order` are work space for the longest group
 _pool_groups = declare(
     "pool_groups", STATUS, starts=i8("ends", least=0, ascending=True), ids=i4("m"), means=f4("n", 3), quats=f4("n", 4),
     scales=f4("n", 3), opacities=f4("n"), sh0=f4("n", 1, 3), shN=f4("n", "rest", 3), footprints=f4("n"),
@@ -31,7 +33,7 @@ _pool_groups = declare(
 
 
 def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own_covariance, out_geometry, out_sh):
-    """Write the moments of every group, computed in float64 about the group's own mean.
+    """Write the moments of every group, which are computed in float64 about the group's own mean.
 
     Args:
         starts: ``[g+1]`` int64 starts of the groups in ``ids``, ascending from 0 or above.
@@ -40,11 +42,11 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
         quats: ``[n,4]`` wxyz of any length.
         scales: ``[n,3]`` standard deviations.
         footprints: ``[n]`` sizes of the members' pixels, world units.
-        own_covariance: Add the members' own covariances to that of their means, with capped extents. Otherwise only the
-            covariance of the means counts (paper eq. teacher_cov).
+        own_covariance: True to add the covariances of the members, with capped extents, to the covariance of their
+            means. Otherwise only the latter counts (paper eq. teacher_cov).
         out_geometry: ``[g,13]`` float64: mean 3, covariance xx xy xz yy yz zz, sum of opacities, mass (paper eq. mass),
             integrated optical depth (sum of -ln(1 - opacity) x disc area), footprint. Empty groups do not change.
-        out_sh: ``[g,k,3]`` float32, zero before.
+        out_sh: ``[g,k,3]`` float32, zero before: weighted means of the harmonics.
     """
     longest = int(np.diff(starts).max(initial=0))
     _pool_groups(
@@ -55,4 +57,4 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
 
 @native(covars=f8("g", 3, 3), out_scales=f8("g", 3, out=True), out_quats=f8("g", 4, out=True))
 def decompose(covars, out_scales, out_quats):
-    """Write standard deviations, ascending, and unit quaternions wxyz, w >= 0, of covariances, by Jacobi sweeps."""
+    """Write the standard deviations of covariances, ascending, and the unit quaternions wxyz, w >= 0, of their axes."""

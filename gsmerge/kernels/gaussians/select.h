@@ -1,10 +1,11 @@
-// Quickselect of an order, for medians and k-d trees.
+// Find the value at a position of an order without sorting it all (quickselect), for medians and k-d trees.
 #pragma once
 #include "native.h"
 
-enum { TRIES = 32 };  // passes over the run before the rest is sorted, so that no order takes quadratic time
+// after as many steps as this many passes over a run, it is sorted, so that no order takes quadratic time
+enum { TRIES = 32 };
 
-// Moves the value at a place of a heap below larger values.
+// Move the value at a place of a heap down, below larger values.
 static inline void sink(const double *values, int64_t stride, int64_t *heap, int64_t place,
                         int64_t count) {
   int64_t moved = heap[place];
@@ -28,9 +29,8 @@ static inline void sort_heap(const double *values, int64_t stride, int64_t *heap
   }
 }
 
-// Reorders order[low] to order[high - 1] so that values[stride * order[place]] is the one that
-// sorting would put there: no value before it is larger, no value after it is smaller. NaN may end up
-// anywhere.
+// Reorder order[low] to order[high - 1] so that values[stride * order[place]] is the value that sorting would put
+// there. No value before it is larger, and no value after it is smaller. NaN may end up anywhere.
 static inline void partition_run(const double *values, int64_t stride, int64_t *order, int64_t low,
                                  int64_t high, int64_t place) {
   int64_t last = high - 1, most = TRIES * (high - low);

@@ -1,1 +1,1 @@
-"""Kernels of the networks: their layers, their inputs, and the corrections that they output."""
+"""Compute the layers of the networks, their inputs, and the corrections that follow from their outputs."""

@@ -6,7 +6,7 @@
 
 enum { COLUMNS = 13, MEAN = 0, SIZE = 3, TURN = 6, LOGIT = 9, COLOR = 10 };  // columns of a correction
 
-// Rotate a vector from a group's frame to the world.
+// Rotate a vector from the frame of a group to the world.
 static inline void to_world(const float *frame, const double *v, double *out) {
   for (int i = 0; i < 3; i++) out[i] = frame[3 * i] * v[0] + frame[3 * i + 1] * v[1] + frame[3 * i + 2] * v[2];
 }
@@ -89,11 +89,13 @@ API void correct_features(float *restrict means, float *restrict covars, float *
     stretch_of(quats + 4 * n, residual + SIZE, stretch);
     multiply(rotation, stretch, change);
     change_covariance(change, covars + 9 * n);
-    double depth = residual[LOGIT], disc = (double)residual[SIZE + 1] + residual[SIZE + 2];  // of the larger two axes
+    // change of the disc of the two larger axes
+    double depth = residual[LOGIT], disc = (double)residual[SIZE + 1] + residual[SIZE + 2];
     masses[n] = (float)(masses[n] * exp8(depth + residual[SIZE] + disc));
     extinctions[n] = (float)(extinctions[n] * exp8(depth + disc));
     for (int i = 0; i < 3; i++) {
-      bool finite = absf8(shift[i]) <= 1.7976931348623157e308;  // false for means near the limit of float32
+      // the shift is not finite for means near the limit of float32
+      bool finite = absf8(shift[i]) <= 1.7976931348623157e308;
       means[3 * n + i] = (float)(means[3 * n + i] + (finite ? shift[i] : 0.0));
       sh0[3 * n + i] = (float)(sh0[3 * n + i] + residual[COLOR + i] / SH_C0);
     }
@@ -117,7 +119,7 @@ API void correct_gaussians(float *restrict means, float *restrict quats, float *
     quats[4 * p + 1] = (float)(w * b + x * a + y * d - z * c);
     quats[4 * p + 2] = (float)(w * c - x * d + y * a + z * b);
     quats[4 * p + 3] = (float)(w * d + x * c - y * b + z * a);
-    double odds = opacities[p], factor = exp8(residual[LOGIT]);  // the logit plus the correction
+    double odds = opacities[p], factor = exp8(residual[LOGIT]);  // adds the correction to the logit
     opacities[p] = (float)mind(maxd(odds * factor / (1.0 + odds * (factor - 1.0)), 0.0), 1.0);
     for (int i = 0; i < 3; i++) {
       means[3 * p + i] = (float)(means[3 * p + i] + shift[i]);

@@ -1,7 +1,9 @@
-// Layers of the networks on tables of tokens. Every row is computed by itself, so results do not depend on the table.
+// Compute the layers of the networks on tables of tokens. Every row is computed by itself, so the rest of the table
+// does not matter.
 #include "exp_log.h"
 
-enum { ROWS = 6 };  // rows that share each load of weights; their sums and a weight fit into sixteen AVX2 registers
+// this many rows use each weight that is loaded; their sums and the weight fit into sixteen AVX2 registers
+enum { ROWS = 6 };
 enum { GELU = 1, TANH = 2 };  // activations
 enum { MOST_COLUMNS = 1 << 20 };
 
@@ -20,10 +22,10 @@ static inline void store_some(float *p, v16f v, int64_t count) {
   for (int64_t l = 0; l < count; l++) p[l] = v[l];
 }
 
-// x times the normal distribution's cumulative function (Hendrycks and Gimpel 2016).
+// x times the distribution function of the normal distribution (Hendrycks and Gimpel 2016).
 static inline float gelu(float x) { return 0.5f * x * (1.f + erf4(0.70710678f * x)); }
 
-// One to ROWS rows from `first` on, for sixteen outputs from column j on.
+// Compute up to ROWS rows from `first` on, for sixteen outputs from column j on.
 static inline void dense_block(const float *restrict x, const float *restrict weight, const float *restrict residual,
                                v16f bias, float *restrict out, int64_t first, int64_t j, int64_t rows, int64_t inputs,
                                int64_t outputs) {
@@ -44,7 +46,7 @@ static inline void dense_block(const float *restrict x, const float *restrict we
   }
 }
 
-// activation(x W + b + residual). The weights are in blocks of sixteen outputs, the last one padded with zeros.
+// Write activation(x W + b + residual). The weights are in blocks of sixteen outputs, the last one padded with zeros.
 API int32_t dense(const float *restrict x, const float *restrict weight, const float *restrict bias,
                   const float *restrict residual, int64_t activation, float *restrict out, int64_t rows, int64_t inputs,
                   int64_t blocks, int64_t outputs) {
@@ -63,7 +65,7 @@ API int32_t dense(const float *restrict x, const float *restrict weight, const f
   return 0;
 }
 
-// Rows with mean 0 and variance 1, times gains, plus shifts (Ba et al. 2016).
+// Normalise rows to mean 0 and variance 1, and write them times gains plus shifts (Ba et al. 2016).
 API void normalise(const float *restrict x, const float *restrict gains, const float *restrict shifts,
                    float *restrict out, int64_t rows, int64_t width) {
   for (int64_t i = 0; i < rows; i++) {
@@ -99,7 +101,7 @@ static inline float largest(v16f v) {
   return s[0];
 }
 
-// Softmax of the scores of a query in one head: writes unnormalised shares, and returns their sum.
+// Write the shares of all keys for a query in one head, by softmax before the division, and return their sum.
 static inline float attention_shares(const float *restrict query, const float *restrict keys,
                                      const float *restrict hidden, float *restrict shares, const Shape *s) {
   v16f top = splat(-__builtin_inff()), sum = {0};
@@ -119,7 +121,7 @@ static inline float attention_shares(const float *restrict query, const float *r
   return total(sum);
 }
 
-// Attend to one set; its keys are transposed so that sixteen of them are compared with a query at once.
+// Attend to one set. Its keys are transposed, so that sixteen of them are compared with a query at once.
 static inline void attend_set(const float *restrict query, const float *restrict pairs, const uint8_t *restrict mask,
                               float *restrict scratch, float *restrict out, int64_t queries, const Shape *s) {
   float *keys = scratch, *hidden = keys + s->width * s->room, *shares = hidden + s->room;

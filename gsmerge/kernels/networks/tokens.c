@@ -1,11 +1,11 @@
-// Compute the inputs of the networks: numbers without a unit, in the frame of each group. They are computed in float64
-// and written as float32.
+// Compute the inputs of the networks, which are numbers without a unit in the frame of each group. They are computed in
+// float64 and written as float32.
 #include "exp_log.h"
 
 #define SH_C0 0.28209479177387814
 #define TINY 1e-12  // least length before a division or a logarithm, world units
 
-enum { PART = 13, MEMBER = 19, NUMBERS = 19 };  // columns
+enum { PART = 13, MEMBER = 19, NUMBERS = 19 };  // numbers of columns, see tokens.py
 
 static inline double clampd(double x, double low, double high) { return mind(maxd(x, low), high); }
 
@@ -32,8 +32,8 @@ static inline void normalise8(double *v) {
   for (int i = 0; i < 3; i++) v[i] = v[i] / norm;
 }
 
-// Write for each point a frame with the columns image right, image down and ray, and a size, the geometric mean of the
-// two largest scales.
+// Write the frame of each group, whose columns are the picture's right and down and the ray, and the group's size,
+// which is the geometric mean of its two largest scales.
 API void place_frames(const float *restrict means, const float *restrict scales, const double *restrict viewmats,
                       const int64_t *restrict views, float *restrict frames, float *restrict sizes, int64_t g,
                       int64_t v) {
@@ -72,7 +72,7 @@ API void place_frames(const float *restrict means, const float *restrict scales,
   }
 }
 
-// The six different entries of a covariance in a frame, in units of the group's size.
+// Write the six different entries of a covariance in a frame, in units of the group's size.
 static inline void describe_covariance(const float *covar, const float *frame, double size, float *out) {
   double turned[3][3];
   for (int i = 0; i < 3; i++)
@@ -121,7 +121,7 @@ API int32_t describe_groups(const float *restrict means, const float *restrict s
   return 0;
 }
 
-// The axis of the smallest of three scales, in the world, of a quaternion of any length.
+// Write the axis of the smallest scale, in the world. The quaternion may have any length.
 static inline void normal_of(const float *quat, const float *scales, double *normal) {
   double q[4], norm = 0.0;
   for (int i = 0; i < 4; i++) norm += (double)quat[i] * quat[i];
@@ -167,7 +167,7 @@ API int32_t describe_parts(const float *restrict means, const float *restrict qu
       row[3 + i] = finite4(clampd(log8(sorted[i] / pixel), -12.0, 12.0) / 4.0);
     }
     row[6] = finite4(logit8(opacities[p]) / 3.0);
-    // towards the camera; a round Gaussian gets no normal, since rounding would choose it
+    // The normal points towards the camera. A round Gaussian gets none, because rounding would choose it
     double flat = (1.0 - sorted[0] / sorted[1]) * (facing[2] > 0.0 ? -1.0 : facing[2] < 0.0 ? 1.0 : 0.0);
     for (int i = 0; i < 3; i++) {
       row[7 + i] = finite4(SH_C0 * ((double)sh0[3 * p + i] - group_sh0[3 * o + i]));

@@ -1,4 +1,4 @@
-"""Compute the inputs of the networks for Gaussians and groups, and apply their corrections, in the frame of each group.
+"""Compute the inputs of the networks in the frame of each group, and apply the corrections that they output.
 
 Arrays are float32, and ids int64. Corrections have 13 columns, see :mod:`gsmerge.networks.corrections`. They are
 applied in place, and a correction of zero changes no bit. The columns of a frame are its axes.
@@ -14,9 +14,9 @@ from gsmerge.kernels.signature import STATUS, f4, f8, i8, native
     frames=f4("g", 3, 3, out=True), sizes=f4("g", out=True),
 )  # fmt: skip
 def place_frames(means, scales, viewmats, views, frames, sizes):
-    """Write the frames of points in their views, and the geometric means of their two largest scales.
+    """Write the frame of each group in its view, and its size, the geometric mean of its two largest scales.
 
-    A frame's columns are the image's right, the image's down and the ray, in the world.
+    The columns of a frame are the picture's right and down, and the ray from the camera to the group, in the world.
     """
 
 
@@ -29,10 +29,11 @@ def describe_groups(
     means, scales, opacities, sh0, covars, masses, extinctions, weights, counts, footprints, frames, sizes, viewmats,
     views, out,
 ):  # fmt: skip
-    """Write the first 19 columns that describe groups.
+    """Write the first 19 numbers that describe each group.
 
     They are three log scales, the logit of the opacity, the mass, the optical depth, the number of members ``counts``,
-    their mean opacity, three colours, six entries of the covariance, and two tangents of the angles to the view's axis.
+    their mean opacity, three colours, six entries of the covariance, and the tangents of the two angles between the ray
+    and the axis of the view.
     """
 
 
@@ -45,10 +46,10 @@ def describe_groups(
 def describe_parts(
     means, quats, scales, opacities, sh0, group_means, group_sh0, frames, sizes, footprints, ids, owners, members, out
 ):
-    """Write the first 13 columns that describe the parts ``ids`` relative to the groups ``owners``.
+    """Write 13 numbers that describe each of the parts ``ids`` relative to its group in ``owners``.
 
     They are three of the position, three log scales, the logit of the opacity, three of the colour and three of the
-    normal. With ``members`` there are six more: the position in pixels, and the absolute colour.
+    normal. If ``members`` is 1, there are six more: the position in pixels, and the colour itself.
     """
 
 
@@ -58,7 +59,7 @@ def describe_parts(
     frames=f4("g", 3, 3), residuals=f4("g", 13),
 )  # fmt: skip
 def correct_features(means, covars, masses, extinctions, sh0, quats, scales, frames, residuals):
-    """Correct Feature Gaussians with principal axes ``quats`` and ``scales``."""
+    """Apply ``residuals`` to Feature Gaussians, whose principal axes are ``quats`` and ``scales``, in place."""
 
 
 @native(
@@ -66,4 +67,4 @@ def correct_features(means, covars, masses, extinctions, sh0, quats, scales, fra
     sh0=f4("n", 1, 3, out=True), residuals=f4("n", 13), frames=f4("g", 3, 3), owners=i8("n", least=0, below="g"),
 )  # fmt: skip
 def correct_gaussians(means, quats, scales, opacities, sh0, residuals, frames, owners):
-    """Correct Gaussians in the frames of their groups ``owners``."""
+    """Apply ``residuals`` to Gaussians, in the ``frames`` of their groups ``owners``, in place."""

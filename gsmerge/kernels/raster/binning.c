@@ -1,14 +1,16 @@
-// Depth order and tile lists.
+// Sort Gaussians by depth, and append them to the lists of the tiles.
 #include "exp_log.h"
 #include "walk.h"
 
-static const float CLOSED = 5e-5f;  // transmittance below which every pixel of a tile has stopped, with room for rounding
+// with an upper bound of the transmittance below this, every pixel of a tile is opaque despite rounding
+static const float CLOSED = 5e-5f;
 static const float ROUNDING = 0.01f;  // tolerance for rounding errors of exponents
 
-enum { DIGIT = 11, PASSES = 3 };  // most bits per pass and passes: 2048 counters and their streams fit the first caches
+// most bits of a pass; most passes. 2048 counters and their streams fit the first caches
+enum { DIGIT = 11, PASSES = 3 };
 
-// A least-significant-digit radix sort. Only bits that differ in the range of values are sorted, in as few passes as
-// possible, with about equal numbers of bits.
+// Sort by radix, the least significant digit first. Only bits in which values differ are sorted, in as few passes as
+// possible with about equal numbers of bits.
 API void sort_bits(const uint32_t *bits, int32_t *order, uint64_t *keys, uint64_t *spare, int64_t m) {
   int64_t counts[PASSES][1 << DIGIT];
   if (m == 0) return;
@@ -43,8 +45,8 @@ API void sort_bits(const uint32_t *bits, int32_t *order, uint64_t *keys, uint64_
   for (int64_t i = 0; i < m; i++) order[i] = (int32_t)keys[i];
 }
 
-// Mark the corners of the boxes, then take running sums. Without a loop over the tiles of each box no branch is
-// mispredicted.
+// Count the boxes over each tile, by marking the corners of boxes and taking running sums. Without a loop over the
+// tiles of each box, no branch is mispredicted.
 API int32_t count_boxes(const int16_t *boxes, int64_t tile_height, int64_t tile_width, int64_t *corners,
                         int64_t *counts, int64_t m, int64_t num_corners, int64_t tiles) {
   int64_t stride = tile_width + 1;
@@ -76,7 +78,7 @@ API int32_t deal_tiles(const int32_t *order, const int16_t *boxes, int64_t tile_
     if (x0 < 0 || y0 < 0 || width <= 0 || height <= 0) continue;
     if (x0 + width > tile_width || (y0 + height) * tile_width > tiles) return OUTSIDE;
     int64_t tile = y0 * tile_width + x0, column = 0;
-    // One loop for both axes: most boxes have one or two tiles, and the end of each loop is mispredicted.
+    // One loop for both axes, because most boxes have one or two tiles, and the end of each loop is mispredicted
     for (int64_t n = width * height; n > 0; n--) {
       uint64_t slot = (uint64_t)cursors[tile];
       if (slot >= (uint64_t)intersections) return OUTSIDE;
@@ -91,8 +93,8 @@ API int32_t deal_tiles(const int32_t *order, const int16_t *boxes, int64_t tile_
   return 0;
 }
 
-// Lower bound of a Gaussian's alpha over the pixels of the tile at (left, top). Exponents are concave, so their least
-// value is in a corner.
+// A lower bound of a Gaussian's alpha in the pixels of the tile at (left, top). The exponent is concave, so it is least
+// in a corner.
 static inline float least_share(const float *conic, float left, float top) {
   float least = 0.f;
   for (int corner = 0; corner < 4; corner++) {

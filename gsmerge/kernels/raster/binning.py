@@ -1,4 +1,4 @@
-"""Sort Gaussians by depth once, then append them in that order to the lists of their tiles."""
+"""Sort Gaussians by depth, and append them in this order to the lists of the tiles that they may touch."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import numpy as np
 from gsmerge.kernels.raster.project import CONIC
 from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u4, u8
 
-MOST_TILES = 2**15 - 1  # per row and per column, since boxes have 16 bits
+MOST_TILES = 2**15 - 1  # most tiles in a row and in a column, because boxes have 16 bits
 
 
 @native(bits=u4("m"), order=i4("m", out=True), keys=u8("m", out=True), spare=u8("m", out=True))
 def sort_bits(bits, order, keys, spare):
-    """Write the stable order of ``bits`` to ``order``; ``keys`` and ``spare`` are overwritten."""
+    """Write the stable ascending order of ``bits`` to ``order``; ``keys`` and ``spare`` are scratch."""
 
 
 def depth_order(bits):
-    """Return the stable order of ``[m]`` uint32 bit patterns of positive floats, nearest first: ``[m]`` int32."""
+    """Return the stable order ``[m]`` int32 of positive depths, nearest first, from their ``bits [m]`` as uint32."""
     m = len(bits)
     order = np.empty(m, np.int32)
     sort_bits(bits, order, np.empty(m, np.uint64), np.empty(m, np.uint64))
@@ -28,13 +28,13 @@ def depth_order(bits):
     corners=i8("num_corners", out=True), counts=i8("tiles", out=True),
 )  # fmt: skip
 def count_boxes(boxes, tile_height, tile_width, corners, counts):
-    """Write the number of boxes over each tile; ``corners`` is scratch, zero before, an entry for each tile corner."""
+    """Write the number of boxes over each tile; ``corners`` is scratch for each corner of a tile, and zero before."""
 
 
 def count_tiles(boxes, tile_height, tile_width):
-    """Count the boxes over each tile: ``[tile_height * tile_width]`` int64.
+    """Return the number of boxes over each tile, ``[tile_height * tile_width]`` int64.
 
-    ``boxes [m,4]`` int16 are first and (exclusive) last tile column, first and last tile row.
+    ``boxes [m,4]`` int16 are the first and the (exclusive) last column of tiles, and the first and the last row.
     """
     counts = np.empty(tile_height * tile_width, np.int64)
     count_boxes(boxes, tile_height, tile_width, np.zeros((tile_height + 1) * (tile_width + 1), np.int64), counts)
@@ -50,9 +50,9 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
 
     Args:
         order: ``[m]`` int32 Gaussians in depth order.
-        boxes: ``[m,4]`` int16 their boxes, in the same order.
-        tile_width: Tiles per row.
-        cursors: ``[tiles]`` int64 ends of the lists in ``flatten_ids``, advanced.
+        boxes: ``[m,4]`` int16 boxes of the Gaussians, in the same order.
+        tile_width: Number of tiles in a row.
+        cursors: ``[tiles]`` int64 ends of the lists in ``flatten_ids``, which move on.
     """
 
 
@@ -61,19 +61,19 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
     left=f4("tiles", out=True), cursors=i8("tiles", out=True), flatten_ids=i4("intersections", out=True),
 )  # fmt: skip
 def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors, flatten_ids):
-    """Append Gaussians to the lists of a range of tile lines, but leave out hidden Gaussians.
+    """Append Gaussians to the lists of a range of rows of tiles, but leave out hidden Gaussians.
 
-    The lists are those of :func:`deal_tiles`, but each ends with the Gaussian after which every pixel of the tile has
-    stopped. So the pixels do not change.
+    The lists are those of :func:`deal_tiles`, but each ends with the Gaussian after which all pixels of the tile are
+    opaque. So the drawn pixels are the same.
 
     Args:
         order: ``[m]`` int32 Gaussians in depth order.
-        boxes: ``[m,4]`` int16 their boxes, in the same order.
-        conics: ``[m,CONIC]`` float32 of the Gaussians.
-        tile_width: Tiles per row.
-        first: First line of tiles.
-        last: Last line of tiles, exclusive.
-        left: ``[tiles]`` float32 upper bound of each tile's transmittance, 1 before; lowered.
-        cursors: ``[tiles]`` int64 ends of the lists, advanced.
+        boxes: ``[m,4]`` int16 boxes of the Gaussians, in the same order.
+        conics: ``[m,CONIC]`` float32 conics of the Gaussians.
+        tile_width: Number of tiles in a row.
+        first: First row of tiles.
+        last: Last row of tiles, exclusive.
+        left: ``[tiles]`` float32 upper bound of the transmittance of each tile, 1 before, which becomes less.
+        cursors: ``[tiles]`` int64 ends of the lists, which move on.
         flatten_ids: ``[intersections]`` int32, written; if it is empty, only the cursors are advanced.
     """

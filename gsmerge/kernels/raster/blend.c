@@ -1,12 +1,12 @@
-// Blend one view front to back, tile by tile, and sum over its blending weights.
+// Blend a view front to back, tile by tile, and sum over its blending weights.
 //
 // All kernels use the same lists with the same weights. Gaussians are gathered 32 at a time into a small local batch,
 // with the rows of the tile in which they show.
 #include "walk.h"
 
-enum { CHANNELS = 4 };  // channels that weighted_sums adds up at a time
+enum { CHANNELS = 4 };  // number of channels that weighted_sums adds up at a time
 
-// Sum and maximum of the weights of one Gaussian over rows, by column.
+// The sum and the maximum of the weights of a Gaussian in each column.
 typedef struct { pixels sum, peak; } Weights;
 
 static inline v4f max4(v4f a, v4f b) { return (v4f)(((a > b) & (v4i)a) | (~(a > b) & (v4i)b)); }
@@ -17,8 +17,8 @@ static inline float maximum(v16f v) {
   return maxf(maxf(peak[0], peak[1]), maxf(peak[2], peak[3]));
 }
 
-// Blend Gaussian j of a batch in a part of its rows. Planes 1 to 3, if there are any, collect the colour. Return its
-// weights, if they are used.
+// Blend Gaussian j of a batch in a part of its rows, and return its weights. If `colored`, planes 1 to 3 collect the
+// colour.
 INLINE Weights blend_part(float *state, const Curve *curve, Rows r, const Batch *b, int64_t j, bool colored, int part) {
   float red = b->red[j], green = b->green[j], blue = b->blue[j];
   int32_t last = last_of(r, part);
@@ -51,7 +51,8 @@ INLINE void blend_one(float *state, const Batch *b, int64_t j, int32_t y0, int32
   else blend_rows(state, (Rows){false, b->x0[j], y0, y1}, b, j, colored, w);
 }
 
-// Blend Gaussian j of a batch over the whole tile, and add its weights to a row of totals: their sum, and their maximum.
+// Blend Gaussian j of a batch over the whole tile, and add its weights to a row of totals: their sum, and their
+// maximum.
 INLINE void survey_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, bool colored, float *own) {
   Weights w[PARTS];
   blend_rows(state, (Rows){true, 0, y0, y1}, b, j, colored, w);
@@ -95,10 +96,10 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
   return 0;
 }
 
-// A weighted sum of one channel over rows, by column.
+// The sum of weights times one channel in each column.
 typedef struct { pixels sum; } Channel;
 
-// Weights of Gaussian j times the planes of some channels, summed over the tile.
+// Sum the weights of Gaussian j times the planes of some channels over the tile.
 INLINE void sum_weights(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, int channels, float *slot) {
   Channel sums[CHANNELS][PARTS] = {{{{0}}}};
   Curve curve;
@@ -135,7 +136,7 @@ API int32_t weighted_sums(const float *restrict conics, const int32_t *restrict 
       for (int64_t j = 0; j < stop - start; j++) {
         int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
         float *slot = slots + CHANNELS * (start + j);
-        if (channels == 1)  // the number is a constant in each call, so that each loop unrolls
+        if (channels == 1)  // the number of channels is a constant in each call, so that loops unroll
           sum_weights(state, &batch, j, y0, y1, 1, slot);
         else
           sum_weights(state, &batch, j, y0, y1, CHANNELS, slot);
@@ -162,7 +163,7 @@ API int32_t add_slots(const int32_t *restrict flatten_ids, const float *restrict
   return 0;
 }
 
-// Blend the whole image over black, and gather sum and maximum of every Gaussian's weights in the same pass.
+// Blend the whole image over black, and in the same pass find the sum and the maximum of every Gaussian's weights.
 API int32_t survey(const float *restrict conics, const int32_t *restrict flatten_ids,
                    const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
                    float *restrict image, float *restrict totals, int64_t m, int64_t n, int64_t ends, int64_t h,

@@ -1,8 +1,9 @@
-"""Blend one view front to back, tile by tile, sum over its blending weights, and run the backward pass.
+"""Blend a view front to back, tile by tile, sum over its blending weights, and run the backward pass.
 
-All kernels here use the same lists with the same weights, see ``gsmerge/kernels/raster/walk.h``. The backward pass
-writes the sums over a tile to one row per intersection, and then adds the rows up in the order of the lists. Threads
-share nothing, and results do not depend on their number. The formula is in ``gsmerge/kernels/raster/blend_backward.c``.
+All kernels here use the same lists and the same weights, see ``gsmerge/kernels/raster/walk.h``. The backward pass
+writes the sums of a Gaussian over a tile to a row for this intersection, and then adds these rows in the order of the
+lists. Threads share no numbers, so results do not depend on how many there are. The formula is in
+``gsmerge/kernels/raster/blend_backward.c``.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from gsmerge.kernels.raster.binning import MOST_TILES
 from gsmerge.kernels.raster.project import CONIC, MAX_SIZE, SUMS
 from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
-CHANNELS = 4  # channels that weighted_sums adds up at a time
-MAX_ALPHA = 0.99  # largest alpha of a Gaussian at a pixel (gsplat)
+CHANNELS = 4  # number of channels that weighted_sums adds up at a time
+MAX_ALPHA = 0.99  # largest alpha of a Gaussian at a pixel, as in gsplat
 
-# Arguments of every kernel that reads tile lists, see the package; the library checks indices as it reads them.
+# Arguments of every kernel that reads the lists of tiles, see gsmerge.kernels.raster; C code checks their indices
 LISTS = {
     "conics": f4("m", CONIC),
     "flatten_ids": i4("n"),
@@ -29,17 +30,18 @@ TILES = {"first": i8(), "last": i8()}
     image=f4("h", "w", 3, out=True), transmittance=f4("h", "w", out=True),
 )  # fmt: skip
 def blend(conics, flatten_ids, isect_offsets, tile_width, colors, first, last, top, background, image, transmittance):
-    """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``.
+    """Blend a range of tiles over ``background [3]``; write the pixels ``image [h,w,3]`` and ``transmittance [h,w]``.
 
-    These arrays have the view's rows from ``top`` on. Tiles that begin outside of them are skipped.
+    These arrays have the rows of the view from ``top`` on. Tiles that begin outside of them are left out.
     """
 
 
 @native(STATUS, **LISTS, **TILES, image=f4("h", "w", "channels"), slots=f4("n", CHANNELS, out=True))
 def weighted_sums(conics, flatten_ids, isect_offsets, tile_width, first, last, image, slots):
-    """Sum the weights times up to four channels of an image, for each intersection of a range of tiles.
+    """Write to ``slots [intersections,CHANNELS]`` the sums of weights times up to four channels of an image.
 
-    ``image [h,w,c]``, c <= CHANNELS; ``slots [intersections,CHANNELS]`` is written at the intersections of these tiles.
+    A sum is over the pixels of a tile, and for each intersection of a range of tiles. ``image [h,w,c]`` has at most
+    ``CHANNELS`` channels.
     """
 
 
@@ -48,7 +50,7 @@ def weighted_sums(conics, flatten_ids, isect_offsets, tile_width, first, last, i
     first=i8(least=0, below="channels"), sums=f4("gaussians", "channels", out=True),
 )  # fmt: skip
 def add_slots(flatten_ids, slots, ids, first, sums):
-    """Add the intersections' ``slots [intersections,CHANNELS]`` to ``sums [n,c]`` from channel ``first`` on.
+    """Add the ``slots [intersections,CHANNELS]`` of each Gaussian to ``sums [n,c]``, from channel ``first`` on.
 
     They are added in the order of the lists.
     """
@@ -56,14 +58,14 @@ def add_slots(flatten_ids, slots, ids, first, sums):
 
 @native(STATUS, **LISTS, colors=f4("m", 3), image=f4("h", "w", 3, out=True), totals=f4("m", 2, out=True))
 def survey(conics, flatten_ids, isect_offsets, tile_width, colors, image, totals):
-    """Blend all tiles over black, and sum the weights as :func:`contributions` does, in one pass."""
+    """Blend all tiles over black, and in the same pass sum the weights as :func:`contributions` does."""
 
 
 @native(STATUS, **LISTS, height=i8(least=1), width=i8(least=1), totals=f4("m", 2, out=True))
 def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width, totals):
     """Add each Gaussian's sum of weights to ``totals[:, 0]``, and raise ``totals[:, 1]`` to its largest weight.
 
-    ``totals [m,2]`` float32.
+    ``totals`` are ``[m,2]`` float32.
     """
 
 
@@ -71,9 +73,10 @@ def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width,
     STATUS, conics=LISTS["conics"], flatten_ids=LISTS["flatten_ids"], left=i8(), top=i8(), parts=i4("n", 3, out=True),
 )  # fmt: skip
 def parts_of_tile(conics, flatten_ids, left, top, parts):
-    """Write the part of the tile at a pixel in which each Gaussian shows, as all kernels use it.
+    """Write for each Gaussian of a list the part of a tile in which it shows, as all kernels use it.
 
-    ``parts`` are first and last row, and the first of eight columns that cover the Gaussian, -1 if eight are too few.
+    The tile begins at the pixel (``left``, ``top``). A part is a first row, a last row, and the first of eight columns
+    that cover the Gaussian, which is -1 if eight are too few.
     """
 
 
@@ -85,13 +88,13 @@ def blend_backward(
     conics, flatten_ids, isect_offsets, tile_width, colors, first, last,
     image, transmittance, grad_image, grad_left, slots,
 ):  # fmt: skip
-    """Write the gradient sums of a range of tiles, one row per intersection.
+    """Write the sums from which gradients follow, a row for each intersection of a range of tiles.
 
     Args:
-        image: ``[h,w,3]`` float32, the blended image with its background.
-        transmittance: ``[h,w]`` float32 remaining transmittance.
-        grad_image: ``[h,w,3]`` float32, gradient with respect to ``image``.
-        grad_left: ``[h,w]`` float32, gradient with respect to ``transmittance``; None for zero.
+        image: ``[h,w,3]`` float32 blended image with its background.
+        transmittance: ``[h,w]`` float32 transmittance of all Gaussians together.
+        grad_image: ``[h,w,3]`` float32 gradient of the loss by ``image``.
+        grad_left: ``[h,w]`` float32 gradient of the loss by ``transmittance``; None for zero.
         slots: ``[intersections,SUMS]`` float32, written at the intersections of these tiles.
     """
 
@@ -101,4 +104,4 @@ def blend_backward(
     sums=f4("m", SUMS, out=True),
 )  # fmt: skip
 def gather_slots(flatten_ids, slots, first, last, sums):
-    """Add the ``slots [intersections,SUMS]`` of some Gaussians to ``sums [m,SUMS]``, in the order of the lists."""
+    """Add the ``slots [intersections,SUMS]`` of a range of Gaussians to ``sums [m,SUMS]`` in the order of the lists."""

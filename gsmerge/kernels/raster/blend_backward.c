@@ -1,22 +1,21 @@
-// The backward pass of blending: gradients with respect to every Gaussian's conic and colour.
+// Run the backward pass of blending: compute the gradients by every Gaussian's conic and colour.
 //
 // Tiles are processed front to back again, with the weights of blend.c. Let g be the gradient of a pixel's colour C,
-// and h that of its final transmittance T. A pixel starts with rest = g.C + h T. Every Gaussian subtracts its w (g.c),
-// so that the rest is the part behind it. Then
+// and h that of its final transmittance T. Each pixel starts with rest = g.C + h T. Every Gaussian of weight w and
+// colour c subtracts its w (g.c), so that the rest is what lies behind it. Then
 //
-//     d loss / d ln alpha = w (g.c) - alpha / (1 - alpha) rest
 //
 // needs no list of the blended Gaussians and no division of transmittances.
 #include "walk.h"
 
 enum { SUMS = 9 };
 
-// Sums over rows, by column, of the gradients of one Gaussian; v are the gradients of ln alpha.
+// The sums of the gradients of a Gaussian in each column; v are the gradients of ln alpha.
 typedef struct {
   pixels red, green, blue, v, vy, vyy;
 } Wants;
 
-// Remove Gaussian j of a batch from a part of its rows; return the gradients.
+// Subtract Gaussian j of a batch from the rests in a part of its rows; return the gradients.
 INLINE Wants walk_part(float *state, const Curve *curve, Rows r, const Batch *b, int64_t j, int part) {
   float red = b->red[j], green = b->green[j], blue = b->blue[j];
   int32_t last = last_of(r, part);
@@ -41,7 +40,7 @@ INLINE Wants walk_part(float *state, const Curve *curve, Rows r, const Batch *b,
   return w;
 }
 
-// Sum over all columns; x is the same in all rows of a lane, so moments with x are computed here.
+// Sum over all columns. x is the same in all rows of a lane, so moments with x are computed here and not before.
 INLINE void add_columns(const Wants w[PARTS], v16f dx, float *slot) {
   v16f v = JOIN(w, v), vy = JOIN(w, vy), vx = v * dx;
   v16f sums[8] = {JOIN(w, red), JOIN(w, green), JOIN(w, blue), v, vx, vy, vx * dx, vy * dx};
@@ -49,7 +48,7 @@ INLINE void add_columns(const Wants w[PARTS], v16f dx, float *slot) {
   slot[8] = total(JOIN(w, vyy));
 }
 
-// Remove Gaussian j of a batch from its rows and write its gradients.
+// Subtract Gaussian j of a batch from the rests in its rows, and write its gradients.
 INLINE void walk_rows(float *state, Rows r, const Batch *b, int64_t j, float *slot) {
   Curve curve;
   Wants w[PARTS];
@@ -107,7 +106,7 @@ API int32_t blend_backward(const float *restrict conics, const int32_t *restrict
   return 0;
 }
 
-// Intersections of Gaussians in other ranges are left out without a branch, which would be mispredicted.
+// Add the slots of a range of Gaussians. Those of others are left out without a branch, which would be mispredicted.
 API int32_t gather_slots(const int32_t *restrict flatten_ids, const float *restrict slots, int64_t first, int64_t last,
                          float *restrict sums, int64_t n, int64_t m) {
   if (first < 0 || last > m) return OUTSIDE;

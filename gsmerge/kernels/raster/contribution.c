@@ -1,14 +1,16 @@
 // Find the superpixel of one view to which each Gaussian contributes most (paper, supplement on non-pixel-aligned
 // backbones).
 //
-// Blending weights are summed for each pair of Gaussian and superpixel, one row of tiles after another. The pairs of a
-// row are chained by Gaussian. At the end of the row, Gaussians that do not reach into the next row are finished, and
-// the sums of the others are carried over. So memory grows with a row of tiles, not with the view.
+// A pair is a Gaussian and a superpixel that it touches, with the sum of its blending weights there. Pairs are summed
+// one row of tiles after another, and linked in a chain for each Gaussian. At the end of a row, Gaussians that do not
+// reach into the next row are finished, and the pairs of the others are carried over. So memory grows with the width of
+// the view, not with its height.
 #include "walk.h"
 
 enum { LABEL, SUM, NEXT, PAIR };  // columns of a pair; NEXT is the next pair of the same Gaussian, -1 for none
 enum { LAST_ROW = 7 };            // column of a conic
-enum { NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS };  // numbers of pairs and active Gaussians, and the next tile
+// number of pairs, number of Gaussians with pairs, and the next tile
+enum { NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS };
 
 // Write a pair and insert it at the front of its Gaussian's chain.
 static inline void chain(double *pairs, int64_t at, int32_t *heads, int64_t k, int64_t label, double value) {
@@ -19,11 +21,11 @@ static inline void chain(double *pairs, int64_t at, int32_t *heads, int64_t k, i
   heads[k] = (int32_t)at;
 }
 
-// A column of a pair as an index below n; -1 for an invalid index.
+// A number of a pair as an index below n; -1 for an invalid index.
 static inline int64_t index_of(double value, int64_t n) { return value >= 0.0 && value < (double)n ? (int64_t)value : -1; }
 
-// Number the superpixels of a tile from 0: lanes gets the number of each pixel, and names the label of each number.
-// Return how many there are.
+// Number the superpixels of a tile from 0, and return how many there are. `lanes` gets the number of each pixel's
+// superpixel, and `names` the label of each number.
 static int32_t number_labels(const int32_t *labels, const Tile *t, int64_t w, int32_t *stamps, int32_t *lanes,
                           int32_t *names) {
   int32_t count = 0;
@@ -115,9 +117,9 @@ API int32_t settle_row(int64_t bottom, const float *restrict conics, int32_t *re
     if (k < 0 || k >= m) return OUTSIDE;
     for (int64_t pair = heads[k]; pair >= 0; pair = index_of(pairs[PAIR * pair + NEXT], num_pairs)) {
       int64_t label = pair < num_pairs ? index_of(pairs[PAIR * pair + LABEL], num_labels) : -1;
-      if (label < 0 || unread-- <= 0) return OUTSIDE;  // more links than pairs: the chain is a ring
+      if (label < 0 || unread-- <= 0) return OUTSIDE;  // if a chain has more links than there are pairs, it is a ring
       if (totals[label] == 0.0) {
-        if (count == num_labels) return OUTSIDE;  // only for sums of 0 or below
+        if (count == num_labels) return OUTSIDE;  // this happens only if sums are 0 or less
         seen[count++] = (int32_t)label;
       }
       totals[label] += pairs[PAIR * pair + SUM];

@@ -2,9 +2,10 @@
 
 This is the rule of the paper's supplement on non-pixel-aligned backbones.
 
-Blending weights are summed for each pair of Gaussian and superpixel, one row of tiles after another. The pairs of a row
-are chained by Gaussian. At the end of the row, Gaussians that do not reach into the next row are finished, and the sums
-of the others are carried over. So memory grows with a row of tiles, not with the view.
+A pair is a Gaussian and a superpixel that it touches, with the sum of its blending weights there. Pairs are summed one
+row of tiles after another, and linked in a chain for each Gaussian. At the end of a row, Gaussians that do not reach
+into the next row are finished, and the pairs of the others are carried over. So memory grows with the width of the
+view, not with its height.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from gsmerge.kernels.raster.blend import LISTS
 from gsmerge.kernels.raster.project import CONIC, TILE
 from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
 
-FIRST_PAIRS = 1 << 16  # initial room for pairs of Gaussian and superpixel
-PAIR = 3  # numbers of a pair: label, sum, and the next pair of the same Gaussian or -1
-NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, PAIR_COUNTS = 0, 1, 2, 3  # numbers of pairs and active Gaussians, and the next tile
+FIRST_PAIRS = 1 << 16  # room for this many pairs at the start
+PAIR = 3  # columns of a pair: label, sum, and the next pair of the same Gaussian or -1
+# Places in `counts`: number of pairs, number of Gaussians with pairs, and the next tile; and the length of `counts`
+NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, PAIR_COUNTS = 0, 1, 2, 3
 
 
 @native(
@@ -27,7 +29,7 @@ NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, PAIR_COUNTS = 0, 1, 2, 3  # numbers of pairs a
     stamps=i4("num_labels", most=-1, out=True), counts=i8(PAIR_COUNTS, out=True),
 )  # fmt: skip
 def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads, pairs, active, stamps, counts):
-    """Append the pairs of a row of tiles, from tile ``counts[NEXT_TILE]`` to the last tile that fits in the buffers."""
+    """Append the pairs of a row of tiles, from tile ``counts[NEXT_TILE]`` to the last one that fits in the buffers."""
 
 
 @native(
@@ -37,14 +39,13 @@ def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads,
     counts=i8(PAIR_COUNTS, out=True),
 )  # fmt: skip
 def settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, out_values, out_labels, counts):
-    """Sum the pairs of every Gaussian; finish Gaussians that end above ``bottom``, and carry over all other sums."""
+    """Sum the pairs of each Gaussian by superpixel; finish those that end above ``bottom``, carry over the others."""
 
 
 def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, count):
-    """Return each Gaussian's largest sum of weights in one superpixel, and the label of that superpixel.
+    """Return each Gaussian's largest sum of weights ``[m]`` float32 in a superpixel, and its label ``[m]`` int32.
 
-    They are ``[m]`` float32 and ``[m]`` int32. Of equal sums the one with the smallest label is returned. Unseen
-    Gaussians have 0 and -1.
+    Of superpixels with equal sums the smallest label is returned. Gaussians that no pixel shows have 0 and -1.
 
     Args:
         labels: ``[h,w]`` int32, below ``count``.

@@ -1,5 +1,5 @@
-// Compute the gradient of the fit's image loss: L1, structural similarity by sums over windows, and L1
-// of the differences between neighbouring pixels.
+// Compute the gradient of the fit's image loss: the L1 error, structural similarity by sums over windows, and the L1
+// error of differences between neighbouring pixels.
 //
 // Rows are processed in groups of four, which begin at multiples of four, wherever a range begins.
 // Sums over seven rows share their common terms and are always added up in the same order. A group is
@@ -7,24 +7,24 @@
 // cache.
 #include "native.h"
 
-enum { RADIUS = 3, PAD = 3 * RADIUS, GROUP = 4, TALL = GROUP + 2 * RADIUS };  // PAD has three channels
+enum { RADIUS = 3, PAD = 3 * RADIUS, GROUP = 4, TALL = GROUP + 2 * RADIUS };  // PAD is three pixels of three channels
 enum {
   CHUNK = 96,
   LINE = CHUNK + 2 * PAD
-};  // numbers of values that are whole pixels and whole vectors; with padding
-// Sums of x, y, x^2 + y^2, xy; derivatives by the means of x, x^2, xy.
+};  // lengths of a chunk, which is of whole pixels and of whole vectors, and of a chunk with padding
+// MEANS are the sums of x, y, x^2 + y^2 and xy. TERMS are the derivatives by the means of x, x^2 and xy.
 enum { MEANS = 4, TERMS = 3 };
-static const float C1 = 1e-4f, C2 = 9e-4f;  // SSIM's constants for a data range of 1
+static const float C1 = 1e-4f, C2 = 9e-4f;  // constants of SSIM for values from 0 to 1
 static const float SHARE = 1.f / 49.f;
 
-// Values that the loops over groups share.
+// The numbers that all loops over groups use.
 typedef struct {
   const float *image, *photo, *weight;
-  int64_t height, width;  // values per row, three for each pixel
+  int64_t height, width;  // width counts values, three for each pixel
   float plain, similar;
 } Loss;
 
-// Sums over the seven rows around each of four rows, of a value in ten rows; a3 to a6 are in all four sums.
+// From the values of ten rows, compute the sums over the seven rows around each of four rows. a3 to a6 are in all sums.
 static inline void sum_seven(const float a[TALL], float sums[GROUP]) {
   float middle = (a[3] + a[4]) + (a[5] + a[6]), above = a[1] + a[2], below = a[7] + a[8];
   sums[0] = middle + (above + a[0]);
@@ -33,7 +33,7 @@ static inline void sum_seven(const float a[TALL], float sums[GROUP]) {
   sums[3] = middle + (below + a[9]);
 }
 
-// The sum of seven values along a row of three channels.
+// The sum of seven values of one channel along a row.
 static inline float sum_along(const float *p) {
   return ((p[0] + p[3]) + (p[6] + p[9])) + ((p[12] + p[15]) + p[18]);
 }
@@ -49,7 +49,7 @@ static inline void copy_rows(Loss l, const float *image, int64_t row, int64_t co
   }
 }
 
-// Column sums of the means, from ten rows of image and photo, appended to the lines.
+// Append to the lines the sums down columns whose means are needed, from ten rows of image and photo.
 static inline void sum_means(const float *restrict x, const float *restrict y, int64_t stride,
                              float (*restrict sums)[MEANS][LINE], int64_t count) {
   for (int64_t i = 0; i < count; i++) {
@@ -89,8 +89,8 @@ static inline void slide(float *lines, int count) {
     for (int i = 0; i < 2 * PAD; i++) lines[line * LINE + i] = lines[line * LINE + CHUNK + i];
 }
 
-// Weights of a row's pixels from a column on, for each channel; zero past the end. `count` is a number
-// of values of whole pixels.
+// Write the weights of the pixels of a row from a column on, once for each channel; zero past the end. `count` is a
+// number of values of whole pixels.
 static inline void repeat_weights(Loss l, int64_t row, int64_t column, float *wide, int64_t count) {
   const float *weight = l.weight + row * (l.width / 3) + column / 3;
   int64_t left = mini(count, l.width - column) / 3;
@@ -100,7 +100,7 @@ static inline void repeat_weights(Loss l, int64_t row, int64_t column, float *wi
   }
 }
 
-// Derivatives of a chunk of windows' SSIM by the means of x, x^2 and xy, times their weights.
+// Write the derivatives of the SSIM of a chunk of windows by the means of x, x^2 and xy, times the weights.
 static inline void write_terms(const float (*restrict sums)[LINE], const float *restrict wide,
                                float *restrict terms, int64_t stride) {
   for (int i = 0; i < CHUNK; i++) {
@@ -117,14 +117,14 @@ static inline void write_terms(const float (*restrict sums)[LINE], const float *
   }
 }
 
-// Terms of a group of rows, [GROUP,TERMS,room], zero outside the image.
+// Write the terms of a group of rows, [GROUP,TERMS,room], which are zero outside the image.
 static void fill_terms(Loss l, int64_t row, float *terms, int64_t room) {
   float sums[GROUP][MEANS][LINE] = {{{0}}}, wide[CHUNK];
   if (row + GROUP <= 0 || row >= l.height) {
     for (int64_t i = 0; i < GROUP * TERMS * room; i++) terms[i] = 0.f;
     return;
   }
-  // the first columns, as the end of a chunk before the image
+  // the first columns count as the end of a chunk before the image
   append_means(l, row, 0, sums, PAD);
   for (int64_t column = 0; column < l.width; column += CHUNK) {
     slide(sums[0][0], GROUP * MEANS);
@@ -144,7 +144,7 @@ static void fill_terms(Loss l, int64_t row, float *terms, int64_t room) {
     }
 }
 
-// Column sums of a chunk of terms, from three groups of rows.
+// Append the sums down columns of a chunk of terms, from three groups of rows.
 static inline void append_terms(const float *restrict before, const float *restrict group,
                                 const float *restrict after, int64_t room,
                                 float (*restrict sums)[TERMS][LINE], int64_t count) {
@@ -159,7 +159,7 @@ static inline void append_terms(const float *restrict before, const float *restr
     }
 }
 
-// Gradient of a chunk of a row; its weighted squared errors are added lane by lane.
+// Write the gradient of a chunk of a row, and add its weighted squared errors lane by lane.
 static inline void write_gradient(Loss l, const float (*restrict sums)[LINE],
                                   const float *restrict x, const float *restrict y,
                                   const float *restrict wide, float *restrict gradient,
@@ -177,7 +177,7 @@ static inline void write_gradient(Loss l, const float (*restrict sums)[LINE],
   for (int i = 0; i < CHUNK; i += LANES) *errors += load(squares + i);
 }
 
-// Rows from first to last of a group from the terms of the group and of those before and after.
+// Write the gradient of the rows from first to last of a group, from its terms and those of the groups beside it.
 static void fill_gradient(Loss l, int64_t row, int64_t first, int64_t last,
                           const float *const terms[3], int64_t room, float *gradient,
                           float *errors) {
@@ -208,8 +208,8 @@ static void fill_gradient(Loss l, int64_t row, int64_t first, int64_t last,
     errors[y] = total(squares[y - row]);
 }
 
-// Differences of a row and the weights of its values, both followed by a pixel of weight zero. Rows
-// outside the image have weight zero, too.
+// Write the differences of a row of the image from the photo, and the weights of its values, both followed by a pixel
+// of weight zero. Rows outside the image also have weight zero.
 static void fill_row(Loss l, int64_t row, float *restrict off, float *restrict wide) {
   if (row < 0 || row >= l.height) {
     for (int64_t j = 0; j < l.width + 3; j++) off[j] = wide[j] = 0.f;
@@ -221,8 +221,8 @@ static void fill_row(Loss l, int64_t row, float *restrict off, float *restrict w
   repeat_weights(l, row, 0, wide, l.width + 3);
 }
 
-// Gradient of pairs of values, which is added to the first value and subtracted from the second: the
-// sign of their difference, times the smaller weight.
+// Write the gradients of pairs of values, which are the sign of the difference times the smaller weight. They are added
+// to the first value of a pair and subtracted from the second.
 static inline void pull(const float *off, const float *wide, const float *off2, const float *wide2,
                         float *restrict to, int64_t count) {
   for (int64_t i = 0; i < count; i++) {
@@ -231,9 +231,9 @@ static inline void pull(const float *off, const float *wide, const float *off2, 
   }
 }
 
-// Values of the last row that the next row needs: differences, weights and gradients of vertical pairs.
+// What the next row needs of the last row: differences, weights, and gradients of vertical pairs.
 typedef struct {
-  float *here, *below, *along, *before, *after;  // rows of a given room, the first two pairs of them
+  float *here, *below, *along, *before, *after;  // rows of length `room`; `here` and `below` are two rows each
   int64_t room;
   float each;
 } Edges;
@@ -247,7 +247,7 @@ static Edges start_edges(Loss l, float each, int64_t first, float *rows, int64_t
   return e;
 }
 
-// Add the gradient of the L1 of differences to a row, and advance to the next row.
+// Add the gradient of the L1 error of differences to a row, and go on to the next row.
 static void add_edges(Loss l, Edges *e, int64_t row, float *restrict gradient) {
   float *here = e->here, *below = e->below, *restrict along = e->along;
   float *restrict before = e->before, *restrict after = e->after, *restrict to = gradient + row * l.width;
@@ -262,7 +262,7 @@ static void add_edges(Loss l, Edges *e, int64_t row, float *restrict gradient) {
   e->after = before;
 }
 
-// The first row of the group of a row, which may lie above the image.
+// The first row of the group to which a row belongs. The row may lie above the image.
 static inline int64_t group_of(int64_t row) { return (row + GROUP) / GROUP * GROUP - GROUP; }
 
 API int32_t loss_gradient(const float *restrict image, const float *restrict photo,

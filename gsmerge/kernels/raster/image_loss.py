@@ -1,8 +1,8 @@
-"""The gradient of the fit's image loss in one pass over the rows: no image is written but the result.
+"""Compute the gradient of the fit's image loss in one pass over the rows, without images of intermediate values.
 
-Structural similarity needs sums over windows of image, photo and their products, and then sums over windows of what
-those give. Differences between neighbouring pixels follow row by row. Every sum is added up in the same order
-wherever a range of rows begins, so results do not depend on how rows are shared out.
+Structural similarity needs sums over windows of the image, the photo and their products, and then sums over windows of
+derivatives that follow from these. Differences between neighbouring pixels are computed row by row. Each sum is added
+up in the same order wherever a range of rows begins. So results do not depend on how rows are divided among threads.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, f4, i8, native
 
-WINDOW_SIDE = 7  # of the windows, pixels
-C1, C2 = np.float32(1e-4), np.float32(9e-4)  # SSIM's constants for a data range of 1
+WINDOW_SIDE = 7  # side of the windows, pixels
+C1, C2 = np.float32(1e-4), np.float32(9e-4)  # constants of SSIM for values from 0 to 1
 
-DERIVATIVE_ROWS, TERMS = 12, 3  # rows of derivatives that are kept at a time, and numbers of each of their values
-EDGE_ROWS = 7  # of differences, weights and what they give
-SUM_CHUNK, PAD = 96, 9  # values that are summed at a time, and beside a row
+DERIVATIVE_ROWS, TERMS = 12, 3  # number of rows of derivatives in memory, and of derivatives for each value
+EDGE_ROWS = 7  # number of rows in memory for differences between neighbouring pixels
+SUM_CHUNK, PAD = 96, 9  # number of values that are summed at a time, and of zeros beside a row
 
 
 def room_of(width):
-    """Return the length of a buffer for a row of ``width`` pixels."""
+    """Return how many values a buffer for a row of ``width`` pixels needs."""
     return -(-3 * width // SUM_CHUNK) * SUM_CHUNK + PAD
 
 
@@ -33,17 +33,17 @@ def room_of(width):
 def loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows):
     """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.
 
-    e is ``image - photo``; differences of e are taken to the next pixel of a row and of a column. Pixels have weights,
-    and a pair of pixels has the smaller weight of the two. Windows of SSIM are uniform, of 7 x 7 pixels, zero beyond
-    the border.
+    e is ``image - photo``. Differences of e are taken to the next pixel of the row and to that of the column. Pixels
+    have weights, and a difference has the smaller weight of its two pixels. The windows of SSIM have 7 x 7 pixels of
+    equal weight. Beyond the border all values are zero.
 
     Args:
-        image: ``[h,3w]`` float32, interleaved channels.
+        image: ``[h,3w]`` float32, with the three channels of a pixel side by side.
         ssim_lambda: Share of structural similarity, float32.
         edge_weight: Weight of the differences between neighbouring pixels, float32.
         first: First row.
         last: Last row, exclusive.
-        gradient: ``[h,3w]`` float32, the rows are written, divided by the number of pixels.
-        errors: ``[h]`` float32, weighted squared error of each row, written.
-        terms, rows: Buffers as long as :func:`room_of` says, overwritten.
+        gradient: ``[h,3w]`` float32, written in the given rows: the gradient divided by the number of pixels.
+        errors: ``[h]`` float32, written: weighted squared error of each row.
+        terms, rows: Scratch, as long as :func:`room_of` says.
     """

@@ -1,10 +1,10 @@
-// Write the blending weights of one view as a list of (pixel, weight) entries.
+// List the blending weights of a view as entries of a pixel and a weight.
 #include "walk.h"
 
-enum { CHANNELS = 4 };  // of an image row
+enum { CHANNELS = 4 };  // number of channels of a pixel
 
-// Append the weights of tiles from progress[0] on after the first progress[1] entries, and advance both numbers. Stop
-// at a tile whose entries may not fit; the caller continues with more room.
+// Append the weights of tiles from progress[0] on, behind the first progress[1] entries, and advance both numbers. Stop
+// at a tile whose entries may not fit, so that the caller can continue with more room.
 API int32_t list_weights(const float *restrict conics, const int32_t *restrict flatten_ids,
                          const int64_t *restrict isect_offsets, int64_t tile_width, int64_t height, int64_t width,
                          int64_t *restrict starts, uint8_t *restrict lanes, float *restrict weights,

@@ -1,4 +1,4 @@
-"""Write the blending weights of one view as a list of (pixel, weight) entries, and multiply with them."""
+"""List the blending weights of a view as entries of a pixel and a weight, and multiply images by them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 from gsmerge.kernels.raster import blend
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native, u1
 
-LANES = 4  # channels of an image row
-BATCH_ENTRIES = 32 * 256  # most entries of a batch of Gaussians in a tile
+LANES = 4  # number of channels of an image that are multiplied at a time
+BATCH_ENTRIES = 32 * 256  # most entries of a batch of 32 Gaussians in a tile of 256 pixels
 
 ENTRIES = {
     "starts": i8("more", least=0, most="entries", ascending=True),
@@ -20,7 +20,7 @@ ENTRIES = {
 }
 
 
-# Appends entries of tiles from progress[0] on after the first progress[1] entries, as far as they fit.
+# Appends the entries of tiles from progress[0] on, behind the first progress[1] entries, as far as they fit
 _list_weights = declare(
     "list_weights", STATUS, **blend.LISTS, height=i8(least=1), width=i8(least=1), starts=i8("more", out=True),
     lanes=u1("room", out=True), weights=f4("room", out=True), progress=i8(2, least=0, out=True),
@@ -28,13 +28,14 @@ _list_weights = declare(
 
 
 def list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width):
-    """List all weights of a view that are not zero.
+    """List all blending weights of a view that are not zero.
 
     Returns:
-        ``starts [intersections + 1]`` int64, ``lanes`` uint8 (pixel within its tile, row-major), ``weights`` float32.
+        The start ``[intersections + 1]`` int64 of the entries of each intersection, and for each entry its pixel within
+        the tile, row by row, as uint8, and its weight, float32.
     """
     starts, progress = np.zeros(len(flatten_ids) + 1, np.int64), np.zeros(2, np.int64)
-    first_entries = 40  # initial room for entries, per pixel
+    first_entries = 40  # room for this many entries for each pixel at the start
     lanes, weights = (
         np.empty(max(BATCH_ENTRIES, first_entries * height * width), dtype) for dtype in (np.uint8, np.float32)
     )
@@ -48,4 +49,4 @@ def list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width):
 
 @native(STATUS, **ENTRIES, image=f4("h", "w", LANES), sums=f8("m", LANES, out=True))
 def collect(starts, lanes, weights, flatten_ids, isect_offsets, tile_width, image, sums):
-    """Add weights times ``image [h,w,LANES]`` to ``sums [m,LANES]`` float64."""
+    """Add to ``sums [m,LANES]`` float64, for each Gaussian, its weights times the pixels of ``image [h,w,LANES]``."""

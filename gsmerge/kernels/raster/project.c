@@ -1,15 +1,16 @@
-// Project Gaussians into one view: culling, EWA conics, tile boxes.
+// Project Gaussians into a view: find those that it may show, their conics, and their boxes of tiles.
 #include "exp_log.h"
 #include "projection.h"
 
-enum { MOST_TILES = 1 << 15 };  // corners per side, since columns and rows of tiles have 16 bits
-enum { BLOCK = 64, ROW = 16 };  // Gaussians that are gathered into planes, and those that may follow each other
+enum { MOST_TILES = 1 << 15 };  // most corners of tiles in a row or a column, because their numbers have 16 bits
+// number of Gaussians that are gathered into planes; number that are gathered at once if they follow each other
+enum { BLOCK = 64, ROW = 16 };
 
 static inline int32_t tile(float pixel) {
   return whole(pixel, 0.f, (MOST_TILES - 1) * (float)TILE) / TILE;
 }
 
-// Planes of a block: the pixels in which a sphere may be seen, and a flag that it may be seen at all.
+// Planes of a block: the pixels in which a sphere may be seen, and a flag for one that may be seen at all.
 enum { X0, X1, Y0, Y1, SIDES };
 typedef struct {
   float side[SIDES][BLOCK];
@@ -81,7 +82,7 @@ API int64_t cull(const float *restrict means, const float *restrict scales,
   return count;
 }
 
-// Planes of a block of conics, and the first and (exclusive) last tile column and row.
+// Planes of a block: conics, and the first and the (exclusive) last column and row of tiles.
 typedef struct {
   float mean[3][BLOCK], quat[4][BLOCK], scale[3][BLOCK], opacity[BLOCK];
   float conic[CONIC][BLOCK], depth[BLOCK];
@@ -96,7 +97,7 @@ static inline void project_one(Block *b, int64_t j, Camera c) {
   float qq = w * w + x * x + y * y + z * z;
   Rows m = rotation(w, x, y, z, qq > 1e-30f ? 2.f / qq : 0.f);
   vec3 s = cut_scales((vec3){b->scale[0][j], b->scale[1][j], b->scale[2][j]}, widest(c) * ray.at.z);
-  // half axes: rows of J W R S
+  // u and v, the rows of J W R S, are half axes
   vec3 u = product(transposed(m.m0, m.m1, m.m2, ray.a), s);
   vec3 v = product(transposed(m.m0, m.m1, m.m2, ray.b), s);
   float uu = dot(u, u), vv = dot(v, v), uv = dot(u, v);
@@ -109,7 +110,7 @@ static inline void project_one(Block *b, int64_t j, Camera c) {
   float share = c.antialiased > 0.f ? sqrtf4(maxf(det0 / det, LEAST_SHARE)) : 1.f;
   float lnop = log4(opacity * share);
   float mx = c.fx * ray.ux + c.cx, my = c.fy * ray.uy + c.cy;
-  // pixels where a weight may reach 1/255
+  // in these pixels a weight may reach 1/255
   float reach = maxf(2.f * (lnop - LN_CUT), 0.f);
   float rx = sqrtf4(reach * cxx), ry = sqrtf4(reach * cyy);
   float x0 = maxf(ceilf4(mx - rx - 0.5f), 0.f), x1 = minf(floorf4(mx + rx - 0.5f), c.width - 1.f);
@@ -154,7 +155,7 @@ API int32_t project(const float *restrict means, const float *restrict quats,
     int64_t size = mini(BLOCK, m - start);
     for (int64_t from = 0; from < BLOCK; from += ROW) {
       int64_t first = ids[start + mini(from, size - 1)];
-      bool in_row = from + ROW <= size;  // as usual, since most Gaussians of a scene are seen
+      bool in_row = from + ROW <= size;  // usually true, because most Gaussians of a scene are seen
       for (int64_t j = 0; in_row && j < ROW; j++) in_row = ids[start + from + j] == first + j;
       if (in_row) {
         gather_row(&b, from, means + 3 * first, quats + 4 * first, scales + 3 * first, opacities + first);

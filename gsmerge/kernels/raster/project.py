@@ -1,4 +1,4 @@
-"""Project Gaussians into one view, and run the backward pass: culling, EWA conics, tile boxes.
+"""Project Gaussians into a view: find those that it may show, their conics and boxes; and run the backward pass.
 
 The conventions are those of gsplat: the dilation is 0.3 square pixels, conics follow from the first-order (EWA)
 projection with directions clamped 15 % outside the image, and contributions below 1/255 are left out. A conic is stored
@@ -18,14 +18,16 @@ from gsmerge.kernels.signature import STATUS, f4, f8, i2, i4, i8, native, u1
 
 TILE = 16  # pixels per side; one row of a tile is one AVX-512 vector
 MAX_SIZE = 32767 * TILE  # most pixels per side of a view, since tile columns and rows have 16 bits
-CONIC = 8  # numbers per conic: mean_x, mean_y, rate_x, slope, rate_y, lnop, first row, last row
-SUMS = 9  # sums per Gaussian: w g (3), v = d loss / d exponent, and v times x, y, xx, xy, yy relative to the mean
+CONIC = 8  # numbers of a conic: mean_x, mean_y, rate_x, slope, rate_y, lnop, first row, last row
+# Sums of a Gaussian over pixels: weight times gradient of the colour (3), v = d loss / d exponent, and v times x, y,
+# xx, xy and yy relative to the mean
+SUMS = 9
 
-# Positions in the camera's array of numbers.
+# Positions of numbers in the array of a camera
 ROTATION, SHIFT, FX, FY, CX, CY, WIDTH, HEIGHT, NEAR, FAR, EPS2D = 0, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20
 LIMIT_X, LIMIT_Y, ANTIALIASED = 21, 23, 25  # further positions; a limit has two numbers
-CAMERA = 26  # length of this array
-BLOCK = 128  # Gaussians whose gradients of the pose are summed in one row
+CAMERA = 26  # length of the array of a camera
+BLOCK = 128  # gradients of the pose are summed over blocks of this many Gaussians
 POSE = 12  # numbers of a world-to-camera matrix: rotation (9, row by row), shift (3)
 
 
@@ -37,11 +39,11 @@ def cull(means, scales, opacities, keep, wanted, camera, start, ids):
     """List the Gaussians that may touch a wanted tile; return their number.
 
     Args:
-        keep: ``[n]`` uint8; 0 drops a Gaussian. None keeps all.
+        keep: ``[n]`` uint8, 0 for Gaussians to leave out; None for none.
         wanted: ``[tile_height + 1, tile_width + 1]`` int32 number of wanted tiles above and to the left of each corner;
-            None: all tiles are wanted.
-        start: Id of the first Gaussian.
-        ids: ``[n]`` int32; the ids of the listed Gaussians are written first, ascending.
+            None if all tiles are wanted.
+        start: Number of the first Gaussian, which is added to all ids.
+        ids: ``[n]`` int32, whose first entries are written: ids of the listed Gaussians, ascending.
     """
 
 
@@ -50,13 +52,13 @@ def cull(means, scales, opacities, keep, wanted, camera, start, ids):
     conics=f4("m", CONIC, out=True), depths=f4("m", out=True), boxes=i2("m", 4, out=True),
 )  # fmt: skip
 def project(means, quats, scales, opacities, ids, camera, conics, depths, boxes):
-    """Project the listed Gaussians.
+    """Project the listed Gaussians, and write their conics, depths and boxes.
 
     Args:
         quats: ``[n,4]`` wxyz of any length.
         opacities: ``[n]``; opacities above 1 count as 1.
         depths: ``[m]`` float32, written: camera z.
-        boxes: ``[m,4]`` int16, written: first and (exclusive) last tile column, first and last tile row; all 0 for
+        boxes: ``[m,4]`` int16, written: first and (exclusive) last column of tiles, first and last row; all 0 for
             Gaussians that are not drawn.
     """
 
@@ -71,20 +73,20 @@ def project_backward(
     means, quats, scales, opacities, ids, sums, camera, first, last,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_poses,
 ):  # fmt: skip
-    """Write the gradients of a range of the listed Gaussians.
+    """Write the gradients of the loss by the parameters of a range of the listed Gaussians.
 
     Args:
         sums: ``[m,SUMS]`` float32, see :func:`gsmerge.kernels.raster.blend.blend_backward`.
         first: Start of the range, a multiple of BLOCK.
         last: End of the range, exclusive.
-        grad_poses: ``[blocks,POSE]`` float32, written: gradient of the world-to-camera matrix, summed over blocks of
-            BLOCK Gaussians; None: not computed.
+        grad_poses: ``[blocks,POSE]`` float32, written: gradient by the world-to-camera matrix, summed over blocks of
+            ``BLOCK`` Gaussians; None if it is not needed.
     """
 
 
 @native(STATUS, ids=i4("m"), rows=f4("m", "c"), totals=f4("n", "c", out=True))
 def add_rows(ids, rows, totals):
-    """Add ``rows [m,c]`` to ``totals [n,c]`` at the ``ids [m]`` int32."""
+    """Add each of ``rows [m,c]`` to the row of ``totals [n,c]`` that ``ids [m]`` int32 name."""
 
 
 @native(means=f4("n", 3), origin=f8(3), out=f4("n", 3, out=True))

@@ -1,10 +1,11 @@
-// The backward pass of projection: gradients of means, rotations, scales and opacities from sums over an image.
+// Run the backward pass of projection: compute gradients of means, rotations, scales and opacities from sums over an
+// image.
 #include "projection.h"
 
 enum { BLOCK = 128, POSE = 12, SUMS = 9 };
 
-// Planes of a block. Input: mean, quaternion, scales, opacity, and six of the sums over the image
-// (1, x, y, xx, xy, yy). Output: gradients of these parameters and of the camera's pose.
+// Planes of a block. The inputs are mean, quaternion, scales, opacity, and six of the sums over the image (1, x, y, xx,
+// xy, yy). The outputs are gradients of these parameters and of the pose of the camera.
 typedef struct {
   float mean[3][BLOCK], quat[4][BLOCK], scale[3][BLOCK], sum[6][BLOCK], opacity[BLOCK];
   float grad_mean[3][BLOCK], grad_quat[4][BLOCK], grad_scale[3][BLOCK], grad_opacity[BLOCK];
@@ -25,7 +26,7 @@ typedef struct {
   float a, b, c, gxx, gxy, gyy;
 } Conic;
 
-// Conic A, B, C (the exponent is -1/2 (A xx + 2 B xy + C yy)), and the gradient of the covariance.
+// Compute the conic A, B, C, of the exponent -1/2 (A xx + 2 B xy + C yy), and the gradient of the covariance.
 // With the conic Q and half the second moments M, the gradient is Q M Q. In antialiased mode the
 // dilation lowers the opacity, which adds s (inv(S) - Q), with s = thinning and the covariance S
 // before the dilation.
@@ -48,8 +49,8 @@ static inline Conic conic_backward(vec3 u, vec3 v, float eps2d, float sxx, float
                  e10 * b + e11 * c + s * (uu * scale0 - c)};
 }
 
-// Gradient of a quaternion q, divided by h, from the gradients gc of a M and gd of b M, with its
-// matrix M; only the part perpendicular to q.
+// Write the gradient of a quaternion q, divided by h, from the gradients gc of a M and gd of b M. M is the matrix of q.
+// Only the part perpendicular to q counts.
 static inline void rotation_backward(Block *block, int64_t j, float w, float x, float y, float z,
                                      float h, Ray ray, vec3 gc, vec3 gd) {
   vec3 g0 = mix(ray.a.x, gc, ray.b.x, gd);
@@ -68,7 +69,8 @@ static inline void rotation_backward(Block *block, int64_t j, float w, float x, 
   block->grad_quat[3][j] = h * (gz - along * z);
 }
 
-// Gradient of the mean through J W, from the gradients ga, gb of its rows, and through the image position.
+// Write the gradient of the mean that comes through its image position, and through J W from the gradients ga, gb of
+// its rows.
 static inline void position_backward(Block *block, int64_t j, Camera c, Ray ray, vec3 p, vec3 ga,
                                      vec3 gb, Conic conic) {
   float sx = block->sum[1][j], sy = block->sum[2][j];
@@ -96,7 +98,7 @@ static inline void backward_one(Block *block, int64_t j, Camera c) {
   Rows m = rotation(w, x, y, z, h);
   float wide = widest(c) * ray.at.z;
   vec3 s = cut_scales(scale, wide);
-  // half axes u, v, and c, d, the same without scales
+  // u and v are half axes, and c and d the same without scales
   vec3 across = transposed(m.m0, m.m1, m.m2, ray.a), down = transposed(m.m0, m.m1, m.m2, ray.b);
   vec3 u = product(across, s), v = product(down, s);
   float weight = block->sum[0][j], thinning = 0.5f * c.antialiased * weight;
@@ -116,7 +118,7 @@ static inline void backward_one(Block *block, int64_t j, Camera c) {
   block->grad_opacity[j] = opacity <= 1.f ? weight / opacity : 0.f;
 }
 
-// Gather the inputs of a block; entries past the size repeat the last Gaussian.
+// Gather the inputs of a block. Lanes past its size repeat the last Gaussian.
 static inline void gather(Block *b, const float *means, const float *quats, const float *scales,
                           const float *opacities, const int32_t *ids, const float *sums,
                           int64_t size) {
@@ -130,7 +132,7 @@ static inline void gather(Block *b, const float *means, const float *quats, cons
   }
 }
 
-// The sum over the block, lane by lane.
+// Write the sum of the gradients of the pose over a block, lane by lane.
 static inline void sum_pose(Block *b, int64_t size, float *pose) {
   for (int q = 0; q < POSE; q++) {
     for (int64_t j = size; j < BLOCK; j++) b->pose[q][j] = 0.f;

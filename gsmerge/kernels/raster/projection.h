@@ -1,12 +1,12 @@
-// Shared by projection and its backward pass.
+// Definitions that projection and its backward pass share.
 #pragma once
 #include "native.h"
 
 enum { CONIC = 8, TILE = 16 };
 static const float LN_CUT = -5.541263545158426f;  // ln(1/255): smaller weights are not drawn
 static const float MIN_OPACITY = 1.f / 255.f;
-static const float MAX_SIGMA = 1e6f;  // pixels; wider conics are flat, and squares of this number do not overflow
-static const float LEAST_SHARE = 0.005f * 0.005f;  // least share of the density after dilation
+static const float MAX_SIGMA = 1e6f;  // in pixels; wider conics look flat, and squares of this number do not overflow
+static const float LEAST_SHARE = 0.005f * 0.005f;  // least share of the density that remains after dilation
 
 typedef struct {
   float x, y, z;
@@ -16,7 +16,7 @@ typedef struct {
 typedef struct {
   vec3 r0, r1, r2, t;  // rows of the rotation from world to camera, shift
   float fx, fy, cx, cy, width, height, near, far, eps2d;
-  float right, left, below, above;  // limits of x / z and y / z, beyond which EWA is too inexact
+  float right, left, below, above;  // limits of x / z and y / z, beyond which the EWA projection is too inexact
   float antialiased;
 } Camera;
 _Static_assert(sizeof(Camera) == 26 * sizeof(float), "as many as in project.py");
@@ -45,7 +45,7 @@ static inline float between(float value, float low, float high) {
   return value > low ? value : low;
 }
 
-// Scales beyond MAX_SIGMA pixels are cut.
+// The largest scale. At depth 1 it has MAX_SIGMA pixels.
 static inline float widest(Camera c) { return MAX_SIGMA / maxf(c.fx, c.fy); }
 static inline vec3 cut_scales(vec3 s, float wide) {
   return (vec3){minf(s.x, wide), minf(s.y, wide), minf(s.z, wide)};

@@ -1,5 +1,5 @@
-// Evaluate the colours of Gaussians as seen from a point, and their gradients: real spherical
-// harmonics of degrees 0 to 4.
+// Evaluate the colours of Gaussians as seen from a point, and their gradients, by real spherical harmonics of degrees 0
+// to 4.
 //
 // A Gaussian's coefficients are stored as red, green and blue of the first harmonic, then of the
 // second, and so on. Fifteen coefficients at a time belong to five harmonics, whose values are
@@ -8,24 +8,24 @@
 
 enum { BLOCK = 32, BASES = 24, FIVE = 5, WIDE = 15, ROW = 40 };
 static const float CONSTANT = 0.28209479177387814f;  // the harmonic of degree 0
-static const float LINEAR = 0.4886025119029199f;  // harmonics of degree 1 divided by their coordinate
+static const float LINEAR = 0.4886025119029199f;  // the harmonics of degree 1 are this times a coordinate
 static const v16i LANE = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
-// A block of Gaussians, seen from the eye. A row has all harmonics of one Gaussian, a plane has one
-// harmonic of all Gaussians; the constant harmonic is in neither.
+// A block of Gaussians as seen from the eye. A row has all harmonics of one Gaussian, and a plane has one harmonic of
+// all Gaussians. The constant harmonic is in neither.
 typedef struct {
   float x[BLOCK], y[BLOCK], z[BLOCK], inverse[BLOCK];  // direction, 1 / distance
   float planes[BASES][BLOCK], rows[BLOCK][ROW];
 } Block;
 
-// Degree for a number of harmonics.
+// The degree that has this number of harmonics.
 static inline int degree_of(int64_t num) {
   int degree = 0;
   while ((degree + 1) * (degree + 1) < num + 1) degree++;
   return degree;
 }
 
-// Directions of the listed Gaussians; entries past the size repeat the last Gaussian.
+// Compute the directions of listed Gaussians. Lanes past the size of the block repeat the last Gaussian.
 static inline void look(Block *b, const float *means, const int32_t *ids, int64_t size,
                         const float *eye) {
   for (int j = 0; j < BLOCK; j++) {
@@ -44,7 +44,7 @@ static inline void look(Block *b, const float *means, const int32_t *ids, int64_
   }
 }
 
-// Harmonics of a unit direction (Sloan 2013, signs and order of the 3DGS layout).
+// Compute the harmonics of a unit direction (Sloan 2013), with the signs and the order of the 3DGS layout.
 static inline void basis_to_2(Block *b, int j, int degree) {
   float x = b->x[j], y = b->y[j], z = b->z[j], xx = x * x, yy = y * y, zz = z * z;
   b->planes[0][j] = -LINEAR * y;
@@ -82,7 +82,7 @@ static inline void basis_4(Block *b, int j) {
   b->planes[23][j] = 0.6258357354491761f * (xx * (xx - 3.f * yy) - yy * (3.f * xx - yy));
 }
 
-// Rows of the first `count` harmonics of a block from its planes; loops over a constant number unroll.
+// Fill the rows of the first `count` harmonics of a block from its planes. `count` is a constant, so that loops unroll.
 static inline __attribute__((always_inline)) void turn(Block *b, int count) {
   for (int j = 0; j < BLOCK; j++)
     for (int k = 0; k < count; k++) b->rows[j][k] = b->planes[k][j];
@@ -105,7 +105,7 @@ static inline v16f repeat(const float *row) {
   return PICK(v, v, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 4);
 }
 
-// As load, but lanes from `left` on, which belong to other rows or lie outside the array, are zero.
+// Load a vector, but with zeros from lane `left` on, because these belong to other rows or lie outside the array.
 static inline v16f load_part(const float *p, const float *end, int64_t left) {
   if (end - p >= LANES) return sel(LANE < (int32_t)left, load(p), splat(0.f));
   v16f v = splat(0.f);
@@ -120,7 +120,7 @@ static inline v16f sum_colors(v16f v) {
   return four + PICK(v, v, 12, 13, 14, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
 }
 
-// Colours of at most three harmonics, which are too few for blocks.
+// Compute colours with at most three harmonics, which are too few for blocks.
 static inline __attribute__((always_inline)) void
 few_colors(const float *restrict means, const float *restrict sh0, const float *restrict shN,
            const int32_t *restrict ids, const float *restrict eye, int64_t first, int64_t last,
@@ -176,7 +176,7 @@ typedef struct {
   float x, y, z;
 } Slope;
 
-// Gradient of the sum of weighted harmonics with respect to the unit direction.
+// The gradient of a weighted sum of harmonics by the unit direction.
 static inline Slope slope_to_2(const Block *b, int j, int degree) {
   const float a = 1.0925484305920792f;
   float x = b->x[j], y = b->y[j], z = b->z[j];
@@ -225,7 +225,7 @@ static inline Slope slope_4(const Block *b, int j) {
   return g;
 }
 
-// Gradients of the means from the weights of the harmonics in the planes; written to x, y, z.
+// Write to x, y, z the gradients of the means, from the weights of the harmonics in the planes.
 static inline void means_backward(Block *b, int j, int degree) {
   Slope g = slope_to_2(b, j, degree);
   if (degree > 2) {
@@ -243,7 +243,7 @@ static inline void means_backward(Block *b, int j, int degree) {
   b->z[j] = (g.z - along * z) * b->inverse[j];
 }
 
-// Gradients of a Gaussian's coefficients. Its row is replaced by the weights of the harmonics: the
+// Write the gradients of a Gaussian's coefficients. Replace its row by the weights of the harmonics, which are the
 // coefficients times the gradient of the colour.
 static inline void coefficients_backward(float *row, const float *shN, const float *end, v16f color,
                                          float *grad, const float *grad_end, int64_t num) {

@@ -1,4 +1,4 @@
-"""Evaluate the colours of Gaussians as seen from a point, and their gradients, by spherical harmonics."""
+"""Evaluate spherical harmonics: the colours of Gaussians as seen from a point, and their gradients."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
     first=i8(least=0, most="m"), last=i8(least="first", most="m"), colors=f4("m", 3, out=True),
 )  # fmt: skip
 def view_colors(means, sh0, shN, ids, eye, first, last, colors):
-    """Write the colours of a range of the listed Gaussians as seen from ``eye [3]``, clipped at 0."""
+    """Write the colours of a range of the listed Gaussians as seen from ``eye [3]``; none is below 0."""
 
 
 @native(
@@ -19,9 +19,9 @@ def view_colors(means, sh0, shN, ids, eye, first, last, colors):
     grad_shN=f4("m", "num", 3, out=True), grad_means=f4("m", 3, out=True),
 )  # fmt: skip
 def view_colors_backward(means, shN, ids, eye, first, last, colors, grad_colors, grad_sh0, grad_shN, grad_means):
-    """Write the gradients of a range of the listed Gaussians through their colours seen from ``eye [3]``.
+    """Write the gradients of a range of the listed Gaussians from those of their colours as seen from ``eye [3]``.
 
     Args:
-        colors: ``[m,3]`` float32, as seen; no gradient passes where they are 0.
-        grad_means: ``[m,3]`` float32, written: gradient through the viewing direction only.
+        colors: ``[m,3]`` float32 colours as seen; no gradient passes where they are 0.
+        grad_means: ``[m,3]`` float32, written: the part of the gradient that comes from the viewing direction.
     """

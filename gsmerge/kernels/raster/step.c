@@ -1,6 +1,6 @@
-// One step of a fit as phases. In each, every thread makes one call and takes pieces of work from a counter; the last
-// thread to arrive does what one thread has to. The phases call the kernels of the other files, so their bits are those
-// of single calls.
+// Take a step of a fit in phases. In each phase every thread makes one call, and takes pieces of work from a counter
+// until none are left. The last thread to finish does what a single thread has to do. The phases call the kernels of
+// the other files, so their bits are those of single calls.
 #include "native.h"
 #include "projection.h"
 
@@ -31,7 +31,8 @@ API int32_t adam(float *, const float *, float *, float *, const float *, const 
                     const float *, const float *, const float *, const float *, const float *, int64_t, int64_t,
                     int64_t, float *, float *, float *, float *, float *, int64_t, int64_t);
 
-enum { SUMS = 9, BLOCK = 128, PIECE = 1 << 13, RANGES = 8 };  // Gaussians of a piece; tile ranges of a thread
+// PIECE is the number of Gaussians of a piece, and RANGES the number of ranges of tiles for each thread
+enum { SUMS = 9, BLOCK = 128, PIECE = 1 << 13, RANGES = 8 };
 
 // The table of kernels/raster/step.py: addresses, then sizes, then numbers.
 typedef struct {
@@ -65,7 +66,7 @@ static inline Span share(int64_t count, int64_t i, int64_t num) {
   return (Span){count * i / num, count * (i + 1) / num};
 }
 
-// The first tile whose list begins at a share of all intersections or behind it.
+// The first tile whose list begins at the share i / num of all intersections, or behind it.
 static inline int64_t cut(const Step *s, int64_t i, int64_t num) {
   if (i <= 0) return 0;
   if (i >= num) return s->tiles;
@@ -94,7 +95,7 @@ static int32_t cull_piece(Step *s, int64_t i) {
   return 0;
 }
 
-// Colours as the camera sees them: without harmonics those of the state, which may be negative.
+// Compute the colours that the camera sees. Without harmonics they are those of the state, which may be negative.
 static int32_t color_rows(Step *s, int64_t first, int64_t last) {
   if (s->num > 0)
     return view_colors(s->means, s->sh0, s->shN, s->ids, s->eye, first, last, s->tints, s->n, s->num, s->num_visible);
@@ -121,7 +122,7 @@ static int32_t count_span(Step *s, int64_t i) {
                      rows.last - rows.first, s->num_corners, s->tiles);
 }
 
-// Deal to a range of tile lines, to each tile until no light passes it. Without intersections count alone.
+// Deal Gaussians to a range of rows of tiles, to each tile until no light passes it. Without intersections only count.
 static int32_t deal_open_lines(Step *s, int64_t i, int64_t intersections) {
   int64_t columns = columns_of(s);
   Span lines = share(s->tiles / columns, i, RANGES * s->threads);
@@ -169,7 +170,7 @@ static int32_t backward_range(Step *s, int64_t i) {
 static int32_t update_rows(Step *s, int64_t i) {
   Span blocks = share((s->num_visible + BLOCK - 1) / BLOCK, i, s->threads);
   int64_t first = BLOCK * blocks.first, last = mini(BLOCK * blocks.last, s->num_visible);
-  float *poses = s->blocks ? s->g_poses : 0;  // no blocks: of a camera that stays
+  float *poses = s->blocks ? s->g_poses : 0;  // there are no blocks if the camera does not move
   for (int64_t k = SUMS * first; k < SUMS * last; k++) s->sums[k] = 0.f;
   if (gather_slots(s->flatten_ids, s->slots, first, last, s->sums, s->num_intersections, s->num_visible))
     return OUTSIDE;
@@ -188,7 +189,7 @@ static int32_t (*const WORK[])(Step *, int64_t) = {
     list_open_lines, blend_range,   loss_rows,  backward_range,   update_rows,
 };
 
-// Place the tiles' lists one after the other, and in each the parts that the spans count.
+// Find where the list of each tile begins, and within it the part of each span.
 static void place_lists(Step *s, int64_t spans) {
   int64_t sum = 0;
   for (int64_t tile = 0; tile < s->tiles; tile++) {
@@ -202,7 +203,8 @@ static void place_lists(Step *s, int64_t spans) {
   s->offsets[s->tiles] = s->num_intersections = sum;
 }
 
-// What one thread does between two phases: close the gaps between pieces, sort by depth, place the tiles' lists.
+// Do what a single thread does between two phases: close the gaps between pieces, sort by depth, place the lists of
+// tiles.
 static void finish(Step *s, int64_t phase) {
   if (phase == CULL) {
     int64_t count = 0;
@@ -215,7 +217,7 @@ static void finish(Step *s, int64_t phase) {
   if (phase == COUNT_OPEN) place_lists(s, 1);
 }
 
-// Whether the buffers go with the picture and the Gaussians.
+// True if the buffers have the right sizes for the picture and the Gaussians.
 static inline bool fits(const Step *s) {
   int64_t columns = columns_of(s), lines = (s->height + TILE - 1) / TILE;
   return s->width > 0 && s->height > 0 && s->threads > 0 && s->spans > 0 && s->n >= 0 && s->n < INT64_C(1) << 31 &&

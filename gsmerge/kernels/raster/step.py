@@ -1,7 +1,8 @@
-"""One step of a fit, from projection to the optimiser, as a table of buffers and phases that work through it.
+"""Take a step of a fit, from projection to the optimiser, in phases that work on one table of buffers.
 
-The kernels and their bits are those of the other modules. What a step needs is checked once, when the table is filled.
-Then a phase is one call without arguments on every thread, see ``gsmerge/kernels/raster/step.c``.
+The kernels are those of the other modules, and give the same bits. The buffers are checked once, when the table is
+filled. Then each phase is one call on every thread, with no argument but the table and its number, see
+``gsmerge/kernels/raster/step.c``.
 """
 
 from __future__ import annotations
@@ -11,12 +12,13 @@ from gsmerge.kernels.raster.image_loss import DERIVATIVE_ROWS, EDGE_ROWS, TERMS
 from gsmerge.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
 from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
 
-# Where most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces "deal". The list of
-# a tile then ends where no light passes the Gaussians in front
+# If most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces "deal". Then the list
+# of a tile ends with the Gaussian behind which all pixels of the tile are opaque
 PHASES = ("cull", "project", "count", "count_open", "deal", "deal_open", "blend", "loss", "backward", "update")
-THREAD_GAUSSIANS = 1 << 13  # Gaussians that are culled or projected by one thread at a time
+THREAD_GAUSSIANS = 1 << 13  # number of Gaussians that a thread culls or projects at a time
 
-# State of the fit, buffers over its n Gaussians, over tiles, over intersections and over pixels, then what a step sets
+# The arrays of the table are in this order: the state of the fit; buffers with a row for each of its n Gaussians, for
+# each tile, for each intersection, and for each pixel; and what each step sets
 STEP = Table(
     "Step",
     ("step", "num_visible", "num_intersections", "next", "arrived", "failed"),
@@ -42,7 +44,7 @@ STEP = Table(
 
 @native(STATUS, table=i8("fields", out=True), phase=i8(least=0, below=len(PHASES)))
 def fit_phase(table, phase):
-    """Work on a phase of a step until it is finished; each of the ``threads`` makes one such call.
+    """Take part in a phase of a step until it is finished. Each of the ``threads`` makes one such call.
 
     A phase begins when all calls of the phase before have ended. After "count" and "count_open" the table holds the
     number of intersections, and the buffers must have room for them before the next phase.

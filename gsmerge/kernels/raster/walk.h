@@ -1,4 +1,4 @@
-// Shared by the blending kernels: evaluate a Gaussian of a batch over the rows of a tile, sixteen pixels at a time.
+// Evaluate a Gaussian of a batch over the rows of a tile, sixteen pixels at a time, for all blending kernels.
 //
 // The state of a tile consists of planes of 16 x 16 floats. The weights are gsplat's: alpha is clamped at 0.99 and cut
 // below 1/255, and a pixel stops before the Gaussian that would lower its transmittance to 1e-4 or below. Plane 0 of
@@ -8,21 +8,22 @@
 
 enum { BATCH = 32, CONIC = 8, SPLAT_COLORS = 3, WIDE = -1 };
 
-#define SPARE 0.02f  // tolerance for rounding, in rows and columns, around a Gaussian
+#define SPARE 0.02f  // rows and columns by which a Gaussian is enlarged, against rounding
 
-// Gaussians relative to the tile's first pixel centre: ln w = lnop - (rate (x - mx - slope (y - my)))^2 - decay (y - my)^2.
+// Gaussians relative to the tile's first pixel centre: ln w = lnop - (rate (x - mx - slope (y - my)))^2 - decay (y -
+// my)^2.
 typedef struct {
   float mx[BATCH], my[BATCH], rate[BATCH], slope[BATCH], decay[BATCH], lnop[BATCH], first[BATCH], last[BATCH];
   float red[BATCH], green[BATCH], blue[BATCH];
-  int32_t y0[BATCH], y1[BATCH];  // rows of the tile in which each shows
-  int32_t x0[BATCH];  // first of the eight columns in which each shows; WIDE if it shows in more columns
+  int32_t y0[BATCH], y1[BATCH];  // first and last row of the tile in which each Gaussian shows
+  int32_t x0[BATCH];  // first of the eight columns in which each Gaussian shows; WIDE if it shows in more
 } Batch;
 
-// Share of a Gaussian in some pixels.
+// What a Gaussian contributes to some pixels.
 typedef struct {
-  pixels alpha, weight;  // weight: alpha times the transmittance, 0 if the pixel stops
+  pixels alpha, weight;  // weight is alpha times the transmittance, or 0 if the pixel stops
   pixels left;           // transmittance behind the Gaussian; negative if the pixel has stopped
-  masks unclamped, goes;  // alpha is below 0.99; the pixel does not stop here or before
+  masks unclamped, goes;  // set if alpha is below 0.99; set if the pixel does not stop here or before
 } Share;
 
 // The tile on which a kernel works.
@@ -59,7 +60,7 @@ INLINE int32_t step_of(Rows r) { return r.wide ? 1 : 2; }
 INLINE int64_t gap_of(Rows r) { return r.wide ? HALF : TILE; }
 INLINE v16f columns_in(Rows r) { return r.wide ? load(ROW_X) : load(PAIR_X) + (float)r.x; }
 
-// A number of row y, or of the pair of rows from y on, in all their pixels.
+// Spread the number of row y, or those of the pair of rows from y on, over all their pixels.
 INLINE pixels spread_rows(const v16f *numbers, int32_t y, bool wide, int part) {
 #if PARTS == 1
   (void)part;
@@ -84,7 +85,7 @@ INLINE void trace(Curve *c, const Batch *b, int64_t j, Rows r) {
   c->dy = dy;
 #if PARTS == 1
   v16f across = b->rate[j] * columns_in(r);
-  if (!r.wide)  // a pair may have one row that is none of the Gaussian's
+  if (!r.wide)  // one row of a pair may be outside the rows of the Gaussian
     top = sel((y >= (float)r.y0) & (y <= (float)r.y1), top, splat(HIDDEN));
   for (int32_t row = first_of(r, 0); row <= r.y1; row += step_of(r)) {
     pixels side = across - spread_rows(&base, row, r.wide, 0);
@@ -115,11 +116,12 @@ static inline float clamp_column(float x) {
   return x > 0.f ? x : 0.f;
 }
 
-// Narrow the rows of a batch to those where a column of the tile reaches the cut, and find the columns where a row does.
+// Narrow the rows of a batch to those where a column of the tile reaches the cut, and find the columns where a row
+// does.
 //
-// With q the ln opacity above the cut, a Gaussian shows where decay y^2 + rate^2 (x - slope y)^2 <= q. The highest point
-// of this ellipse lies at y = sqrt(q / decay); where that is outside the tile, the ellipse is highest at the tile's
-// column next to it. It reaches sqrt(q (1 / rate^2 + slope^2 / decay)) to the sides.
+// With q the ln opacity above the cut, a Gaussian shows where decay y^2 + rate^2 (x - slope y)^2 <= q. The highest
+// point of this ellipse lies at y = sqrt(q / decay); where that is outside the tile, the ellipse is highest at the
+// tile's column next to it. It reaches sqrt(q (1 / rate^2 + slope^2 / decay)) to the sides.
 static inline void narrow_rows(Batch *b) {
   for (int i = 0; i < BATCH; i++) {
     float mx = b->mx[i], my = b->my[i], slope = b->slope[i], decay = b->decay[i], squared = b->rate[i] * b->rate[i];
@@ -143,7 +145,7 @@ static inline void narrow_rows(Batch *b) {
   }
 }
 
-// Make a batch of Gaussians without effect, since unused lanes are computed, too.
+// Fill a batch with Gaussians without effect, because unused lanes are computed as well.
 static inline void clear_batch(Batch *b) {
   float *numbers = b->mx;
   for (int i = 0; i < 11 * BATCH; i++) numbers[i] = 1.f;
@@ -167,7 +169,7 @@ static inline bool lists_are_sound(const Lists *l, int64_t first, int64_t last) 
   return true;
 }
 
-// Transpose eight rows.
+// Transpose eight rows of eight numbers.
 static inline void transpose8(v8f r[8]) {
   v8f a[8], b[8];
   for (int k = 0; k < 8; k += 2) {
@@ -224,7 +226,7 @@ static inline void gather_colors(Batch *b, const float *colors, const int32_t *f
     __builtin_prefetch(colors + SPLAT_COLORS * (int64_t)flatten_ids[i]);
 }
 
-// Reset the planes of a tile: the transmittance is 1, other planes are zero, and lanes outside the image have stopped.
+// Reset the planes of a tile. The transmittance is 1, other planes are zero, and pixels outside the image have stopped.
 static inline Tile open_tile(float *state, int planes, int64_t tile, int64_t tile_width, int64_t h, int64_t w) {
   int64_t left = tile % tile_width * TILE, top = tile / tile_width * TILE;
   int32_t num_x = (int32_t)mini(TILE, w - left), num_y = (int32_t)mini(TILE, h - top);
@@ -246,7 +248,7 @@ static inline void narrow_tile(Tile *tile, const float *state) {
   while (tile->y_high >= tile->y_low && !row_is_live(state + tile->y_high * TILE)) tile->y_high--;
 }
 
-// First and last of the live rows in which Gaussian j of a batch shows.
+// The first and the last row in which Gaussian j of a batch shows, among those with pixels that have not stopped.
 static inline int32_t first_row(const Tile *tile, const Batch *b, int64_t j) {
   return b->y0[j] > tile->y_low ? b->y0[j] : tile->y_low;
 }
@@ -267,7 +269,7 @@ static inline void weigh_rows(float *state, const Batch *b, int64_t j, int32_t y
     }
 }
 
-// First and last column of the tile that Gaussian j of a batch can touch.
+// Write the first and the last column of the tile that Gaussian j of a batch can touch.
 static inline void columns_of(const Batch *b, int64_t j, int32_t num_x, int32_t *x0, int32_t *x1) {
   float rate = b->rate[j], slope = b->slope[j];
   float square = 1.f / (rate * rate) + slope * slope / b->decay[j];

@@ -1,1 +1,1 @@
-"""Kernels of segmentation."""
+"""Cut pictures into superpixels, and merge superpixels."""

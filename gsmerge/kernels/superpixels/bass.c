@@ -1,8 +1,8 @@
-// Bayesian adaptive superpixels: fit the parameters of regions, and pass over their labels.
+// Cut pictures by Bayesian adaptive superpixels: fit the parameters of regions, and change labels of pixels.
 #include "exp_log.h"
 #include "labels.h"
 
-// Columns of a region's row after its mean (three colours, x, y).
+// Columns of the row of a region after its mean, which has three colours, x and y.
 enum { XX = 5, XY, YY, LOG_DET };
 static const int64_t ROW = 9;
 
@@ -22,7 +22,7 @@ API int32_t fit_regions(const int32_t *labels, const float *colours, const doubl
       const float *colour = colours + 3 * (y * width + x);
       double *sum = sums + ROW * labels[(y + 1) * padded_width + x + 1];
       double across = (double)x, down = (double)y;
-      // Four at a time, since unaligned vectors of eight take longer.
+      // Four numbers at a time, because unaligned vectors of eight take longer
       *(v4d *)sum += (v4d){colour[0], colour[1], colour[2], across};
       *(v4d *)(sum + 4) += (v4d){down, across * across, across * down, down * down};
       sum[8] += 1;
@@ -45,8 +45,7 @@ API int32_t fit_regions(const int32_t *labels, const float *colours, const doubl
   return 0;
 }
 
-// Twice the logarithm of the posterior of a label for a pixel, up to a constant. A pixel has three
-// colours, x and y.
+// Twice the logarithm of the posterior of a label for a pixel, up to a constant. A pixel has three colours, x and y.
 static inline float log_posterior(const float *row, const float *pixel, float num_foreign,
                                   float precision) {
   float d0 = pixel[0] - row[0], d1 = pixel[1] - row[1], d2 = pixel[2] - row[2];
@@ -57,8 +56,7 @@ static inline float log_posterior(const float *row, const float *pixel, float nu
   return -((colour + shape) + rest);
 }
 
-// The label with the highest posterior among those around a border pixel; its own label if the pixel
-// may not change.
+// The label with the highest posterior among those around a pixel; its own label if the pixel may not change.
 static inline int32_t best_label(const int32_t *place, int64_t columns, const float *rows,
                                  const float *pixel, const uint8_t *table, const float *foreign,
                                  float precision) {

@@ -1,8 +1,9 @@
 """Cut pictures into superpixels by BASS (Uziel, Ronen and Freifeld 2019), without its splits and merges.
 
-Rounds of hard expectation maximisation of Gaussians in colour (fixed standard deviation) and position
-(normal-inverse-Wishart prior), with a Potts term on the borders. A pixel may change its label only if no region is
-disconnected by that. Pixels at the picture's edge may change, too, and no region can become empty.
+Each region is a Gaussian in colour, with a fixed standard deviation, and in position, with a normal-inverse-Wishart
+prior. Each round fits these Gaussians, and then moves pixels to the most likely regions (hard expectation
+maximisation), with a Potts term that keeps borders short. A pixel may change its label only if every region stays
+connected. Pixels at the border of the picture may change, too, and no region can become empty.
 """
 
 from __future__ import annotations
@@ -11,15 +12,15 @@ import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, native, u1
 
-COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
-REGION_COLUMNS = 9  # columns of a region's parameters
+COLOUR_DEVIATION = 0.018 / 2  # standard deviation of colours, in CIELAB divided by 100
+REGION_COLUMNS = 9  # number of a region's parameters
 
 
 def simple_point_table():
-    """Make a table ``[256]`` uint8 that is 1 for rings of neighbours with which a pixel may change its label.
+    """Return a table ``[256]`` uint8 that is 1 for rings of eight neighbours with which a pixel may change its label.
 
-    Such a ring has one arc of pixels with the label and one arc without, each with an edge neighbour. Bit i of the
-    index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the label.
+    Such a ring has one arc of pixels with the label and one arc of others, and in each arc a pixel that shares a side
+    with the pixel in the middle. Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the label.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     changes = (cells != np.roll(cells, 1, axis=1)).sum(1)
@@ -27,7 +28,7 @@ def simple_point_table():
     return ((changes == 2) & (edges > 0) & (edges < 4)).astype(np.uint8)
 
 
-# sums are zero before
+# `sums` are zero before
 _fit_regions = declare(
     "fit_regions", STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3),
     areas=f8("count"), sums=f8("count", 9, out=True), rows=f4("count", REGION_COLUMNS, out=True),
@@ -35,10 +36,10 @@ _fit_regions = declare(
 
 
 def fit_regions(labels, colours, areas):
-    """Fit ``[count,9]`` float32 parameters of every region: means, inverse covariance and its log-determinant.
+    """Return the parameters ``[count,9]`` float32 of every region: means, inverse covariance, and its log-determinant.
 
-    The covariance is ``(A² I + S) / (n + 50 A - 3)`` with the scatter S of n positions and the expected area A of the
-    region, pixels, from ``areas [count]`` float64.
+    The covariance is ``(A² I + S) / (n + 50 A - 3)``. S is the scatter of the region's n positions, and A its expected
+    area in pixels, from ``areas [count]`` float64.
     """
     rows = np.empty((len(areas), REGION_COLUMNS), np.float32)
     _fit_regions(labels, colours, areas, np.zeros((len(areas), 9)), rows)
@@ -50,16 +51,17 @@ def fit_regions(labels, colours, areas):
     rows=f4("count", REGION_COLUMNS), table=u1(256), foreign=f4(256), precision=f4(),
 )  # fmt: skip
 def label_pass(labels, colours, rows, table, foreign, precision):
-    """Pass over all border pixels once, in four grids of pixels that do not touch; return how many pixels changed.
+    """Visit all pixels at borders between regions once, and return how many changed their label.
 
-    No two pixels of a grid are neighbours, so their order does not matter.
+    The pixels are visited in four grids. No two pixels of a grid are neighbours, so their order does not matter.
     """
 
 
 def infer_labels(labels, colours, count):
-    """Improve padded labels in place, in as many rounds as a superpixel's side has pixels; return them.
+    """Improve padded labels in place, in as many rounds as the side of a superpixel has pixels; return the labels.
 
-    Each of the ``count`` regions is 4-connected and not empty, before and after. ``colours [h,w,3]`` are CIELAB / 100.
+    Each of the ``count`` regions is 4-connected and not empty, before and after. ``colours [h,w,3]`` are CIELAB values
+    divided by 100.
     """
     height, width, _ = colours.shape
     areas = np.full(count, height * width / count)
@@ -69,12 +71,12 @@ def infer_labels(labels, colours, count):
 
 
 def improve_labels(labels, colours, areas):
-    """Fit the parameters of the regions and pass over the labels in place; ``areas`` are as in :func:`fit_regions`."""
+    """Run one round in place: fit the regions, and move pixels; ``areas`` are as in :func:`fit_regions`."""
     table = simple_point_table()
     foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
     precision = np.float32(1 / COLOUR_DEVIATION**2)
     rows = fit_regions(labels, colours, areas)
-    num_passes = 4  # label passes per update of the parameters
+    num_passes = 4  # most passes over the labels after each fit of the parameters
     for _ in range(num_passes):
         if label_pass(labels, colours, rows, table, foreign, precision) == 0:
             break

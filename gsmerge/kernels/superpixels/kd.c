@@ -1,4 +1,4 @@
-// Split a picture into rectangles, as a start for merging.
+// Cut a picture into rectangles, from which merging starts.
 #include "native.h"
 
 // Cuts are queued in buckets by the exponent and three mantissa bits of their gain, so a nearly best
@@ -8,11 +8,11 @@ enum {
   CUT = 4,
   NEXT,
   NODE = 8
-};  // columns of a rectangle's row after y0, x0, y1, x1, and its length
+};  // columns of the row of a rectangle after y0, x0, y1, x1; and length of the row
 
 typedef struct {
   const double *integral;
-  int64_t stride;  // entries of a line of the integral image
+  int64_t stride;  // number of entries of a line of the integral image
   double compactness;
   int32_t *nodes;
   int64_t *heads;
@@ -44,8 +44,8 @@ API int32_t integral_image(const float *pixels, double *integral, int64_t height
   return 0;
 }
 
-// The best cut of a rectangle across one of its sides. near and far are the corners at both ends of
-// the side that is not cut; step is the distance between places along the side that is cut.
+// The best cut of a rectangle across one of its sides. `near` and `far` are the corners at both ends of the side that
+// is not cut, and `step` is the distance of neighbours along the side that is cut.
 static inline Cut best_cut(const double *near, const double *far, int64_t step, int64_t side,
                            double num_pixels, double compactness) {
   double length = (double)side, spatial = 0.25 * compactness * num_pixels * num_pixels, total[3],
@@ -79,9 +79,9 @@ API int32_t cut_gain(const double *integral, int64_t near, int64_t far, int64_t 
   return 0;
 }
 
-// Store a rectangle with its best cut, in the bucket of the cut's gain or limit; single pixels are not
-// queued. A cut of a part comes after the cut that made the part, so its bucket need not be above the
-// one being emptied.
+// Store a rectangle with its best cut, in the bucket of its gain, but not above the bucket `limit`. Single pixels are
+// not stored. A cut of a part comes after the cut that made the part, so its bucket need not be above the one that is
+// emptied.
 static void enqueue(const Queue *queue, int64_t node, int64_t limit, int64_t y0, int64_t x0,
                     int64_t y1, int64_t x1) {
   int64_t height = y1 - y0, width = x1 - x0, stride = queue->stride;

@@ -1,4 +1,4 @@
-"""Split a picture into rectangles, as a start for merging: best cut first, with integral images.
+"""Cut a picture into rectangles, from which merging starts. The best cut comes first, found with integral images.
 
 Label pictures are padded: ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel has to check for the border.
 """
@@ -9,34 +9,34 @@ import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8
 
-NUM_BUCKETS = 2048  # lists of cuts with about the same gain
-NODE = 8  # columns of a rectangle's row
+NUM_BUCKETS = 2048  # number of lists, each for cuts with about the same gain
+NODE = 8  # columns of the row of a rectangle
 
 
 _integral_image = declare("integral_image", STATUS, pixels=f4("height", "width", 3), integral=f8("places", 3, out=True))
 
 
 def integral_image(pixels):
-    """Sum all pixels above and to the left of each corner: ``[(h+1)·(w+1),3]`` float64."""
+    """Return the sum of all pixels above and to the left of each corner of a pixel, ``[(h+1)·(w+1),3]`` float64."""
     height, width, _ = pixels.shape
     integral = np.empty(((height + 1) * (width + 1), 3))
     _integral_image(pixels, integral)
     return integral
 
 
-# Writes the gain of the best cut of a rectangle across one of its sides, below 0 if there is nothing to cut, and its
-# place, 1 to side - 1. The gain is the reduction of the squared error. A rectangle of n pixels with colour sum t, whose
-# side of length S is cut at c into parts with sums s and t - s, loses |S s - c t|² / (n c (S - c)) of colour error and
-# n c (S - c) / 4 of position error, times the compactness. near and far are the places in the integral image of its
-# first corner and of the corner at the other end of the side that is not cut. step is the distance between neighbours
-# along the side that is cut.
+# Writes the gain of the best cut of a rectangle across one of its sides, which is below 0 if it cannot be cut, and the
+# place of this cut, 1 to side - 1. The gain is the reduction of the squared error. Let a rectangle have n pixels whose
+# colours sum to t, and let its side of length S be cut at c into parts with sums s and t - s. Then the colour error
+# falls by |S s - c t|² / (n c (S - c)), and the position error by n c (S - c) / 4 times the compactness. near and far
+# are the places in the integral image of the rectangle's first corner, and of the corner at the other end of the side
+# that is not cut. step is the distance of neighbours along the side that is cut.
 cut_gain = declare(
     "cut_gain", STATUS, integral=f8("places", 3), near=i8(least=0), far=i8(least=0), step=i8(least=1), side=i8(least=0),
     num_pixels=f8(), compactness=f8(), found=f8(2, out=True),
 )  # fmt: skip
 
 
-# returns the number of labels
+# Returns the number of labels
 _split_rectangles = declare(
     "split_rectangles", COUNT, integral=f8("places", 3), count=i8(least=0), block=i8(least=1), compactness=f8(),
     nodes=i4("capacity", NODE, out=True), heads=i8(NUM_BUCKETS, out=True),
@@ -45,15 +45,15 @@ _split_rectangles = declare(
 
 
 def split_rectangles(pixels, count, block, compactness):
-    """Cut the picture into ``count`` rectangles, at least one per block; cuts with the largest gain come first.
+    """Cut a picture into ``count`` rectangles, but at least one in each block; cuts with the largest gain come first.
 
     Args:
         count: Wanted number of rectangles, at most h·w.
-        block: Side of the blocks that the picture is divided into at the start, pixels.
-        compactness: Weight of squared pixels against squared colours.
+        block: Side, in pixels, of the square blocks into which the picture is divided at the start.
+        compactness: Weight of squared distances in pixels, relative to squared differences of colours.
 
     Returns:
-        (labels, count): padded labels and the number of rectangles.
+        Padded labels, and the number of rectangles.
     """
     height, width, _ = pixels.shape
     capacity = max(count, max(1, height // block) * max(1, width // block))

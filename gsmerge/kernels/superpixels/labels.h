@@ -1,5 +1,5 @@
-// Shared by the kernels of segmentation. Label pictures are padded: [h+2,w+2] with a frame of -1, so
-// that no loop has to check for the border.
+// Definitions that the kernels of superpixels share. Label pictures are padded: [h+2,w+2] with a frame of -1, so that
+// no loop has to check for the border.
 #pragma once
 #include "native.h"
 
@@ -20,7 +20,7 @@ static inline bool labels_fit(const int32_t *labels, int64_t rows, int64_t colum
   return good;
 }
 
-// Bits of the eight neighbours (N, NE, E, SE, S, SW, W, NW) of a place that have the label.
+// A number whose bit i is set if neighbour i (N, NE, E, SE, S, SW, W, NW) of a place has the label.
 static inline uint32_t ring_of(const int32_t *place, int64_t columns, int32_t label) {
   const int32_t *above = place - columns, *below = place + columns;
   return (uint32_t)((above[0] == label) | (above[1] == label) << 1 | (place[1] == label) << 2
@@ -29,7 +29,7 @@ static inline uint32_t ring_of(const int32_t *place, int64_t columns, int32_t la
                     | (above[-1] == label) << 7);
 }
 
-// True if all four neighbours of a place have its label.
+// True if the four neighbours of a place have the same label as the place.
 static inline bool is_inside(const int32_t *place, int64_t columns) {
   int32_t own = place[0];
   return (place[-columns] == own) & (place[1] == own) & (place[columns] == own)

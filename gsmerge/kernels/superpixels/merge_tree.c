@@ -1,27 +1,27 @@
 // Merge the regions of a view, one pair after another, cheapest first.
 #include "labels.h"
 
-// Columns of a region's row after its mean (three colours, y, x); the nine from PLANE on are sums
-// over the pixels of z², z²x, z²y, z²xx, z²xy, z²yy, z, zx, zy. The box is -y, y, -x, x in
-// whole pixels, the largest of each.
+// Columns of the row of a region after its mean, which has three colours, y and x. The nine columns from PLANE on are
+// sums over the pixels of z², z²x, z²y, z²xx, z²xy, z²yy, z, zx and zy. The box is the largest -y, y, -x and x in whole
+// pixels.
 enum { NUM_PIXELS = 5, PLANE, PLANE_ERROR = 15, BOX };
 static const int64_t ROW = 20;
-// Ridge of the fit of planes, square pixels; it determines the slopes of planes through fewer than three points.
+// Ridge of the fit of planes, in square pixels. It determines the slopes if there are fewer than three points
 static const double SLOPE_RIDGE = 1e-3;
 static const int32_t NEVER = -1000000000;  // box of a region without pixels
-static const double OVERSIZE = 1e9;        // added to the cost of a merge beyond the largest extent
+static const double OVERSIZE = 1e9;        // added to the cost of a merge that makes too large a region
 
 typedef double v4d __attribute__((vector_size(32), aligned(8)));
 typedef struct {
   double error, place;
 } Growth;
 
-// Edges between regions: a heap by their costs, and a list of half-edges for each region. Edge e has
-// the half-edges 2e and 2e + 1.
+// The edges, which are pairs of neighbouring regions: a heap of them by cost, and a list of half-edges for each region.
+// Edge e has the half-edges 2e and 2e + 1.
 typedef struct {
   double *costs;
   int32_t *heap;    // edges, the cheapest first
-  int32_t *places;  // place of each edge in the heap, -1 after it was removed
+  int32_t *places;  // place of each edge in the heap, or -1 once it was removed
   int32_t *heads;   // first half-edge of each region
   int32_t *nexts;   // next half-edge in the list of each half-edge
   int32_t *ends;    // region to which each half-edge leads
@@ -33,7 +33,7 @@ typedef struct {
   double depth_weight, compactness, max_extent;
 } Regions;
 
-// Minimum over a, b, c of the sum of (1 - z (a x + b y + c))² over n pixels, with a ridge on the slopes.
+// The minimum over a, b, c of the sum of (1 - z (a x + b y + c))² over n pixels, with a ridge on the slopes a and b.
 static inline double plane_error(double n, const double *s) {
   double w = s[0], z = s[6];
   if (w <= 0) return 0;
@@ -45,7 +45,7 @@ static inline double plane_error(double n, const double *s) {
 }
 
 // Add a pixel with its colour, place and depth to a region's row of sums, and its squared colour to
-// the column of the error. Four at a time, since unaligned vectors of eight take longer.
+// the column of the error. It adds four numbers at a time, because unaligned vectors of eight take longer.
 static inline void add_pixel(double *row, const float *pixel, double y, double x, double z) {
   v4d *sums = (v4d *)row;
   double r = pixel[0], g = pixel[1], b = pixel[2], zz = z * z;
@@ -89,7 +89,7 @@ API int32_t region_sums(const int32_t *labels, const float *pixels, const float 
   return 0;
 }
 
-// Growth of the error if two regions are merged: of colour and depth, and of place times compactness.
+// By how much the error grows if two regions merge: that of colour and depth, and that of position times compactness.
 static inline Growth growth_of(const double *a, const double *b, double depth_weight,
                                double compactness) {
   double n_a = a[NUM_PIXELS], n_b = b[NUM_PIXELS], sums[9];
@@ -157,7 +157,7 @@ static inline void put(Edges *edges, int64_t at, int32_t edge) {
   edges->places[edge] = (int32_t)at;
 }
 
-// Move an edge up or down in the heap to the place of its cost.
+// Move an edge up or down in the heap to the place for its cost.
 static void settle(Edges *edges, int32_t edge) {
   const int32_t *heap = edges->heap;
   const double *costs = edges->costs;

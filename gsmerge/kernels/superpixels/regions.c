@@ -1,7 +1,8 @@
-// Rows of the regions of a label picture.
+// Compute the rows of the regions of a label picture.
 #include "labels.h"
 
-// A region's row: mean (three colours, y and x times spread), number of pixels, and two columns for other algorithms.
+// The row of a region has its mean (three colours, y and x times spread), its number of pixels, and two columns for the
+// algorithm that uses it
 static const int64_t ROW = 8;
 
 API int32_t region_rows(const int32_t *labels, const float *pixels, float spread, double *sums,

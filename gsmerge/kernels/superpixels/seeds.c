@@ -1,7 +1,8 @@
-// Measure the corners of a picture, choose seeds for superpixels, and grow regions from them.
+// Measure how much like a corner each pixel of a picture is, choose seeds for superpixels, and grow regions of them.
 #include "native.h"
 
-// The line or column i of a picture with n of them, mirrored about the first and the last one.
+// The line or column at index i of a picture with n lines or columns, which is mirrored about the first and the last
+// one.
 static inline int64_t mirror(int64_t i, int64_t n) {
   i = i < 0 ? -i : i;
   i = i < n ? i : 2 * (n - 1) - i;
@@ -14,7 +15,7 @@ static inline void mirror_ends(float *line, int64_t width) {
   line[width + 1] = line[1 + mirror(width, width)];
 }
 
-// Products of Sobel's derivatives of a line, across and down.
+// Write the products of Sobel's derivatives of a line, across and down.
 static void multiply_slopes(const float *above, const float *here, const float *below, float *xx,
                             float *xy, float *yy, int64_t width) {
   for (int64_t x = 1; x <= width; x++) {

@@ -1,4 +1,4 @@
-"""Measure the corners of a picture, choose seeds for superpixels, and grow regions from them."""
+"""Measure how much like a corner each pixel of a picture is, choose seeds for superpixels, and grow regions of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
-JITTER = 0.3  # width of the noise on the dithering threshold, which prevents worm patterns
+JITTER = 0.3  # width of the noise on the threshold of dithering, without which seeds would form lines
 
 
 _corner_response = declare(
@@ -18,10 +18,10 @@ _corner_response = declare(
 
 
 def corner_response(pixels):
-    """Compute the smaller eigenvalue of the grey picture's structure tensor (Shi and Tomasi): ``[h,w]`` float32.
+    """Return the smaller eigenvalue of the grey picture's structure tensor (Shi and Tomasi), ``[h,w]`` float32.
 
-    The tensor is averaged over 3 x 3 pixels from Sobel's derivatives, mirrored at the border, in OpenCV's scale;
-    OpenCV's own last bits depend on the processor. ``pixels [h,w,3]`` float32.
+    The tensor is the mean over 3 x 3 pixels of products of Sobel's derivatives, with the picture mirrored at its
+    borders. The scale is that of OpenCV, whose own last bits depend on the processor. ``pixels [h,w,3]`` are float32.
     """
     height, width, _ = pixels.shape
     response = np.empty((height, width), np.float32)
@@ -30,7 +30,10 @@ def corner_response(pixels):
 
 
 def hexagonal_seeds(height, width, count):
-    """Place ``count`` distinct pixels near a hexagonal grid, about equally many per row; return (y, x) int64."""
+    """Return the positions (y, x) ``[count,2]`` int64 of different pixels near the points of a hexagonal grid.
+
+    The numbers of pixels in the rows of the grid differ by at most one.
+    """
     row_distance = math.sqrt(height * width / count * math.sqrt(3) / 2)
     num_rows = min(max(round(height / row_distance), math.ceil(count / width)), height, count)
     first = np.arange(num_rows + 1) * count // num_rows
@@ -42,9 +45,9 @@ def hexagonal_seeds(height, width, count):
 
 
 def seed_density(saliency, count):
-    """Compute the number of seeds per pixel ``[h,w]`` float64 from saliency: at most 1 each, and ``count`` in all.
+    """Return how many seeds each pixel should get, ``[h,w]`` float64: at most 1, and ``count`` in all.
 
-    The density is uniform if nothing is salient.
+    The numbers grow with the root of ``saliency [h,w]``. They are uniform if the saliency is zero everywhere.
     """
     density = np.sqrt(saliency, dtype=np.float64)
     density_floor = 0.3  # share of the seeds that are spread evenly
@@ -58,7 +61,7 @@ def seed_density(saliency, count):
     return density
 
 
-# errors are zero before
+# `errors` are zero before
 _dither = declare(
     "dither", STATUS, density=f8("height", "width"), jitter=f8(), errors=f8(2, "columns", out=True),
     seeds=u1("height", "width", out=True),
@@ -66,7 +69,7 @@ _dither = declare(
 
 
 def dither(density):
-    """Choose seeds by serpentine Floyd-Steinberg dithering with a jittered threshold: ``[h,w]`` bool."""
+    """Return a mask ``[h,w]`` of seeds, by serpentine Floyd-Steinberg dithering with a noisy threshold."""
     height, width = density.shape
     seeds = np.empty((height, width), np.uint8)
     _dither(density, JITTER, np.zeros((2, width + 2)), seeds)
@@ -74,7 +77,7 @@ def dither(density):
 
 
 def _spread_picks(weights, count):
-    """Choose ``count`` distinct indices, spread evenly over the cumulative sum of the weights."""
+    """Return ``count`` different indices, ascending, which are spread evenly over the cumulative sum of the weights."""
     total = np.cumsum(weights)
     order = np.arange(count)
     picks = np.searchsorted(total, (order + 0.5) * (total[-1] / count))
@@ -83,9 +86,9 @@ def _spread_picks(weights, count):
 
 
 def seeds_from_density(density, count):
-    """Choose ``count`` distinct pixels ``[count,2]`` int64 (y, x) distributed by the density.
+    """Return the positions (y, x) ``[count,2]`` int64 of different pixels, distributed as the density says.
 
-    Dithering loses a few seeds at the border of the picture; seeds are added or removed evenly to reach the exact
+    Dithering loses a few seeds at the border of the picture. So seeds are added or removed evenly to reach the exact
     number.
     """
     seeds = dither(density).reshape(-1)
@@ -103,9 +106,10 @@ _voronoi = declare(
 
 
 def voronoi(seeds, height, width):
-    """Label each pixel with its nearest seed in steps to 4-neighbours: ``[h,w]`` int32; every region is connected.
+    """Return the index ``[h,w]`` int32 of the seed nearest to each pixel, by the number of steps to 4-neighbours.
 
-    ``seeds [count,2]`` int64 are y and x of pixels. Raises ValueError for a seed outside the picture.
+    So every region is connected. ``seeds [count,2]`` int64 are y and x of pixels. Raises ValueError for a seed outside
+    of the picture.
     """
     labels = np.empty((height, width), np.int32)
     _voronoi(seeds, np.empty((height * width + len(seeds), 2), np.int32), labels)

@@ -10,14 +10,14 @@ API int64_t ring_mask(const int32_t *labels, int64_t y, int64_t x, int32_t label
   return ring_of(labels + y * columns + x, columns, label);
 }
 
-// Squared distance of a pixel's feature to a region's mean.
+// Squared distance of the feature of a pixel from the mean of a region.
 static inline float distance(const float *row, const float *feature) {
   float d0 = feature[0] - row[0], d1 = feature[1] - row[1], d2 = feature[2] - row[2];
   float d3 = feature[3] - row[3], d4 = feature[4] - row[4];
   return d0 * d0 + d1 * d1 + d2 * d2 + d3 * d3 + d4 * d4;
 }
 
-// Add (sign 1) or remove (sign -1) one pixel.
+// Add a pixel to a region (sign 1) or remove it (sign -1), and update the mean.
 static inline void shift(float *row, float sign, const float *feature) {
   float num_pixels = row[NUM_PIXELS] + sign, step = sign / num_pixels;
   row[NUM_PIXELS] = num_pixels;
@@ -26,7 +26,7 @@ static inline void shift(float *row, float sign, const float *feature) {
   for (int i = 0; i < 5; i++) row[i] += step * (feature[i] - row[i]);
 }
 
-// The label, of a neighbour or its own, with the least cost of a border pixel.
+// The label with the least cost for a pixel, among its own and those of its neighbours.
 static inline int32_t best_label(const int32_t *place, int64_t columns, const float *rows,
                                  const float *feature) {
   const int32_t own = place[0], around[4] = {place[-columns], place[1], place[columns], place[-1]};

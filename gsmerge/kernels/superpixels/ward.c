@@ -1,14 +1,14 @@
-// Merge neighbouring regions by Ward's method.
+// Merge neighbouring regions by Ward's method. An edge is a pair of neighbouring regions.
 #include "labels.h"
 
-enum { NUM_PIXELS = 5, INVERSE, HEIGHT };  // columns of a region's row after its mean
+enum { NUM_PIXELS = 5, INVERSE, HEIGHT };  // columns of the row of a region after its mean
 static const int64_t ROW = 8;
 
 static const float LEAST_CEILING = 1e-7f;
 static const float CEILING_GROWTH = 1.5f;
-static const float RETURN_MARGIN = 1.5f;  // parked edges return if their cost is below so many times the ceiling
+static const float RETURN_MARGIN = 1.5f;  // parked edges return if they cost less than this many times the ceiling
 
-// Edges between regions: active ones with a cost up to the ceiling, or parked ones.
+// A list of edges: the active ones, which cost at most the ceiling, or the parked ones.
 typedef struct {
   int32_t *pairs;
   float *costs;
@@ -18,7 +18,7 @@ typedef struct {
 typedef struct {
   float *rows;
   int32_t *parents;
-  float *best_costs;  // least cost of every region's active edges, inf between the rounds
+  float *best_costs;  // least cost of the active edges of each region; inf between the rounds
   int64_t num_nodes;
 } Tree;
 
@@ -30,8 +30,8 @@ API int64_t adjacent_pairs(const int32_t *labels, int32_t *pairs, int64_t rows, 
     const int32_t *line = labels + y * columns, *above = line - columns, *below = line + columns;
     for (int64_t x = 1; x < columns - 1; x++) {
       int32_t u = line[x], east = line[x + 1], south = below[x];
-      // Always written; the count decides if it stays. A branch here would be mispredicted half of the
-      // time.
+      // The pair is always written, and the count decides if it stays. A branch here would be mispredicted half of the
+      // time
       pairs[2 * count] = u;
       pairs[2 * count + 1] = east;
       count += (east != u) & (east >= 0) & ((above[x] != u) | (above[x + 1] != east));
@@ -43,7 +43,7 @@ API int64_t adjacent_pairs(const int32_t *labels, int32_t *pairs, int64_t rows, 
   return count;
 }
 
-// Growth of the squared error if two regions are merged.
+// By how much the squared error grows if two regions merge.
 static inline float merge_cost(const float *u, const float *v) {
   float d0 = u[0] - v[0], d1 = u[1] - v[1], d2 = u[2] - v[2], d3 = u[3] - v[3], d4 = u[4] - v[4];
   return (d0 * d0 + d1 * d1 + d2 * d2 + d3 * d3 + d4 * d4) / (u[INVERSE] + v[INVERSE]);
@@ -80,7 +80,7 @@ static void weigh(Edges *edges, Edges *parked, const Tree *tree, float ceiling) 
     set_edge(edges, kept, u, v, cost);
     kept += outer & cheap;
     bits4 bid = {.f = cost};
-    // Inf or NaN, which compare as not below; a choice between floats would be a branch.
+    // Sets the bits of inf or NaN, which are not less than any cost. A choice between floats would be a branch
     bid.u |= (outer & cheap) ? 0 : 0x7f800000;
     best[u] = minf(bid.f, best[u]);
     best[v] = minf(bid.f, best[v]);

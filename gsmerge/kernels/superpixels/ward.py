@@ -1,9 +1,10 @@
 """Merge neighbouring regions by Ward's method down to an exact number.
 
-In each round every region finds its cheapest neighbour, and pairs that choose each other merge. Edges with costs above
-a ceiling are parked, so that a round reads only the few edges that matter. The ceiling rises when no cheap edges are
-left. Rounds merge some pairs out of order, and too many. So the merges are recorded as a tree with heights, and the
-tree is cut where exactly the wanted number of regions is left.
+An edge is a pair of neighbouring regions. In each round every region finds its cheapest neighbour, and pairs that
+choose each other are merged. Edges that cost more than a ceiling are put aside, so that a round reads only the few
+edges that matter. The ceiling rises when no cheap edges are left. Rounds merge some pairs out of order, and merge too
+many. So the merges are recorded as a tree with heights, and the tree is cut where exactly the wanted number of regions
+is left.
 """
 
 from __future__ import annotations
@@ -13,23 +14,23 @@ import numpy as np
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, i4, i8, u1
 from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW_COLUMNS, region_rows
 
-INVERSE, MERGE_HEIGHT = 6, 7  # columns of a region's row: 1 / n, and the cost of the merge that made it
+INVERSE, MERGE_HEIGHT = 6, 7  # columns of 1 / number of pixels, and of the height of the merge that made a region
 
 
-# returns the number of pairs
+# Returns the number of pairs
 _adjacent_pairs = declare("adjacent_pairs", COUNT, labels=i4("rows", "columns"), pairs=i4("capacity", 2, out=True))
 
 
 def adjacent_pairs(labels):
-    """List the labels of neighbouring regions, ``[e,2]`` int32; a pair may be repeated.
+    """Return the labels of all pairs of neighbouring regions, ``[e,2]`` int32, in which pairs may be repeated.
 
-    There is about one row for each straight piece of a common border.
+    There is about one pair for each straight piece of a common border.
     """
     pairs = np.empty((2 * (labels.shape[0] - 2) * (labels.shape[1] - 2) + 1, 2), np.int32)
     return pairs[: _adjacent_pairs(labels, pairs)]
 
 
-# Writes the growth of the squared error if two regions merge: n_u n_v / (n_u + n_v) |mean_u - mean_v|².
+# Writes by how much the squared error grows if two regions merge: n_u n_v / (n_u + n_v) |mean_u - mean_v|²
 merge_costs = declare(
     "merge_costs", rows=f4("capacity", ROW_COLUMNS), pairs=i4("count", 2, least=0, below="capacity"),
     costs=f4("count", out=True),
@@ -37,22 +38,22 @@ merge_costs = declare(
 
 
 def _first_ceiling(pairs, rows, share):
-    """Estimate a cost slightly above the most expensive merge that removes ``share`` of the regions.
+    """Estimate a cost slightly above that of the last merge, if merges remove the ``share`` of the regions.
 
-    On photos with 1.5 to 3 times too many regions, the share of edges that are cheaper than that merge at the start is
-    close to the share of regions that disappear.
+    In photos with 1.5 to 3 times as many regions as wanted, about this share of the edges is cheaper at the start than
+    the last merge.
     """
-    sample_edges = 4096  # edges whose costs the first ceiling is estimated from
+    sample_edges = 4096  # the ceiling is estimated from the costs of about this many edges
     step = max(1, len(pairs) // sample_edges)
     costs = np.empty(len(pairs) // step, np.float32)
     merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
     rank = min(int(share * len(costs)), len(costs) - 1)
-    # Squared colour that the kernel adds to equal costs, so that flat pictures merge many pairs per round
+    # The kernel adds at most this to a cost, so that costs differ and flat pictures merge many pairs in a round
     tie_break = 1e-7
     return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * tie_break))
 
 
-# returns the number of nodes
+# Returns the number of nodes
 _merge_tree = declare(
     "merge_tree", COUNT, num_leaves=i8(least=0), num_merges=i8(), ceiling=f4(),
     pairs=i4("num_pairs", 2, least=0, below="num_leaves", out=True), costs=f4("num_pairs", out=True),
@@ -63,17 +64,18 @@ _merge_tree = declare(
 
 
 def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
-    """Merge neighbouring regions until at least ``num_merges`` pairs are merged, or no pair with a cost is left.
+    """Merge neighbouring regions until at least ``num_merges`` pairs are merged, or no pair with a finite cost is left.
 
     Args:
         pairs: From :func:`adjacent_pairs`; overwritten.
-        rows: ``[2·leaves,8]`` rows of the leaves; those of the merged regions are filled in.
+        rows: ``[2·leaves,8]`` rows of the leaves, then room for those of merged regions, which are written.
         num_leaves: Number of regions at the start.
         num_merges: Wanted number of merges; the regions must be connected.
-        ceiling: First ceiling of the cost, squared colour times pixels.
+        ceiling: First ceiling of costs, which are squared differences of colours times pixels.
 
     Returns:
-        (parents, num_nodes): ``parents[i]`` is -1 at a root; children come before their parents.
+        The parent of each leaf and merge, which is -1 at a root, and the number of leaves and merges. Children come
+        before their parents.
     """
     parents, best_costs = np.empty(len(rows), np.int32), np.empty(len(rows), np.float32)
     costs, parked_costs = np.empty(len(pairs), np.float32), np.empty(len(pairs) + 1, np.float32)
@@ -84,7 +86,7 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
     return parents, num_nodes
 
 
-# labels the leaves, dense from 0, if only the merges in ``keep`` are made
+# Writes the labels of the leaves, from 0 without gaps, if only the merges in `keep` are made
 _label_leaves = declare(
     "label_leaves", STATUS, parents=i4("num_nodes", below="num_nodes"), keep=u1("num_nodes"),
     names=i4("num_nodes", out=True), num_leaves=i8(),
@@ -92,12 +94,12 @@ _label_leaves = declare(
 
 
 def merge_regions(labels, pixels, num_regions, count, spread):
-    """Merge the regions of a padded label picture down to ``count``, cheapest first.
+    """Merge the regions of a padded label picture until ``count`` are left, the cheapest pairs first.
 
     Args:
         labels: Padded labels 0 to ``num_regions - 1``, each region 4-connected.
         count: Wanted number of regions, 1 to ``num_regions``.
-        spread: Square root of the weight of squared pixels against squared colours, float32.
+        spread: Square root of the weight of squared distances in pixels, float32.
 
     Returns:
         Padded labels 0 to ``count - 1``.
@@ -120,7 +122,7 @@ def merge_regions(labels, pixels, num_regions, count, spread):
     cut = np.partition(merges, num_merges - 1)[num_merges - 1]
     keep = heights < cut
     ties = np.flatnonzero(merges == cut) + num_regions
-    # Children come before their parents, so of merges with equal heights the first ones have all their children.
+    # Children come before their parents, so the first ones of merges with equal heights have all their children
     keep[ties[: num_merges - np.count_nonzero(merges < cut)]] = True
     names = np.empty(num_nodes, np.int32)
     _label_leaves(parents[:num_nodes], keep.view(np.uint8), names, num_regions)

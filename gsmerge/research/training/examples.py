@@ -31,7 +31,7 @@ from gsmerge.scene.read import load_scene
 from gsmerge.settings.budget import share_text
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import encode
-from gsmerge.stages.merge import take
+from gsmerge.stages.merge import take_features
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Pixels
 
@@ -127,7 +127,7 @@ def select_example_views(example: Example, ids: Sequence[int]) -> Example:
     new_views = np.full(num_views, -1)  # new number of each view; -1 if it is left out
     new_views[list(ids)] = np.arange(len(ids))
     rows = np.flatnonzero(new_views[example.features.views] >= 0)
-    part = take(example.features, rows)
+    part = take_features(example.features, rows)
     member_rows, pixels = Pixels(members.pixels, members.fronts, own=True).select(ids)
     new_rows = np.full(len(members.pixels), -1, np.int32)  # new row of each member; -1 if it is left out
     new_rows[member_rows] = np.arange(len(member_rows), dtype=np.int32)

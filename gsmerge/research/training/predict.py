@@ -39,9 +39,9 @@ from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
-from gsmerge.stages.decode import divide
+from gsmerge.stages.decode import divide_groups
 from gsmerge.stages.match import match
-from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
+from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take_features
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 from gsmerge.values.arrays import Array, as_array, as_tensor
 
@@ -301,7 +301,7 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
     """Run a crop through encoder, merger and refiner with gradients; each stage takes the results of earlier stages."""
     example = crop.example
     context = TrainingContext(networks, example.members, example.cameras, seed)
-    encoded = context.encode(features_to_tensors(take(example.features, crop.rows)))
+    encoded = context.encode(features_to_tensors(take_features(example.features, crop.rows)))
     encoded = replace(encoded, latents=as_tensor(encoded.latents))
     matches = match(features_to_arrays(encoded), options.match_options())
     refined = context.refine(_merge(encoded, matches, context))
@@ -334,7 +334,7 @@ def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext
     if len(order) == 0:
         return encoded
     pooled = context.merge(pool_tensors(encoded, order, cuts), encoded, order, cuts)
-    return FeatureGaussians.concat([take(encoded, alone), pooled])
+    return FeatureGaussians.concat([take_features(encoded, alone), pooled])
 
 
 def _make_children(
@@ -348,12 +348,12 @@ def _make_children(
         return None, np.repeat(np.arange(len(arrays)), k)
     if k == 1:
         return described.base, np.arange(len(arrays))
-    children, parents = divide(arrays, crop.example.members, np.full(len(arrays), k))
+    children, parents = divide_groups(arrays, crop.example.members, np.full(len(arrays), k))
     return children.to("cpu"), parents
 
 
 def analytic_gaussians(crop: Crop, options: TrainOptions) -> Gaussians:
     """Decode the children of a crop without networks."""
-    features = take(crop.example.features, crop.rows)
+    features = take_features(crop.example.features, crop.rows)
     merged = merge(features, match(features, options.match_options()))
-    return divide(merged, crop.example.members, np.full(len(merged), crop.k))[0]
+    return divide_groups(merged, crop.example.members, np.full(len(merged), crop.k))[0]

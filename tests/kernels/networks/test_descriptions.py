@@ -16,7 +16,7 @@ from gsmerge.kernels.elementary import log
 from gsmerge.networks.corrections import move_features, move_gaussians
 from gsmerge.networks.options import FEATURE, MEMBER_COLUMNS, PART_COLUMNS, RESIDUAL
 from gsmerge.networks.tokens import GroupFeatures, compute_group_features, contiguous, part_tokens
-from gsmerge.stages.merge import take
+from gsmerge.stages.merge import take_features
 from gsmerge.types import SH_C0, Gaussians
 
 Each = Callable[..., list[np.ndarray]]
@@ -91,13 +91,15 @@ def test_groups(some: Made, each_target: Each) -> None:
         expected = slow_group(features, row, viewmats[row])
         np.testing.assert_allclose(group[row, :19], expected, atol=1e-5, rtol=1e-5)
     np.testing.assert_allclose(sizes, np.sqrt(np.sort(features.base.scales, 1)[:, 1:].prod(1)), rtol=1e-6)
-    nothing = compute_group_features(take(some.features, np.zeros(0, np.int64)), some.members, some.scene.cameras)
+    nothing = compute_group_features(
+        take_features(some.features, np.zeros(0, np.int64)), some.members, some.scene.cameras
+    )
     assert nothing.group.shape == (0, group.shape[1])
 
 
 def test_points_at_a_camera_and_on_its_axis(some: Made) -> None:
     """Have frames, too: what is seen along the image's own right is level with the ray ahead."""
-    features, viewmat = take(some.features, np.arange(3)), some.scene.cameras.viewmats[0]
+    features, viewmat = take_features(some.features, np.arange(3)), some.scene.cameras.viewmats[0]
     rotation, centre = viewmat[:3, :3], some.scene.cameras.centres[0]
     means = np.stack([centre, centre + rotation[2], centre + rotation[0]]).astype(np.float32)
     frames = compute_group_features(replace(features, means=means), some.members, some.scene.cameras).frames

@@ -51,14 +51,14 @@ def test_hostile_numbers_come_to_an_end(
     state, numbers = some_state(300, rng, num), step_numbers(rng)
     photo, weight = (rng.random((HEIGHT, WIDTH, *more), dtype=np.float32) for more in ((3,), ()))
     buffers = StepBuffers(state, threads, moves_camera=True)
-    buffers.take(1, photo, weight, state.splats.opacities, numbers)
+    buffers.take_step(1, photo, weight, state.splats.opacities, numbers)
     arrays = [state.x, state.x0, state.m, state.v, *vars(state.splats).values(), photo, weight, *numbers.values()]
     arrays = [array for array in arrays if array.size]
     for number in range(2, 12):
         array = arrays[rng.integers(len(arrays))].reshape(-1)
         array[rng.integers(0, array.size, max(1, array.size // 4))] = rng.choice(HOSTILE)
         with np.errstate(all="ignore"), suppress(ValueError):  # of a camera whose picture has another size
-            buffers.take(number, photo, weight, state.splats.opacities, numbers)
+            buffers.take_step(number, photo, weight, state.splats.opacities, numbers)
 
 
 def test_views_that_show_nothing_take_a_step() -> None:
@@ -66,7 +66,7 @@ def test_views_that_show_nothing_take_a_step() -> None:
     state, numbers = some_state(5, rng), step_numbers(rng)
     state.splats.means[:, 2] = -1
     photo, weight = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.ones((HEIGHT, WIDTH), np.float32)
-    error, viewmat_gradient = StepBuffers(state, 2).take(1, photo, weight, state.splats.opacities, numbers)
+    error, viewmat_gradient = StepBuffers(state, 2).take_step(1, photo, weight, state.splats.opacities, numbers)
     assert viewmat_gradient is None
     assert error == pytest.approx(
         HEIGHT * WIDTH * float((numbers["background"].astype(np.float64) ** 2).sum()), rel=1e-5
@@ -79,7 +79,7 @@ def test_buffers_of_another_size_are_refused(name: str) -> None:
     state, numbers = some_state(300, rng), step_numbers(rng)
     photo, weight = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.ones((HEIGHT, WIDTH), np.float32)
     buffers = StepBuffers(state, 1, moves_camera=True)
-    buffers.take(1, photo, weight, state.splats.opacities, numbers)
+    buffers.take_step(1, photo, weight, state.splats.opacities, numbers)
     ((table, _),) = buffers.tables.values()
     arrays = dict(table.arrays)
     arrays[name] = np.zeros(tuple(size + 1 for size in arrays[name].shape), arrays[name].dtype)

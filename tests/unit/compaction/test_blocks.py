@@ -15,7 +15,7 @@ from gsmerge import CompactOptions, EvaluateOptions, compact, evaluate
 from gsmerge.compaction.seams import join_views
 from gsmerge.errors import UsageError
 from gsmerge.facts.scene_size import measure_size
-from gsmerge.fit import FitJob, FitOptions, fit
+from gsmerge.fit import FitJob, FitOptions, fit_gaussians
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.photos.row_colors import ROW_COLORS
@@ -189,7 +189,7 @@ def fit_every_second(scene: Scene, steps: int, faint: int) -> tuple[Gaussians, G
     settings = FitOptions(fit_steps=steps, scored=False, min_contribution=0.0)
     photos = fit_photos(PicturedScene.with_pictures(canonical, scene.images, None), settings)
     start = replace(start, means=start.means.astype(np.float32), opacities=opacities)
-    fitted, report = fit(start, FitJob(photos, settings, len(start), fixed=fixed))
+    fitted, report = fit_gaussians(start, FitJob(photos, settings, len(start), fixed=fixed))
     assert report is not None
     assert report.accepted
     assert settings.grows == (steps >= GROW_STEPS)

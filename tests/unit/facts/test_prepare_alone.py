@@ -17,7 +17,7 @@ from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.fit import FitOptions, fit_scene
 from gsmerge.geometry.transforms import project
 from gsmerge.runtime.record import record_run
-from gsmerge.stages.fit_pairs import merge_pairs
+from gsmerge.stages.fit_pairs import merge_scene
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_no_fit_sees_the_views_that_judge_it(prepared: Prepared) -> None:
 
 def fit_scene_alone(prepared: Prepared, options: FitOptions) -> Gaussians:
     held_out = prepared.reference.score_views
-    start = merge_pairs(300, 1.0, prepared)
+    start = merge_scene(300, 1.0, prepared)
     views = [view for view in range(len(prepared.scene)) if view not in held_out]
     fitted = fit_scene(start, prepared.scene, options, 0, views=views, num_scored=len(views))
     assert fitted.report is not None

@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.fit import FitJob, FitOptions, fit, record_fit
+from gsmerge.fit import FitJob, FitOptions, fit_gaussians, record_fit
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import (
     EMPTY_OPACITY,
@@ -165,7 +165,7 @@ def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pa
 
 
 def test_a_note_says_where_fog_is_left(truth: Gaussians, photos: Pair) -> None:
-    _, report = fit(scenes.spoil(truth), FitJob(photos, OPTIONS))
+    _, report = fit_gaussians(scenes.spoil(truth), FitJob(photos, OPTIONS))
     for fog, count in ((HAZE, 0), (HAZE + 0.01, 1), (None, 0)):
         with record_run(None) as record:
             record_fit(replace(report, fog=fog))

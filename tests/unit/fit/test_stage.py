@@ -8,7 +8,7 @@ import numpy as np
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.fit import FitJob, FitOptions, fit
+from gsmerge.fit import FitJob, FitOptions, fit_gaussians
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import place_outside_views, score_fog
@@ -39,7 +39,7 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
     outside = place_outside_views(scenes.bare(truth), start, photos[1], QUICK)
     assert outside is not None
-    result, report = fit(start, FitJob(photos, QUICK, seed=4, outside=outside))
+    result, report = fit_gaussians(start, FitJob(photos, QUICK, seed=4, outside=outside))
     expected, own = fit_full(start, scenes.run_for(photos, QUICK, seed=4, outside=outside))
     assert report == replace(own, fog=score_fog(make_splats(result), outside))
     assert scenes.identical(result, expected)
@@ -48,12 +48,12 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
 def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
     opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
-    alone, both = (fit(g, FitJob(photos, QUICK))[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
+    alone, both = (fit_gaussians(g, FitJob(photos, QUICK))[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
     assert len(both) == len(alone)
 
 
 def test_a_fit_that_shows_the_photos_worse_is_refused(truth: Gaussians, photos: Pair) -> None:
-    result, report = fit(truth, FitJob(photos, LONG))  # of a perfect start
+    result, report = fit_gaussians(truth, FitJob(photos, LONG))  # of a perfect start
     assert (report.method, report.accepted) == ("none", False)
     assert "worse" in report.stopped
     assert scenes.identical(result, truth[visible(truth, photos[1])])
@@ -66,13 +66,13 @@ def test_a_fit_is_taken_though_held_out_patches_get_worse(truth: Gaussians, phot
     for view, weight in enumerate(prepare_fit(FitJob(photos, LONG)).weights):
         drawn = composite(tile_view(state.splats, **half.camera(view)), state.colors)[0]
         images[view][weight == 0] = drawn.clip(0, 1)[weight == 0]  # patches show the start
-    _, report = fit(start, FitJob((photos[0], replace(half, images=images)), LONG))
+    _, report = fit_gaussians(start, FitJob((photos[0], replace(half, images=images)), LONG))
     assert report.holdout_after < report.holdout_before
     assert report.accepted
 
 
 def test_nothing_to_fit(truth: Gaussians, photos: Pair) -> None:
-    result, _ = fit(truth[:0], FitJob(photos, QUICK))
+    result, _ = fit_gaussians(truth[:0], FitJob(photos, QUICK))
     assert len(result) == 0
 
 

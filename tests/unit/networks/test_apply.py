@@ -14,9 +14,9 @@ from gsmerge.networks.corrector import ANALYTIC
 from gsmerge.networks.options import GROUP_COLUMNS, PAPER_NUMBERS, NetworkOptions
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.settings.stages import DecodeOptions, MatchOptions
-from gsmerge.stages.decode import decode, divide
+from gsmerge.stages.decode import decode, divide_groups
 from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge, take
+from gsmerge.stages.merge import merge, take_features
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 from gsmerge.values.arrays import as_array
 
@@ -79,7 +79,7 @@ def test_trained_networks_change_every_stage(scene: Made) -> None:
 def test_no_networks_and_nothing_to_do(scene: Made) -> None:
     assert ANALYTIC.refine(scene.features) is scene.features
     context = scene.networks(noisy())
-    none = take(encode_features(scene.features, context), np.zeros(0, np.int64))
+    none = take_features(encode_features(scene.features, context), np.zeros(0, np.int64))
     assert len(context.refine(none)) == 0
     assert len(encode_features(none, context)) == 0
     assert len(decode(none, scene.members, DecodeOptions(), networks=context)) == 0
@@ -102,8 +102,8 @@ def test_order_of_the_groups_and_the_table_they_share_do_not_matter(scene: Made)
     context = scene.networks(noisy())
     together = encode_features(scene.features, context)
     for row in range(0, len(scene.features), 3):
-        alone = encode_features(take(scene.features, np.array([row])), context)
-        assert_close(alone, take(together, np.array([row])), 2e-6)
+        alone = encode_features(take_features(scene.features, np.array([row])), context)
+        assert_close(alone, take_features(together, np.array([row])), 2e-6)
 
 
 def test_order_within_a_cluster_does_not_matter(scene: Made) -> None:
@@ -112,7 +112,7 @@ def test_order_within_a_cluster_does_not_matter(scene: Made) -> None:
     matches = pairs(encoded)
     back = np.arange(len(encoded))[::-1].copy()
     a = merge(encoded, matches, context)
-    b = merge(take(encoded, back), Matches(matches.clusters[back], matches.count), context)
+    b = merge(take_features(encoded, back), Matches(matches.clusters[back], matches.count), context)
     np.testing.assert_allclose(np.sort(a.means, 0), np.sort(b.means, 0), atol=1e-5, rtol=1e-5)
     np.testing.assert_allclose(np.sort(a.latents, 0), np.sort(b.latents, 0), atol=1e-5, rtol=1e-5)
 
@@ -127,9 +127,9 @@ def test_three_children_take_slots_of_the_head_for_four(scene: Made) -> None:
     plain = decode(encoded, scene.members, options, counts)
     assert len(mixed_counts) == len(plain)
     row = next(i for i in range(0, len(encoded), 2) if encoded.starts[i + 1] - encoded.starts[i] >= 13)
-    one = take(encoded, np.array([row]))
+    one = take_features(encoded, np.array([row]))
     alone = decode(one, scene.members, options, np.array([3]), networks=context)
-    before = len(decode(take(encoded, np.arange(row)), scene.members, options, counts[:row]))
+    before = len(decode(take_features(encoded, np.arange(row)), scene.members, options, counts[:row]))
     assert_close(alone, mixed_counts[before : before + 3], 2e-6)
 
 
@@ -138,8 +138,8 @@ def test_many_children_are_corrected_in_halves(scene: Made) -> None:
     context = scene.networks(noisy())
     encoded = encode_features(scene.features, context)
     large = np.flatnonzero(np.diff(encoded.starts) >= 30)
-    few = take(encoded, large)
-    children, parents = divide(few, scene.members, np.full(len(few), 6))
+    few = take_features(encoded, large)
+    children, parents = divide_groups(few, scene.members, np.full(len(few), 6))
     assert np.bincount(parents).tolist() == [6] * len(few)
     together = context.decode(children, parents, few)
     for half in (np.arange(len(parents)) % 6 < 3, np.arange(len(parents)) % 6 >= 3):
@@ -160,7 +160,7 @@ def test_refiner_reads_the_neighbours(scene: Made) -> None:
 
 
 def test_nearest_by_hand(scene: Made) -> None:
-    features = take(scene.features, np.arange(6))
+    features = take_features(scene.features, np.arange(6))
     line = np.array([0, 1, 3, 7, 7.5, 9], np.float32)
     features = replace(features, means=np.stack([line, line * 0, line * 0], 1))
     assert find_neighbors(features.means, 2).tolist() == [[1, 2], [0, 2], [1, 0], [4, 5], [3, 5], [4, 3]]

@@ -12,9 +12,9 @@ from gsmerge.runtime.record import (
     Forecast,
     RunPart,
     adopt,
-    choose,
     current_record,
     note,
+    record_choices,
     record_part,
     record_run,
     report_progress,
@@ -25,7 +25,7 @@ from gsmerge.runtime.record import (
 def test_nothing_is_recorded_outside_of_a_run() -> None:
     with stage("fit"):
         note("lost")
-        choose(count=1)
+        record_choices(count=1)
     assert current_record().notes == []
     assert current_record().seconds == {}
 
@@ -34,7 +34,7 @@ def test_stages_notes_and_choices_go_to_the_current_run() -> None:
     @stage("encode")
     def encode() -> int:
         note("odd")
-        choose(groups=3)
+        record_choices(groups=3)
         return 3
 
     events: list[tuple[str, int, int]] = []
@@ -80,7 +80,7 @@ def test_a_part_has_a_record_of_its_own_until_it_is_adopted() -> None:
         note("first")
         with record_part() as part, stage("fit"):
             note("second")
-            choose(steps=2)
+            record_choices(steps=2)
         with record_part(silent=True), stage("decode"):
             pass
         assert record.notes == ["first"]

@@ -8,7 +8,7 @@ import pytest
 from scenes import make_features
 
 from gsmerge.geometry.pooling import feature_to_gaussians
-from gsmerge.stages.merge import merge, take
+from gsmerge.stages.merge import merge, take_features
 from gsmerge.types import FeatureGaussians, Matches
 
 
@@ -34,7 +34,7 @@ def test_two_by_hand() -> None:
     )
     merged = merge(features, matches(0, 1, 0))
     assert len(merged) == 2
-    assert_equal(take(merged, np.array([0])), take(features, np.array([1])))
+    assert_equal(take_features(merged, np.array([0])), take_features(features, np.array([1])))
     np.testing.assert_allclose(merged.means[1], [1, 0, 0], atol=1e-6)  # weights 3 to 1
     np.testing.assert_allclose(merged.covars[1], np.diag([4.0, 1, 1]), atol=1e-5)
     np.testing.assert_allclose(merged.shN[1], 0.25)
@@ -100,8 +100,8 @@ def test_every_member_once_whatever_the_clusters() -> None:
 
 def test_take_brings_the_members() -> None:
     features = with_members(make_features(np.eye(3)), [1, 2, 3])
-    taken = take(features, np.array([2, 0]))
+    taken = take_features(features, np.array([2, 0]))
     assert taken.starts.tolist() == [0, 3, 4]
     assert taken.members.tolist() == [103, 104, 105, 100]
     assert taken.means.tolist() == features.means[[2, 0]].tolist()
-    assert len(take(features, np.zeros(0, np.int64))) == 0
+    assert len(take_features(features, np.zeros(0, np.int64))) == 0
