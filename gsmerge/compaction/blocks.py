@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.compaction.block_report import join_reports
 from gsmerge.compaction.block_start import BlockStart, start_block
 from gsmerge.compaction.costs import RunCosts
-from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
+from gsmerge.compaction.file_size import drop_to_bytes, measure_base
 from gsmerge.compaction.partition import (
     Block,
     Covisibility,
@@ -134,7 +134,7 @@ def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, co
     steps, num_gaussians = 0 if choices.fit.fit == "none" else choices.fit.steps, choices.limits.default
     settings, view_pixels = choices.settings(options), scene.pixels_per_view
     costs = RunCosts(settings, view_pixels * len(scene), view_pixels, 1 / count, steps)
-    build, [scores] = costs.build(num_gaussians), costs.end([], None)
+    build, [scores] = costs.build_part(num_gaussians), costs.end_parts([], None)
     merged, fitted = RunPart(build.stages / count), RunPart(0.0, build.fits / count)
     seam_cost = 0.5  # of the fit of seams, as a share of the fits of all blocks
     seams = [RunPart(0.0, seam_cost * build.fits)] * (steps > 0)
@@ -202,7 +202,7 @@ def finish_joined(
         note(f"budget: {limit:,} Gaussians were asked for, {len(result):,} remain of those of all blocks")
     if (size := file_size(options.budget)) and size.packed:
         content = size.num_bytes, size.file, cameras, names
-        result = drop_to_bytes(result, *content, measure_rest(result, *content))
+        result = drop_to_bytes(result, *content, measure_base(result, *content))
     return result
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.compaction.outputs import Outputs, frame_notes, write_outputs
 from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.errors import Doubt, SceneError, UsageError, name_notes
-from gsmerge.facts.counts import LEVEL_FACTOR, STREAMED_LEVELS
+from gsmerge.facts.counts import STREAMED_LEVELS, level_counts
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.io import GaussianFile, file_notes, read_cameras, read_gaussians
@@ -98,8 +98,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {outputs.result.name}", steps - 1, steps)
     levels = [gaussians]
-    while format_.levels == "inside" and len(levels) < STREAMED_LEVELS and len(levels[-1]) >= LEVEL_FACTOR:
-        levels.append(merge_neighbors(levels[-1], len(levels[-1]) // LEVEL_FACTOR))
+    for level_count in level_counts(len(gaussians), STREAMED_LEVELS) if format_.levels == "inside" else ():
+        levels.append(merge_neighbors(levels[-1], level_count))
     notes += frame_notes(outputs, moved)
     contents = Contents(levels, comments, moved, names, scene_title(options.inputs[0]), extra_columns=columns)
     num_bytes, camera_path = write_outputs(outputs, contents), outputs.viewer_cameras if len(moved) else None
