@@ -54,8 +54,9 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
         # unseen Gaussians were dropped from the requested number; the bytes that they free are not filled up
         requested = max(count, built[-1].count or 0)
         full_size = base_bytes + (size - base_bytes) * requested / max(count, 1)  # bytes with the dropped Gaussians
-        full_count = int(BUILD_SURPLUS * count * (max_bytes - base_bytes) / max(size - base_bytes, 1))
-        full_count = min(full_count, plan.limits.most)
+        full_count = min(
+            int(BUILD_SURPLUS * count * (max_bytes - base_bytes) / max(size - base_bytes, 1)), plan.limits.most
+        )
         near_share = 0.97  # share of the size that a build has to reach
         is_near = full_size >= near_share * max_bytes or full_count <= BUILD_SURPLUS * requested
         most_dropped = 0.08  # largest share of the Gaussians that is dropped after the last build
