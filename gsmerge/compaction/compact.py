@@ -151,12 +151,13 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     """Compact a prepared scene with a method, in one piece.
 
     A search finds the number of Gaussians, unless the options state it, and builds the result. Then its coarser levels
-    are built, a trial measures what new views gain, and all scores come into the report.
+    are built, a trial measures what new views gain, and the input is scored for the report.
     """
     plan = make_plan(prepared, options)  # from here on, the plan replaces the options
     plan = add_target(plan, prepared)
 
     def rebuild(count: int | None) -> Candidate:
+        """Build a candidate after those of the search."""
         candidate = build_scored(method.build, prepared, plan, count)
         add_seconds(candidate.record.seconds)  # in addition to those of the search
         return candidate

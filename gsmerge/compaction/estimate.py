@@ -53,24 +53,24 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
     choices, num_blocks = choose_for_scene(size, options), choose_blocks(size, options)
     limits, settings = choices.limits, choices.settings(options)
-    pixels = max(limits.num_pixels, scene.num_gaussians)
-    max_count = pixels if options.method.startswith("unmerged") else limits.count or limits.default
+    num_pixels = max(limits.num_pixels, scene.num_gaussians)
+    max_count = num_pixels if options.method.startswith("unmerged") else limits.count or limits.default
     no_views = is_without_views(scene, options)
     has_target = choices.keeps_fidelity or options.budget.target_psnr is not None
     found_count = find_count(scene, options) if no_views and has_target and num_input <= MAX_SEARCHED else None
-    count = found_count or min(scene.num_gaussians or pixels, max_count)
-    at_once, num_rest = gaussians_at_once(pixels, num_blocks), 3 * scene.gaussians.shN.shape[1]
-    num_drawn = pixels if options.method == "unmerged-fit" else count
+    count = found_count or min(scene.num_gaussians or num_pixels, max_count)
+    at_once, num_rest = gaussians_at_once(num_pixels, num_blocks), 3 * scene.gaussians.shN.shape[1]
+    num_drawn = num_pixels if options.method == "unmerged-fit" else count
     fit = {OURS: choices.fit.fit, "unmerged-fit": "full"}.get(options.method, "none")
     steps = 0 if fit == "none" else choices.fit.steps
-    num_pixels, budget = at_once * num_blocks, options.budget
+    all_pixels, budget = at_once * num_blocks, options.budget  # pixels of views in several blocks count several times
     inside = 1.0 if no_views else mean_inside(scene)
-    costs = RunCosts(settings, num_pixels, num_pixels / max(1, len(scene)), inside, steps, no_views, no_views)
+    costs = RunCosts(settings, all_pixels, all_pixels / max(1, len(scene)), inside, steps, no_views, no_views)
     choice = CountChoice(has_target, budget.auto or budget.max_drop is not None, budget.max_drop, size.rendered)
     has_trial = steps > 0 and scene.has_own_pixels and options.new_views is not False
     parts = expected_parts(costs, limits, num_drawn, choice, has_trial=has_trial)
     seconds = costs.seconds(parts, len(scene), options.threads or available_threads())
-    memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=pixels - at_once)
+    memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=num_pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,

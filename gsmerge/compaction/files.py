@@ -8,7 +8,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact_scene
-from gsmerge.compaction.outputs import Outputs, add_outputs, frame_notes, refuse_other_cameras
+from gsmerge.compaction.outputs import Outputs, add_outputs, frame_notes, refuse_to_replace_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError
@@ -60,7 +60,7 @@ def compact_files(
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras if views else None
         if cameras_path is not None and cameras_path.exists() and not outputs.overwrite:  # fail before the long work
-            refuse_other_cameras(cameras_path, load.scene.cameras[views], names, moved=True)
+            refuse_to_replace_cameras(cameras_path, load.scene.cameras[views], names, moved=True)
         read_at = perf_counter()
         result = compact_scene(load.scene, settings, progress)
         if len(result.gaussians) == 0:

@@ -103,10 +103,10 @@ def _add_cameras(add: AddOutput, path: Path, contents: Contents, *, overwrite: b
     if overwrite or not path.exists():
         add(path).write_bytes(viewer_cameras(cameras, names).encode())
     else:
-        refuse_other_cameras(path, cameras, names)
+        refuse_to_replace_cameras(path, cameras, names)
 
 
-def refuse_other_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool = False) -> None:
+def refuse_to_replace_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool = False) -> None:
     """Raise UsageError if a file has other cameras than these, to within rounding.
 
     With ``moved``, a run may still move these cameras, so poses are not compared.

@@ -240,10 +240,10 @@ def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, p
 
 
 def _fit_for_certain(load: Loaded, files: SceneFiles) -> bool:
-    """Return whether cameras fit for certain: rows are their pixels, or photos explain their views.
+    """Return whether cameras fit for certain, so that no others have to be tried.
 
-    If there are no other cameras, these need no proof by photos. Without photos, cameras in folders below the scene are
-    never certain; those beside it are if rows are their pixels, or if nothing is doubtful.
+    With photos, they do if rows are their pixels, if the photos explain their views, or if there are no others. Without
+    photos, they do if rows are their pixels or nothing is doubtful, but never if they lie in a folder below the scene.
     """
     if load.scene.images is None:
         return not files.below and (load.scene.has_own_pixels or not load.doubts)
@@ -292,10 +292,7 @@ def _note_left_out(load: Loaded, files: SceneFiles, names: list[str], cause: Sce
 
 
 def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Read the cameras and photos of a scene, and combine them with its Gaussians; return the error if they do not fit.
-
-    Without cameras, the scene has no views.
-    """
+    """Combine a scene's Gaussians with its cameras, if it has any, and photos; return the error if they do not fit."""
     camera_file = _read_or_error(partial(read_scene_cameras, ply, files))
     if camera_file is None:
         return _make_scene_without_views(ply, files, hints)
@@ -317,7 +314,7 @@ def _add_photos(
     if isinstance(proposal, Proposal) and proposal.by_names:
         files = replace(files, images=proposal.folder)
     inside = _read_or_error(partial(photos_inside, files, camera_file)) if photos and proposal is None else ()
-    error = next((photo_files for photo_files in (proposal, inside) if isinstance(photo_files, SceneError)), None)
+    error = next((value for value in (proposal, inside) if isinstance(value, SceneError)), None)
     if error is not None and ("images" in files.named or files.images == files.cameras):
         return error
     if isinstance(proposal, Proposal):
@@ -366,6 +363,7 @@ def _assign_photos(
     """
 
     def read(cameras: CameraFile, chosen: Sequence[Assignment | None]) -> Loaded | SceneError:
+        """Read the scene with the chosen photo of each camera."""
         return _read_or_error(
             lambda: _make_scene_with_views(ply, files, cameras, read_photos(proposal, chosen, cameras), hints)
         )
