@@ -64,14 +64,14 @@ def compact_files(
         read_at = perf_counter()
         result = compact_scene(load.scene, settings, progress)
         if len(result.gaussians) == 0:
-            nothing = "expected Gaussians that show something, found none that remains after merging"
-            raise SceneError(files.ply, nothing, "check its scales and opacities")
+            problem = "expected Gaussians that show something, found none that remains after merging"
+            raise SceneError(files.ply, problem, "check its scales and opacities")
         result = _pad_to_full(result) if outputs.options.columns == "full" else result
         compacted_at, results = perf_counter(), (result, *result.coarser)
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
         comments = result_comments(result.report.new_views, load.comments)
         contents = Contents(levels, comments, cameras, names, scene_title(files.ply))
-        level_files = add_outputs(add, outputs, temporary, contents)
+        level_files = add_outputs(add, outputs, temporary, contents)  # the first level is the result itself
         notes = [*format_notes(out, result.gaussians), *frame_notes(outputs, cameras), *doubt_changed(load.stats)]
         document = report_document(
             result.report, recognised=load.recognised, output_path=out,
