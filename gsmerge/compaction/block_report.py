@@ -1,4 +1,4 @@
-"""Scores of all blocks -> the report of the whole scene."""
+"""Make the report of a whole scene from the scores of all its blocks."""
 
 from __future__ import annotations
 
@@ -26,28 +26,30 @@ def join_reports(
     psnrs: Sequence[float | None],
     options: CompactOptions,
 ) -> CompactReport:
-    """Report on the whole scene: mean PSNR of the blocks weighted by views, sums of seconds, all notes.
+    """Make the report of the whole scene: its PSNR is the mean of the blocks, weighted by their views.
 
-    ``psnrs``: PSNR (dB) of the result on the photos of each block; None without photos.
+    ``psnrs`` has the PSNR (dB) of the result on the photos of each block, None without photos. Seconds and notes are
+    those of the current record. If the result may be worse than the input, both are scored again on all photos.
     """
-    run, sizes = current_record(), [len(start.block.own) for start in starts]
+    run, num_views = current_record(), [len(start.block.own) for start in starts]
 
     def mean(values: Sequence[float | None]) -> float | None:
+        """Return the mean of the blocks' values, weighted by their views; None if a block has none."""
         numbers = [value for value in values if value is not None]
-        return None if len(numbers) < len(values) else float(np.average(numbers, weights=sizes))
+        return None if len(numbers) < len(values) else float(np.average(numbers, weights=num_views))
 
     scored = sum(len(start.plan.scored_views) for start, psnr in zip(starts, psnrs, strict=True) if psnr is not None)
     before, after = mean([start.psnr_before for start in starts]), mean(psnrs)
     reference = None if before is None else starts[0].prepared.reference.name
     pictures = OWN_PHOTOS if reference == PHOTOS else reference
-    is_near = reference == PHOTOS and is_worse(before, after, SAMPLE_LOSS)
-    if is_near:  # all photos decide
+    may_be_worse = reference == PHOTOS and is_worse(before, after, SAMPLE_LOSS)
+    if may_be_worse:
         exact = evaluate(scene, {"result": gaussians}, options=EvaluateOptions(lpips=(), fog=False))
         before, after = (scores.mean("context")[scene.masks is not None].psnr for scores in exact.results)
     worse = None if pictures is None else describe_loss("the result", before, after, pictures)
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
         psnr_after=after, notes=[*run.notes, *([] if worse is None else [Doubt(worse)])],
-        choices=run.choices | {"scored_views": len(scene) if is_near else scored, "scored_all": is_near},
+        choices=run.choices | {"scored_views": len(scene) if may_be_worse else scored, "scored_all": may_be_worse},
         options=options.to_dict(), peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""A block of views -> its start: its views are merged, and the Gaussians that belong to the block are kept."""
+"""Start a block of views: merge its views, and keep the Gaussians that belong to the block."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class BlockStart:
     count: int  # Gaussians that the block is to have in the end
     prepared: Prepared  # Its views, without the Gaussians of their pixels
     plan: Plan
-    psnr_before: float | None  # Of the input on the scored photos, dB; None without photos
+    psnr_before: float | None  # PSNR (dB) of the input on the scored photos; None without photos
 
 
 def start_block(
@@ -50,9 +50,9 @@ def start_block(
 
 
 def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
-    """Return a mask ``[n]`` of means ``[n,3]`` whose owner is one of the block's own views.
+    """Return a mask ``[n]`` of the means ``[n,3]`` whose owner is one of the block's own views.
 
-    The owner is found among the views that share surfaces with the block.
+    Only views that share surfaces with the block can be owners here, since the others do not see these means.
     """
     is_candidate = covisibility.weights[list(block.own)].sum(0) > 0
     is_candidate[list(block.own)] = True
@@ -61,18 +61,20 @@ def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility
 
 
 def without_gaussians(prepared: Prepared) -> Prepared:
-    """Return a prepared scene without Gaussians and with photos in a file, to free their memory."""
-    moved: dict[int, np.ndarray] = {}  # arrays in files by the id of their photos, which both scenes may share
+    """Return a prepared scene without Gaussians, and with its photos in a file if they are large, to free memory."""
+    copies: dict[int, np.ndarray] = {}  # by the id of the photos, since both scenes may have the same
 
-    def move(images: np.ndarray) -> np.ndarray:
-        if id(images) not in moved:
-            moved[id(images)] = make_array(images.shape, images.dtype.type, IN_FILE)
-            moved[id(images)][:] = images
-            free_pages([moved[id(images)]])
-        return moved[id(images)]
+    def copy_photos(images: np.ndarray) -> np.ndarray:
+        """Copy photos into a file if they are large, once."""
+        if id(images) not in copies:
+            copies[id(images)] = make_array(images.shape, images.dtype.type, IN_FILE)
+            copies[id(images)][:] = images
+            free_pages([copies[id(images)]])
+        return copies[id(images)]
 
     def empty(scene: SceneT) -> SceneT:
-        images = move(np.asarray(scene.images))  # views with Gaussians of their own always have pictures
+        """Return a scene without its Gaussians and their pixels."""
+        images = copy_photos(np.asarray(scene.images))  # views with Gaussians of their own always have pictures
         return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixels=None)
 
     reference = replace(prepared.reference, photo_files=None)

@@ -1,4 +1,4 @@
-"""A scene of many views in blocks: each block is compacted alone and keeps its own Gaussians; then all are joined."""
+"""Compact a scene of many views in blocks: each block keeps its own Gaussians, and those of all blocks are joined."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.compaction.block_report import join_reports
 from gsmerge.compaction.block_start import BlockStart, start_block
 from gsmerge.compaction.costs import RunCosts
-from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
+from gsmerge.compaction.file_size import drop_to_bytes, measure_base
 from gsmerge.compaction.partition import (
     Block,
     Covisibility,
@@ -50,16 +50,16 @@ from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene
 
 T = TypeVar("T")
-# Most superpixels of a block, relative to compaction in one piece. A block takes more if views of other blocks see the
-# same surfaces
+# Most superpixels of a block, relative to compaction in one piece. A block takes more superpixels than one piece if
+# views of other blocks see its surfaces
 MOST_DENSITY = 2.0
-BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to an exact number; the faintest surplus is dropped
+BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to the requested number; the faintest are dropped at the end
 
 
 def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
-    """Cut the views of a scene into ``count`` blocks.
+    """Cut the views of a scene into ``count`` blocks; also return what each view sees of the others.
 
-    If ``count`` is automatic and comes from the number of views alone, there may be fewer blocks, down to one.
+    If only the number of views, not the user or the memory, asks for blocks, there may be fewer, down to one.
     """
     with stage("partition"):
         covisibility = measure_covisibility(scene.numpy())
@@ -92,6 +92,7 @@ def compact_in_blocks(
         shared = work.share(covisibility)
 
         def pieces() -> Iterator[tuple[Any, ...]]:
+            """Yield the arguments of :func:`start_block` for each block."""
             for block, factor in zip(blocks, factors, strict=True):
                 piece_options = block_options(options, scene, block, factor, limit)
                 piece = subset(scene, block.views)
@@ -130,11 +131,11 @@ def join_parts(parts: Sequence[Gaussians]) -> tuple[Gaussians, np.ndarray]:
 
 
 def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, count: int) -> list[RunPart]:
-    """Return the parts of a run in ``count`` blocks of equal costs: they are merged, then fitted, and then scored."""
+    """Return the parts of a run in ``count`` blocks, as if all cost the same: merge all, fit all, seams, score all."""
     steps, num_gaussians = 0 if choices.fit.fit == "none" else choices.fit.steps, choices.limits.default
     settings, view_pixels = choices.settings(options), scene.pixels_per_view
     costs = RunCosts(settings, view_pixels * len(scene), view_pixels, 1 / count, steps)
-    build, [scores] = costs.build(num_gaussians), costs.end([], None)
+    build, [scores] = costs.build_part(num_gaussians), costs.end_parts([], None)
     merged, fitted = RunPart(build.stages / count), RunPart(0.0, build.fits / count)
     seam_cost = 0.5  # of the fit of seams, as a share of the fits of all blocks
     seams = [RunPart(0.0, seam_cost * build.fits)] * (steps > 0)
@@ -142,32 +143,32 @@ def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, co
 
 
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
-    """Yield each value with the choices of its record; add the seconds and notes to the current record."""
+    """Yield each value with the choices of its record; add seconds, notes and left-out photos to the current record."""
     for value, record in outcomes:
         add_seconds(record.seconds)
         for text in record.notes:
             note(text)
-        if stray := record.choices.get("photos_left_out"):
-            record_choices(photos_left_out=[*current_record().choices.get("photos_left_out", ()), *stray])
+        if left_out := record.choices.get("photos_left_out"):
+            record_choices(photos_left_out=[*current_record().choices.get("photos_left_out", ()), *left_out])
         yield value, record.choices
 
 
 def each_start(starts: Sequence[BlockStart], *values: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the arguments of one call per block: its start, the ``values``, and its number; then free its files."""
+    """Yield the arguments of one call per block: its start, the ``values``, and its number; then free its memory."""
     for number, start in enumerate(starts):
         yield start, *values, number
         for scene in (start.prepared.scene, start.prepared.input_scene):
             free_scene(scene)
 
 
-def fit_block(start: BlockStart, everything: tuple[Gaussians, np.ndarray], growth: float, number: int) -> Gaussians:
-    """Fit all Gaussians that the views of a block may see; return the fitted Gaussians of block ``number``.
+def fit_block(start: BlockStart, shared_start: tuple[Gaussians, np.ndarray], growth: float, number: int) -> Gaussians:
+    """Fit all Gaussians that the views of a block may see; return the fitted Gaussians that the block owns.
 
-    ``everything``: canonical Gaussians of all blocks, and the block of each. ``growth``: final number of Gaussians
-    divided by the number at the start.
+    ``shared_start`` has the canonical Gaussians of all blocks, and the number of the block that owns each. ``growth``
+    is the final number of Gaussians divided by the number at the start. ``number`` is the number of the block.
     """
     begin_part()
-    (joined, owners), scene, plan = everything, start.prepared.scene, start.plan
+    (joined, owners), scene, plan = shared_start, start.prepared.scene, start.plan
     used = owners == number
     if plan.fit.fit != "none":
         used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution
@@ -191,7 +192,7 @@ def finish_joined(
     joined: Gaussians, cameras: Cameras, names: Sequence[str], frame: Frame, options: CompactOptions,
     choices: SceneChoices,
 ) -> Gaussians:  # fmt: skip
-    """Prune the canonical Gaussians of all blocks, move them into the world, and drop those beyond the budget."""
+    """Return the result: prune the canonical Gaussians of all blocks, move them into the world, and meet the budget."""
     limit = choices.limits.count
     if choices.fit.min_contribution > 0:
         joined = prune_joined(joined, frame.enter_cameras(cameras), options, limit)
@@ -202,12 +203,12 @@ def finish_joined(
         note(f"budget: {limit:,} Gaussians were asked for, {len(result):,} remain of those of all blocks")
     if (size := file_size(options.budget)) and size.packed:
         content = size.num_bytes, size.file, cameras, names
-        result = drop_to_bytes(result, *content, measure_rest(result, *content))
+        result = drop_to_bytes(result, *content, measure_base(result, *content))
     return result
 
 
 def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, limit: int | None) -> Gaussians:
-    """Drop the Gaussians that none of the ``cameras`` shows, except Gaussians that fill a budget of ``limit``."""
+    """Drop the Gaussians that none of the ``cameras`` shows, but keep some if a budget of ``limit`` has to be full."""
     seen, unseen = split_unseen(joined, cameras)
     room = len(unseen) if limit is None else limit - len(seen)
     unseen = unseen[: max(0, room) if options.budget.is_filled else 0]
@@ -232,9 +233,9 @@ def block_options(
 ) -> CompactOptions:
     """Return the options of a block: the scene's options, with ``factor`` times the block's share of the Gaussians.
 
-    Cameras and exposures stay fixed. The block also gets its share of all steps and of the first steps, which draw a
-    quarter of the pixels, so each view is fitted as often as in one piece. ``limit`` is the number of Gaussians of all
-    blocks together; None: ``superpixels`` and K decide.
+    Cameras and exposures stay fixed. The block gets its share of the steps of the fit, so each view is fitted as often
+    as in one piece. That also holds for the first steps, which draw a quarter of the pixels. ``limit`` is the number of
+    Gaussians of all blocks together; None: ``superpixels`` and K decide.
     """
     settings: dict[str, Any] = {**ONE_PIECE, "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))

@@ -1,10 +1,10 @@
-"""fitted -> candidate: Gaussians that were built for one count, in the world, with their score."""
+"""Fitted Gaussians -> candidate: the Gaussians in the world, with their PSNR."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from gsmerge.compaction.scores import covers_all, measure_renders, measure_result, written
+from gsmerge.compaction.scores import compares_all_pixels, measure_renders, measure_result, round_for_output
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import scene_depth
@@ -17,30 +17,30 @@ from gsmerge.types import Cameras, Gaussians
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Gaussians built for one count, with their score."""
+    """Gaussians built for one count, with their PSNR; a search compares several candidates."""
 
-    count: int | None  # Gaussians that were asked for; None: as many as `superpixels` and K give
+    count: int | None  # Number of Gaussians that was asked for; None: as many as `superpixels` and K give
     fitted: Fitted  # Fitted canonical Gaussians
-    gaussians: Gaussians  # The same in the world
+    gaussians: Gaussians  # The same Gaussians in the world
     cameras: Cameras  # The given views in the world; their poses are those of the fit
     psnr: float | None  # Mean PSNR (dB) of the scored views, against photos or renders of the input; None without views
     record: Record  # Seconds, choices and notes of building and scoring it
-    # PSNR (dB) that decides the count: over the pixels that the input covers, if it does not cover all
+    # PSNR (dB) that a search compares with its target: over the pixels that the input covers, if it does not cover all
     deciding_psnr: float | None = None
 
 
-def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
-    """Move canonical Gaussians into the world, and measure the PSNR."""
+def make_candidate(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
+    """Make a candidate of fitted canonical Gaussians: move them into the world, and measure their PSNR."""
     moved = with_moved_views(prepared, fitted.cameras)
     gaussians, cameras = moved.frame.leave(fitted.gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
-        _note_moves(prepared, cameras, plan)
+        _record_moves(prepared, cameras, plan)
     psnr, deciding_psnr = _measure_candidate(gaussians, moved, plan)
     return Candidate(count, fitted, gaussians, cameras, psnr, current_record(), deciding_psnr)
 
 
 def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
-    """Replace a candidate's Gaussians by all or some of them, and measure its PSNR again."""
+    """Return a candidate with ``gaussians``, which are all or some of its own, and measure their PSNR again."""
     with record_part(silent=True) as record:
         psnr, _ = _measure_candidate(gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan)
     choices = candidate.record.choices | record.choices
@@ -48,12 +48,12 @@ def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan
 
 
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tuple[float | None, float | None]:
-    """Measure two PSNR (dB) of Gaussians of the world: of the scored views, and the one that decides the count.
+    """Measure two PSNR (dB) of Gaussians of the world: the mean of the scored views, and the PSNR that a search uses.
 
-    Both are against photos, or against renders of the input if these stand for photos; None without either.
+    Both are measured against photos, or against renders of the input if these stand for photos; None without either.
     """
     if moved.reference.name == RENDERS:
-        fidelity = _measure_fidelity(moved.frame.enter(written(gaussians, plan)), moved, plan)
+        fidelity = _measure_fidelity(moved.frame.enter(round_for_output(gaussians, plan)), moved, plan)
         views, placed = len(plan.scored_views), moved.reference.placed
         record_choices(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
         return fidelity, fidelity
@@ -63,18 +63,24 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tup
     record_choices(
         scored_views=len(plan.scored_views), scored_all=not plan.samples and plan.scored_views == own_views(moved)
     )
-    return measured.psnr, measured.psnr if covers_all(plan.before) else measured.covered_psnr
+    return measured.psnr, measured.psnr if compares_all_pixels(plan.before) else measured.covered_psnr
 
 
 @stage("score")
 def _measure_fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
-    """Measure the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input, where it covers."""
+    """Measure the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input.
+
+    If the plan has the pixels that the input covers, only these count.
+    """
     measured = measure_renders(gaussians, prepared, plan)
     return measured.psnr if plan.covered is None else measured.covered_psnr
 
 
 def with_moved_views(prepared: Prepared, cameras: Cameras) -> Prepared:
-    """Move the input views to the canonical ``cameras`` of a fit; return the scene unchanged if the fit moved none."""
+    """Return the scene with all views at the canonical ``cameras`` of a fit.
+
+    The input's views follow in the world. Their cameras stay the same object if the fit moved none.
+    """
     prepared = prepared.with_cameras(cameras)
     final = prepared.final_cameras()
     if final is prepared.input_scene.cameras:
@@ -82,8 +88,8 @@ def with_moved_views(prepared: Prepared, cameras: Cameras) -> Prepared:
     return replace(prepared, input_scene=replace(prepared.input_scene, cameras=final))
 
 
-def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
-    """Add a note on how far each camera was moved."""
+def _record_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
+    """Record how far the fit moved each camera of the world, and add a note."""
     input_scene = prepared.input_scene
     cause = "poses are free" if plan.free_poses else "the photos of some views agree only under other poses"
     depth = scene_depth(prepared.scene) * prepared.frame.unit

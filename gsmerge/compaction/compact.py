@@ -1,6 +1,6 @@
-"""The top: compact a scene in one piece or in blocks.
+"""Compact a scene in memory: in one piece, or in blocks of views.
 
-In one piece it is built once for one number of Gaussians, or several times until a quality is met.
+In one piece, a result is built once if its number of Gaussians is known, or several times until a quality is met.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from weakref import ReferenceType, ref
 
 import numpy as np
 
-from gsmerge.compaction.candidate import Candidate, score
+from gsmerge.compaction.candidate import Candidate, make_candidate
 from gsmerge.compaction.costs import CountChoice, RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.file_size import Rebuild, meet_bytes
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import can_try, try_new_views
 from gsmerge.compaction.result import CompactResult, make_result
-from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, search_count
+from gsmerge.compaction.search import CountSearch, add_target, build_left_out, search_count
 from gsmerge.errors import Doubt, DoubtWarning, TargetError
+from gsmerge.facts.counts import level_counts
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
@@ -50,13 +51,14 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
-# Changes of the options that are tried in this order if a result is worse than its input, with words for a note
+# If a result is clearly worse than its input, the scene is compacted again with one of these changes of the options, in
+# this order. The words are for a note
 SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
     ("with the scene's own colours in place of the photos", lambda o: o.with_settings({"look": "scene"})),
     ("without a fit", lambda o: o.with_settings({"fit": "none"})),
     ("with more Gaussians", lambda o: replace(o, budget=replace(o.budget, keep=True))),
 )
-SURPLUS = 1.05  # The requested count has to remain after clean-up, so this many times more are built
+SURPLUS = 1.05  # Gaussians that are built, relative to the number that has to remain after clean-up
 
 
 @check_arguments
@@ -91,9 +93,9 @@ def compact(
 
 
 def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Progress | None = None) -> CompactResult:
-    """Replace a scene by a compact one as :func:`compact` does, without Python's warnings: the report has them."""
+    """Replace a scene by a compact one as :func:`compact` does, but leave doubts to the report: no Python warnings."""
     with use_threads(options.threads), record_run(progress):
-        # a reference, so that the result does not keep the scene in memory
+        # a weak reference, so that the result does not keep the scene in memory
         source: StrPath | ReferenceType[Scene] = scene if isinstance(scene, str | PathLike) else ref(scene)
         scene = as_scene(scene)
         if options.clean.crop is not None:
@@ -107,14 +109,15 @@ def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Pro
 
 
 def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult) -> CompactResult:
-    """Compact a scene again in simpler ways, each with a note, until the result is not worse than its input.
+    """Compact a scene again with one change of ``SIMPLER`` after another, until a result is not clearly worse.
 
-    ``result``: the first result, which is worse. Raises TargetError if all of them are.
+    ``result`` is the first result, which is clearly worse than its input. A note says what was changed. Raises
+    TargetError if all results are clearly worse.
     """
     cause = result.report.worse
     for words, change in SIMPLER:
         simpler = change(options)
-        if simpler == options:
+        if simpler == options:  # the first result was made like this
             continue
         with record_part():
             note(Doubt(f"{cause}; so it was made again {words}"))
@@ -139,17 +142,22 @@ def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
         blocks, covisibility = cut_views(scene, options, num_blocks)
         if len(blocks) > 1:
             return compact_in_blocks(scene, options, choose_for_scene(size, options), blocks, covisibility)
-    method = choose_method(options, scene)  # ours, ours for scenes without cameras, or a baseline
-    prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses
+    method = choose_method(options, scene)  # our own, or that of another package
+    prepared = method.prepare(scene.numpy(), options.prepare)  # adds the frame, corrected photos and poses
     return compact_prepared(prepared, method, options).to(scene.gaussians.device)
 
 
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
-    """Compact a prepared scene with a method: plan, search, levels of detail, trial, result."""
-    plan = make_plan(prepared, options)  # options end here
+    """Compact a prepared scene with a method, in one piece.
+
+    A search finds the number of Gaussians, unless the options state it, and builds the result. Then its coarser levels
+    are built, a trial measures what new views gain, and the input is scored for the report.
+    """
+    plan = make_plan(prepared, options)  # from here on, the plan replaces the options
     plan = add_target(plan, prepared)
 
     def rebuild(count: int | None) -> Candidate:
+        """Build a candidate after those of the search."""
         candidate = build_scored(method.build, prepared, plan, count)
         add_seconds(candidate.record.seconds)  # in addition to those of the search
         return candidate
@@ -158,20 +166,21 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     has_target, has_curve = plan.target_psnr is not None, plan.auto_count or plan.max_drop is not None
     choice = CountChoice(has_target, has_curve, plan.max_drop, rendered=prepared.reference.name == RENDERS)
     expect_parts(expected_parts(costs, plan.limits, plan.limits.default, choice, has_trial=has_trial))
-    search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
+    search = search_count(prepared, plan, method.build)
     best = run_search(search, method.build, rebuild, prepared)
     best = meet_bytes(best, rebuild, prepared, plan)
-    fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
-    counts = level_counts(len(best.gaussians), plan)
-    expect_parts(costs.end(counts, costs.trial(len(best.gaussians)) if has_trial else None))
-    levels = [build_scored(method.build, *fixed, count) for count in counts]
+    # coarser levels keep the cameras that the result has
+    level_start = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
+    counts = level_counts(len(best.gaussians), plan.levels, plan.limits.min_count)
+    expect_parts(costs.end_parts(counts, costs.trial_part(len(best.gaussians)) if has_trial else None))
+    levels = [build_scored(method.build, *level_start, count) for count in counts]
     trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
-    begin_part()
+    begin_part()  # the last part, which scores the input
     return make_result(best, levels, prepared, plan, search.facts(best), trial)
 
 
 def measure_costs(prepared: Prepared, plan: Plan) -> RunCosts:
-    """Return the facts about a run from which the costs of its parts follow."""
+    """Return the facts about a run in one piece from which the costs of its parts follow."""
     scene, steps = prepared.scene, 0 if plan.fit.fit == "none" else plan.fit.steps
     settings = plan.settings | ({} if plan.checkpoint else {"checkpoint": "none"})
     num_pixels = max(scene.pixels_per_view * len(scene), len(scene.gaussians))
@@ -195,7 +204,7 @@ def run_search(search: CountSearch, build: Build, rebuild: Rebuild, prepared: Pr
 
 
 def find_count(scene: Scene, options: CompactOptions) -> int:
-    """Find the number of Gaussians that a run makes of a scene without cameras if a PSNR decides it."""
+    """Search for the number of Gaussians of a scene without cameras as a run does, if a PSNR decides it; return it."""
     with use_threads(options.threads), record_part(silent=True):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
@@ -209,32 +218,33 @@ def find_count(scene: Scene, options: CompactOptions) -> int:
 def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
     begin_part()
-    return score(count, build_cleaned(build, prepared, plan, count), prepared, plan)
+    return make_candidate(count, build_cleaned(build, prepared, plan, count), prepared, plan)
 
 
 @record_part()
 def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
     """Clean up a candidate of a search without clean-up, and score it again."""
     adopt(candidate.record)
-    gaussians, dropped = _clean(candidate.fitted, prepared, plan)
-    _note_clean(dropped, len(gaussians), None, prepared)
-    return score(None, replace(candidate.fitted, gaussians=gaussians), prepared, plan)
+    gaussians, dropped = _clean_fitted(candidate.fitted, prepared, plan)
+    _record_dropped(dropped, len(gaussians), None, prepared)
+    return make_candidate(None, replace(candidate.fitted, gaussians=gaussians), prepared, plan)
 
 
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build Gaussians and clean them up, so that exactly ``count`` remain if the scene has that many.
 
-    More Gaussians than ``count`` are built. If fewer remain after clean-up, they are built once more, with a surplus by
-    the share that remained. The faintest surplus is dropped.
+    More Gaussians than ``count`` are built. If too few remain after clean-up, all are built once more, with a surplus
+    that makes up for the share that was dropped. If too many remain, the faintest are dropped.
     """
     if not plan.clean.asked:
         return build(prepared, plan, count)
     from gsmerge.stages.clean import faintest_dropped
 
     def build_once(built_count: int | None) -> tuple[Fitted, dict[str, int], Record]:
+        """Build and clean once; return the result, the dropped Gaussians by reason, and the record of both."""
         with record_part() as record:
             fitted = build(prepared, plan, built_count)
-            gaussians, dropped = _clean(fitted, prepared, plan)
+            gaussians, dropped = _clean_fitted(fitted, prepared, plan)
         add_seconds(record.seconds)
         return replace(fitted, gaussians=gaussians), dropped, record
 
@@ -242,32 +252,33 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
     first_count = None if count is None else min(max_count, math.ceil(SURPLUS * count))
     fitted, dropped, record = build_once(first_count)
     if count is not None and first_count is not None and len(fitted.gaussians) < count and first_count < max_count:
-        share = SURPLUS * count / max(1, len(fitted.gaussians))
-        fitted, dropped, record = build_once(min(max_count, math.ceil(share * first_count)))
+        factor = SURPLUS * count / max(1, len(fitted.gaussians))
+        fitted, dropped, record = build_once(min(max_count, math.ceil(factor * first_count)))
     gaussians = fitted.gaussians
     if count is not None and len(gaussians) > count:
         gaussians, dropped = faintest_dropped(gaussians, count), dropped | {"surplus": len(gaussians) - count}
     adopt(record)
-    _note_clean(dropped, len(gaussians), count, prepared)
+    _record_dropped(dropped, len(gaussians), count, prepared)
     return replace(fitted, gaussians=gaussians)
 
 
-def _clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gaussians, dict[str, int]]:
+def _clean_fitted(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gaussians, dict[str, int]]:
     """Clean up fitted Gaussians; return the remaining Gaussians, and the number of dropped Gaussians by reason."""
     from gsmerge.stages.clean import clean
 
-    # the few cameras placed for scores do not show all of the scene; without cameras, `clean` places more
+    # The few cameras that are placed for scores do not show all of the scene. Without cameras, `clean` places more
     cameras = None if prepared.reference.placed else fitted.cameras[sorted({*prepared.repeated})]
     rows, dropped = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
     return fitted.gaussians[rows], dropped
 
 
-def _note_clean(dropped: dict[str, int], remaining: int, count: int | None, prepared: Prepared) -> None:
-    """Note which Gaussians clean-up dropped, and whether fewer than ``count`` remain."""
+def _record_dropped(dropped: dict[str, int], remaining: int, count: int | None, prepared: Prepared) -> None:
+    """Record how many Gaussians clean-up dropped for which reason, with a note; note if fewer than ``count`` remain."""
     from gsmerge.stages.clean import describe_counts
 
     record_choices(clean=dropped)
-    # the scene itself was cropped before: Gaussians count as cropped here if the fit moved them over the border
+    # The run has cropped its input. Gaussians are only cropped here if the fit moved them over the border, so a zero
+    # is not worth a note
     shown = {name: number for name, number in dropped.items() if number or name != "cropped"}
     if shown:
         note(f"left out by clean-up: {describe_counts(shown, placed=prepared.reference.placed)}")

@@ -1,4 +1,4 @@
-"""Convert files of Gaussians from format to format without a fit: join, clean, place and write them."""
+"""Convert files of Gaussians from format to format without a fit; they may be joined, cleaned and moved."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from gsmerge.compaction.outputs import Outputs, frame_notes, write_outputs
-from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
+from gsmerge.compaction.placement import NUM_FULL, find_placement, move_to_frame, pad_harmonics
 from gsmerge.errors import Doubt, SceneError, UsageError, name_notes
-from gsmerge.facts.counts import LEVEL_FACTOR, STREAMED_LEVELS
+from gsmerge.facts.counts import STREAMED_LEVELS, level_counts
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.io import GaussianFile, file_notes, read_cameras, read_gaussians
@@ -42,10 +42,10 @@ from gsmerge.types import NO_CAMERAS, Gaussians, StrPath, make_scene
 class ConvertOptions:
     """Files to convert, how to read them, and what to do with them."""
 
-    inputs: Sequence[Path]  # Several inputs are joined in their order
+    inputs: Sequence[Path]  # Several inputs are joined in this order
     outputs: Outputs
-    cameras: StrPath | None = None  # In the frame of the first input; None: the cameras inside or beside a result
-    images: StrPath | None = None  # Photos of these cameras, to find the sky
+    cameras: StrPath | None = None  # In the frame of the first input; None: those of this input if it is a result
+    images: StrPath | None = None  # Photos of these cameras, which show where the sky is
     opacity: OpacityChoice = "auto"
     scales: ScaleChoice = "auto"
     colors: ColorChoice = "auto"
@@ -67,16 +67,16 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
             files.append(read_gaussians(path, opacity=options.opacity, scales=options.scales, colors=options.colors))
         # a selection of all rows would be a copy
         gaussians = join_gaussians([f.gaussians if f.valid.all() else f.gaussians[f.valid] for f in files])
-        stored, unread = _read_cameras(options)
+        stored, camera_notes = _find_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
         count = len(gaussians)
-        rows, dropped = _clean(gaussians, options, stored)
+        rows, dropped = _clean_joined(gaussians, options, stored)
         gaussians = gaussians if len(rows) == count else gaussians[rows]
         if len(gaussians) == 0:
             problem = f"expected Gaussians that are kept, found none of {count:,}"
             raise SceneError(options.inputs[0], problem, "find the extent of the scene with gsmerge inspect")
         frame = find_placement(options.placement, cameras, upward_axis(files[0].info.comments))
-        gaussians, moved = place(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
+        gaussians, moved = move_to_frame(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
         largest = max(float(np.abs(gaussians.means).max()), float(gaussians.scales.max()))
         if options.placement.moves and not 1e-30 < largest < 1e30:  # numbers in files have 32 bits
             problem = f"expected coordinates of 1e-30 to 1e30, the largest would be {largest:.0e}"
@@ -85,9 +85,9 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     infos = [file.info for file in files]
     columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
     columns = columns[rows]
-    of_files = [*zip(options.inputs, map(file_notes, infos), strict=True)]
-    notes = [*of_files[0][1]] if len(files) == 1 else [n for path, ns in of_files for n in name_notes(path.name, ns)]
-    notes += [*unread, *describe_extra_columns(columns, missing, format_, moves=options.placement.moves)]
+    named_notes = [name_notes(path.name, file_notes(info)) for path, info in zip(options.inputs, infos, strict=True)]
+    notes = [*file_notes(infos[0])] if len(files) == 1 else [*chain(*named_notes)]
+    notes += [*camera_notes, *describe_extra_columns(columns, missing, format_, moves=options.placement.moves)]
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, dropped["unseen"], count, None if stored is None else stored.path)
     names = () if stored is None else stored.names
@@ -98,25 +98,25 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {outputs.result.name}", steps - 1, steps)
     levels = [gaussians]
-    while format_.levels == "inside" and len(levels) < STREAMED_LEVELS and len(levels[-1]) >= LEVEL_FACTOR:
-        levels.append(merge_neighbors(levels[-1], len(levels[-1]) // LEVEL_FACTOR))
+    for level_count in level_counts(len(gaussians), STREAMED_LEVELS) if format_.levels == "inside" else ():
+        levels.append(merge_neighbors(levels[-1], level_count))
     notes += frame_notes(outputs, moved)
     contents = Contents(levels, comments, moved, names, scene_title(options.inputs[0]), extra_columns=columns)
     num_bytes, camera_path = write_outputs(outputs, contents), outputs.viewer_cameras if len(moved) else None
     facts = {"path": str(outputs.result), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
     inputs = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     input_cameras = None if stored is None else str(stored.path)
-    old = viewer_cameras_path(outputs.result)
-    if camera_path is None and not format_.has_cameras and old.is_file():
-        notes.append(f"{old} is of an earlier file of that name, not of this one: delete it")
+    earlier_cameras = viewer_cameras_path(outputs.result)
+    if camera_path is None and not format_.has_cameras and earlier_cameras.is_file():
+        notes.append(f"{earlier_cameras} is of an earlier file of that name, not of this one: delete it")
     document = document_head() | {"inputs": inputs, "cameras": input_cameras, "dropped": dropped, "output": facts}
     return document | {"viewer_cameras": camera_path and str(camera_path), **note_entries(notes)}
 
 
 def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -> tuple[list[str], list[str]]:
-    """Return the header comments that all files share, and notes on the comments that are lost.
+    """Return the header comments that all files share, and notes on the comments that the output will lack.
 
-    ``moves``: the scene is moved, so comments on its frame are no longer true.
+    If the scene moves, comments on its frame are no longer true, and are left out.
     """
     file_comments = [
         [comment for comment in kept_comments(info) if not (moves and is_of_frame(comment))] for info in infos
@@ -130,7 +130,7 @@ def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -
 
 
 def conversion_line(document: dict[str, Any]) -> str:
-    """Describe a conversion in one line of text."""
+    """Describe the document of :func:`convert_files` in one line of text."""
     before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
     total = "" if after["num_gaussians"] == before and not document["dropped"] else f" of {before:,}"
     reasons = describe_counts(document["dropped"], placed=document["cameras"] is None)
@@ -144,8 +144,8 @@ def conversion_line(document: dict[str, Any]) -> str:
 def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: StrPath | None) -> list[str]:
     """Return a note for ``--drop unseen`` if its views were placed, or see less than half of the Gaussians."""
     if cameras is None:
-        beside = None if options.cameras == NONE else find_scene_files(options.inputs[0]).cameras
-        remedy = "" if options.cameras == NONE else f"; name them with --cameras {beside or 'FILE'}"
+        likely = None if options.cameras == NONE else find_scene_files(options.inputs[0]).cameras
+        remedy = "" if options.cameras == NONE else f"; name them with --cameras {likely or 'FILE'}"
         return [f"drop unseen: without cameras, views are placed around and inside the scene{remedy}"]
     if 2 * unseen > count:
         share = f"{100 * unseen / count:.0f} % of the Gaussians"
@@ -154,15 +154,15 @@ def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: Str
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
-    """Join Gaussians of the same world frame; missing harmonics become zeros."""
+    """Join Gaussians of one world frame; those of a lower degree get harmonics of zero."""
     num_higher = max(gaussians.shN.shape[1] for gaussians in parts)
     return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
 
 
-def _read_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]]:
-    """Read the cameras; also return notes.
+def _find_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]]:
+    """Return the cameras that were named, or else those of the first input if it is a result; also return notes.
 
-    If a camera file beside the first input was not named and cannot be read, it is left out with a note.
+    Cameras beside the input that were not named are left out with a note if they cannot be read.
     """
     named, first_input = options.cameras, options.inputs[0]
     path = result_cameras(first_input) if named is None else named_path(named)
@@ -175,10 +175,10 @@ def _read_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]
         return None, [Doubt(text)]
 
 
-def _clean(
+def _clean_joined(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[np.ndarray, dict[str, int]]:
-    """Crop the Gaussians and drop unwanted ones; return the remaining rows, and numbers of dropped ones by reason."""
+    """Crop the Gaussians and drop what the options name; return the rows that remain, and how many were dropped why."""
     drops = options.clean.drops
     if not {"sky", "unseen"} & set(drops) or len(gaussians) == 0:
         return clean(gaussians, options.clean, None, None, lambda g: g)

@@ -1,6 +1,7 @@
-"""Processor seconds of a run and of its parts: an estimate before the run adds them up, and its progress weighs them.
+"""Estimate the processor seconds of a run and of its parts.
 
-They are means of whole runs, on any settings, and right within a factor of about two.
+The time that ``inspect`` and ``--dry-run`` show is their sum, and the progress of a run follows their ratios. The costs
+below are means of whole runs with any settings. The estimates are right within a factor of about two.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.compaction.curve import curve_counts
-from gsmerge.facts.counts import LEVEL_FACTOR, CountLimits
+from gsmerge.facts.counts import CountLimits, level_counts
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.runtime.record import RunPart
 from gsmerge.settings.compact import OURS
@@ -31,10 +32,10 @@ COST_SLOW = {"greedy": 25.0, "splat-transform": 60.0}  # in addition
 COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.25  # per million Gaussians that it draws
 THREAD_GAIN = 0.35  # speed of each thread after the first, relative to the first
-TRIAL_SHARE = 0.25  # of the trial that estimates new views, as a share of building the result
-# Counts that a search usually builds, by photos and by renders of the input
+TRIAL_SHARE = 0.25  # cost of the trial that estimates new views, as a share of building the result
+# Candidates that a search usually builds: if they are scored on photos, and on renders of the input
 USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
-INSIDE_GAUSSIANS = 10_000  # from which the mean share inside a view is estimated
+INSIDE_GAUSSIANS = 10_000  # sample of Gaussians for the mean share that lies inside a view
 PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
 
 
@@ -44,14 +45,14 @@ class RunCosts:
 
     settings: Mapping[str, Any]  # All settings by flat name, with the networks in use
     num_pixels: int  # Of all views together, or the number of Gaussians if that is larger
-    view_pixels: float
+    view_pixels: float  # Pixels of one view
     inside: float  # Share of the result's Gaussians that a view draws
-    steps: int  # Of a fit; 0 without
-    merges_pairs: bool = False
+    steps: int  # Steps of a fit; 0 without a fit
+    merges_pairs: bool = False  # Neighbours are merged pair by pair, instead of superpixels
     is_placed: bool = False  # The views are placed, since the scene has none
 
-    def build(self, count: float, steps: int | None = None) -> RunPart:
-        """Return the part that builds ``count`` Gaussians, with a fit of ``steps`` (None: as the run)."""
+    def build_part(self, count: float, steps: int | None = None) -> RunPart:
+        """Return the part that builds ``count`` Gaussians, with a fit of ``steps`` (None: of the run's steps)."""
         settings, steps = self.settings, self.steps if steps is None else steps
         method = settings["method"]
         work = COST_PAIRS if self.merges_pairs else COST_BUILD
@@ -62,14 +63,14 @@ class RunCosts:
         step = COST_STEP * view_pixels + COST_DRAWN * self.inside * count
         return RunPart(self.num_pixels * work / 1e6, steps * step / 1e6)
 
-    def end(self, counts: Sequence[float], trial: RunPart | None) -> list[RunPart]:
+    def end_parts(self, counts: Sequence[float], trial: RunPart | None) -> list[RunPart]:
         """Return the parts that follow a result: levels of ``counts`` Gaussians, a trial, the scores of the input."""
-        work = COST_PLACED if self.is_placed else COST_INPUT
-        return [*map(self.build, counts), *([] if trial is None else [trial]), RunPart(self.num_pixels * work / 1e6)]
+        scores = RunPart(self.num_pixels * (COST_PLACED if self.is_placed else COST_INPUT) / 1e6)
+        return [*map(self.build_part, counts), *([] if trial is None else [trial]), scores]
 
-    def trial(self, count: float) -> RunPart:
-        """Return the part of the trial that estimates new views of ``count`` Gaussians, in two rounds."""
-        build = self.build(count)
+    def trial_part(self, count: float) -> RunPart:
+        """Return the part that estimates new views of a result of ``count`` Gaussians by a trial, in two rounds."""
+        build = self.build_part(count)
         return RunPart(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)
 
     def seconds(self, parts: Sequence[RunPart], num_views: int, threads: int) -> float:
@@ -82,10 +83,10 @@ class RunCosts:
 class CountChoice:
     """How a run chooses the number of Gaussians; by default, the options state it."""
 
-    has_target: bool = False  # Numbers are tried until a PSNR is met
-    has_curve: bool = False  # The scene's curve is measured first, unless a PSNR has to be met
-    max_drop: float | None = None  # Largest loss (dB) that is searched for on the curve; None: its knee
-    rendered: bool = False  # Renders of the input stand for photos, which a curve needs
+    has_target: bool = False  # Several candidates are built until one reaches a PSNR
+    has_curve: bool = False  # The scene's curve decides, unless ``has_target`` or ``rendered``
+    max_drop: float | None = None  # Largest loss of quality (dB) that is allowed on the curve; None: the knee decides
+    rendered: bool = False  # Renders of the input stand for photos, so there is no curve
 
 
 def mean_inside(scene: Scene) -> float:
@@ -94,15 +95,26 @@ def mean_inside(scene: Scene) -> float:
 
 
 def expected_parts(
-    costs: RunCosts, limits: CountLimits, count: float, choice: CountChoice, *, has_trial: bool
+    costs: RunCosts, limits: CountLimits, count: int, choice: CountChoice, *, has_trial: bool
 ) -> list[RunPart]:
-    """Return the parts of a run for a result of ``count`` Gaussians; ``has_trial``: a trial estimates new views."""
+    """Return the parts that a run is expected to have before it starts, in their order, each with its seconds.
+
+    First come the fits of a curve, if there is one, then the builds of the result, or of all candidates of a search.
+    The parts of :meth:`RunCosts.end_parts` follow.
+
+    Args:
+        costs: Facts about the run.
+        limits: Limits on the number of Gaussians.
+        count: Gaussians of the result, as far as they are known.
+        choice: How the run chooses the number of Gaussians.
+        has_trial: Whether a trial estimates new views.
+    """
     builds = 1
     if choice.has_target:
         builds = USUAL_BUILDS_OF_RENDERS if choice.rendered else USUAL_BUILDS
-    parts = [costs.build(count)] * builds
+    parts = [costs.build_part(count)] * builds
     if choice.has_curve and not (choice.has_target or choice.rendered):
         counts, steps = curve_counts(choice.max_drop, limits.default, limits.min_count, limits.max_count)
-        parts = [*(costs.build(tried, steps) for tried in counts), *parts]
-    coarser = [count / LEVEL_FACTOR**level for level in range(1, costs.settings["levels"])]
-    return [*parts, *costs.end(coarser, costs.trial(count) if has_trial else None)]
+        parts = [*(costs.build_part(point_count, steps) for point_count in counts), *parts]
+    coarser = level_counts(count, costs.settings["levels"], limits.min_count)
+    return [*parts, *costs.end_parts(coarser, costs.trial_part(count) if has_trial else None)]

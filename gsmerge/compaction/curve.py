@@ -1,6 +1,7 @@
-"""The scene's curve: quality by number of Gaussians, measured by short fits; its knee, and the fewest near its best.
+"""Measure the scene's curve, which is the quality of short fits by their number of Gaussians, and choose a number.
 
-The quality is measured on photos that the fits leave out, or, with too few photos, on patches that they leave out.
+The quality is measured on photos that the fits leave out. With too few photos, it is measured on patches of photos that
+they leave out. The number is at the knee of the curve, or the smallest that is good enough.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians
 
 PROGRESS = "curve: what each count brings"
-SSIM_DB = 40.0  # dB equal to 1 of SSIM; SSIM counts, because 1 % of the Gaussians may beat 4 % in PSNR and still blur
+SSIM_DB = 40.0  # dB that equal 1 of SSIM. SSIM is needed, because 1 % of the Gaussians may beat 4 % in PSNR but blur
 KNEE_SLOPE = 0.15  # dB of quality per doubling of the count; below it, more Gaussians gain too little
 
 
@@ -45,13 +46,13 @@ class CurvePoint:
 
 
 def curve_counts(max_drop: float | None, usual: int, least: int, most: int) -> tuple[list[int], int]:
-    """Return rising counts for measuring a curve, within ``least`` and ``most``, and the steps of its short fits.
+    """Return the counts to measure a curve at, rising from ``least`` to ``most``, and the steps of its short fits.
 
-    ``max_drop``: largest loss of quality, dB, that is searched for; None: the knee.
+    ``max_drop`` is the largest loss of quality (dB) that the curve has to show; None: it has to show the knee.
     """
-    shares, steps = [1 / 8, 1 / 4, 1 / 2, 1.0], 60  # of the usual count; enough to find the knee
+    shares, steps = [1 / 8, 1 / 4, 1 / 2, 1.0], 60  # shares of the usual count; this is enough to find the knee
     if max_drop is not None:
-        shares, steps = [1 / 16, *shares, 2.0], 300  # tenths of a dB count on clean scenes
+        shares, steps = [1 / 16, *shares, 2.0], 300  # a loss may be a tenth of a dB, which shorter fits do not show
     return sorted({min(max(round(usual * share), least), most) for share in shares}), steps
 
 
@@ -60,8 +61,8 @@ def measure_curve(
 ) -> list[CurvePoint]:
     """Measure PSNR and SSIM, at full size, of fits with each of the ``counts``.
 
-    Every fit takes ``steps``, whatever the plan says. It is scored on the photos of ``left_out``; without them, on
-    patches that the fit leaves out.
+    Every fit takes ``steps`` steps, whatever the plan says. It is scored on the photos of ``left_out``; without them,
+    on patches of all photos that the fit leaves out.
     """
     holdout = 0.1  # share of the photos' patches that the fits leave out
     short = replace(
@@ -75,7 +76,7 @@ def measure_curve(
         seen = np.flatnonzero(left_out.shares > LEAST_SEEN).tolist()
         photos, weights = left_out.photos[seen], [1 - mask.astype(np.float32) for mask in left_out.seen[seen]]
         prepared, plan, min_gain = left_out.rest, left_out.plan(plan), math.inf
-    short_plan = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())  # the fit adds no Gaussians
+    short_plan = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())
     points: list[CurvePoint] = []
     report_progress(PROGRESS, 0, len(counts))
     for count in counts:
@@ -90,15 +91,18 @@ def measure_curve(
 def _score_fit(
     count: int, gaussians: Gaussians, photos: Photos, weights: list[np.ndarray], min_gain: float
 ) -> CurvePoint:
-    """Score Gaussians on the pixels of photos that have no weight in the fit."""
+    """Score Gaussians on those pixels of the photos that have a weight of 0, since the fit left them out."""
     images = [np.clip(image, 0, 1) for image in render_photos(gaussians, photos)]
     views = range(len(photos))
-    similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], weights[v] == 0), views)
-    return CurvePoint(count, holdout_psnr(images, photos, weights, min_gain), float(np.mean(similar)))
+    similarities = parallel_map(lambda v: _measure_ssim(images[v], photos.images[v], weights[v] == 0), views)
+    return CurvePoint(count, holdout_psnr(images, photos, weights, min_gain), float(np.mean(similarities)))
 
 
-def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float:
-    """Return SSIM over the windows inside the mask; over the whole picture if there are none; 0 if it is too small."""
+def _measure_ssim(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float:
+    """Return the SSIM over the windows inside the mask, or over the whole picture if no window lies inside.
+
+    0 for a picture smaller than a window.
+    """
     if min(mask.shape) < WINDOW:
         return 0.0
     border = WINDOW // 2
@@ -108,14 +112,17 @@ def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float
 def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
     """Return the fewest Gaussians whose quality lies at most ``max_drop`` dB below the best of the curve.
 
-    Points come by rising count. Between them the quality is linear in the logarithm of the count.
+    The points are sorted by count.
     """
     best = max(point.quality for point in points)
     return count_reaching([(point.count, point.quality) for point in points], best - max_drop)
 
 
 def count_reaching(points: Sequence[tuple[int, float]], target: float) -> int:
-    """Return the fewest Gaussians at which a curve of (count, quality) reaches ``target``; one of its points does."""
+    """Return the fewest Gaussians at which a curve of points (count, quality), sorted by count, reaches ``target``.
+
+    Between two points the quality is linear in the logarithm of the count. At least one point has to reach the target.
+    """
     index = next(i for i, (_, quality) in enumerate(points) if quality >= target)
     if index == 0:
         return points[0][0]
@@ -126,9 +133,9 @@ def count_reaching(points: Sequence[tuple[int, float]], target: float) -> int:
 def curve_knee(points: Sequence[CurvePoint]) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
-    The knee is the last count at which the quality grows by at least 0.15 dB per doubling of the count. The slope in
-    the middle of two neighbouring points is the slope of the line between them. Between the middles the slope is
-    linear. Points come by rising count.
+    This knee is the last count at which the quality grows by at least 0.15 dB per doubling of the count. Halfway
+    between two neighbouring points, the slope is that of the line through them. It is linear between these places. The
+    points are sorted by count.
     """
     doublings = [float(log(p.count) / log(2)) for p in points]
     pairs = list(pairwise(range(len(points))))

@@ -1,7 +1,7 @@
-"""Result -> whether it lies far from its input in pictures that no fit has seen.
+"""Measure whether a result differs too much from its input in pictures that no fit has seen.
 
-Photos tell how far the input is from the truth. A result that is farther from the input than twice that is farther from
-the truth than the input is, by the triangle inequality. The cause may be one that no rule foresees.
+Photos show how far the input is from the truth. If a result is more than twice as far from the input, it is farther
+from the truth than the input, by the triangle inequality. So this finds bad results whatever their cause is.
 """
 
 from __future__ import annotations
@@ -21,17 +21,20 @@ from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.types import Cameras, Gaussians
 
-WRONG_DB = 20.0  # dB, which is a tenth of the range of colours (root mean square); from there on pictures look right
-TWICE_DB = decibels(1 / 4)  # dB between two distances of which one is twice the other
-# Gaussians that represent the input, pixels of the longer side, and standard deviation of a blur, pixels, by which
-# noise of the Gaussians hardly counts. On fifteen captures a result is .2 dB or more nearer to its input than the input
-# to its photos, and .03 s tell that
+WRONG_DB = 20.0  # PSNR below which pictures look wrong; errors are then a tenth of the range of colours
+TWICE_DB = decibels(1 / 4)  # dB between two errors of which one is twice the other (root mean square)
+# A sample of so many Gaussians stands for the input. It is drawn with so many pixels on the longer side. Pictures are
+# blurred by this standard deviation (pixels), so that noise of single Gaussians hardly counts. On fifteen captures all
+# results are nearer to their input than the input to its photos, by .2 dB or more; measuring takes .03 s
 DISTANCE_GAUSSIANS, DISTANCE_PIXELS, DISTANCE_BLUR = 40_000, 80, 1.0
-MOST_PHOTOS, MOST_BETWEEN = 2, 3  # most photos, and most cameras between them, that are compared
+MOST_PHOTOS, MOST_BETWEEN = 2, 3  # most photos that are compared, and most cameras that are placed between views
 
 
 def is_far(near: float | None, far: float | None) -> bool:
-    """Return whether a PSNR (dB) means twice the error of another, and looks wrong; False if one cannot be measured."""
+    """Return whether ``far``, a PSNR (dB), means more than twice the error of ``near``, and looks wrong.
+
+    False if one of them could not be measured.
+    """
     return near is not None and far is not None and far < min(near - TWICE_DB, WRONG_DB)  # NaN is not less
 
 
@@ -43,12 +46,12 @@ def describe_far(gaussians: Gaussians, prepared: Prepared) -> str | None:
     share = DISTANCE_PIXELS / max(DISTANCE_PIXELS, scene.cameras.width, scene.cameras.height)
     size = [max(1, round(side * share)) for side in (scene.cameras.width, scene.cameras.height)]
     sample, cameras = sample_gaussians(scene, DISTANCE_GAUSSIANS), resize_cameras(scene.cameras, *size)
-    more = _place_between(sample, cameras, views)
+    between = _place_between(sample, cameras, views)
     pictures = shrink_pictures(scene.images[own], *size)
     counts = None if scene.masks is None else shrink_pictures(scene.masks[own].astype(np.float32), *size) == 1
-    distance = _compare(sample, more, render(gaussians, more).images, None)
-    # the second is only measured if the first does not look right
-    if not distance < WRONG_DB or not is_far(error := _compare(sample, cameras[own], pictures, counts), distance):
+    distance = _measure_psnr(sample, between, render(gaussians, between).images, None)
+    # the error of the input is only measured if the result looks wrong
+    if not distance < WRONG_DB or not is_far(error := _measure_psnr(sample, cameras[own], pictures, counts), distance):
         return None
     return (
         "between the views, pictures of the result differ from pictures of the input more than twice as much as these"
@@ -57,15 +60,19 @@ def describe_far(gaussians: Gaussians, prepared: Prepared) -> str | None:
 
 
 def _place_between(sample: Gaussians, cameras: Cameras, views: Sequence[int]) -> Cameras:
-    """Place a few cameras between views; if there is no space between any, beside them."""
+    """Place a few cameras between the views, or beside them if no two have space between them."""
     between = between_cameras(cameras[list(views)]) if len(views) > 1 else cameras[[]]
     if len(between) == 0:
         return outside_cameras(sample.means, cameras, MOST_BETWEEN, OUTSIDE_LOW, OUTSIDE_HIGH)
     return between[even_views(len(between), min(len(between), MOST_BETWEEN))]
 
 
-def _compare(gaussians: Gaussians, cameras: Cameras, pictures: np.ndarray, counts: np.ndarray | None) -> float:
-    """Return the PSNR (dB) of ``pictures [v,h,w,3]`` and drawings, both blurred, where Gaussians cover a pixel."""
+def _measure_psnr(gaussians: Gaussians, cameras: Cameras, pictures: np.ndarray, counts: np.ndarray | None) -> float:
+    """Return the PSNR (dB) of renders of Gaussians against ``pictures [v,h,w,3]``, both blurred.
+
+    Only pixels that the Gaussians cover are compared and, if there is a mask ``counts [v,h,w]``, those inside it. NaN
+    without such pixels.
+    """
     drawn = render(gaussians, cameras)
     covered = (drawn.alphas[..., 0] > 0.5) & (counts is None or counts)
     pairs = zip(drawn.images, pictures, covered, strict=True)

@@ -9,7 +9,7 @@ from typing import Any
 from gsmerge.compaction.compact import find_count
 from gsmerge.compaction.costs import CountChoice, RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.files import Outputs, with_output_name
-from gsmerge.compaction.methods import choose_method, stands_alone
+from gsmerge.compaction.methods import choose_method, is_without_views
 from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.crop import crop_scene
@@ -28,21 +28,22 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
 from gsmerge.values.words import count_words
 
-SEARCHED = 500_000  # Gaussians of a scene without cameras up to which a search takes seconds
-BESIDE = ("cameras", "images", "masks", "protect")  # files and folders that are read with the Gaussians
+MAX_SEARCHED = 500_000  # most Gaussians of a scene without cameras for which the search is run; it takes seconds
+BESIDE = ("cameras", "images", "masks", "protect")  # fields of SceneFiles that are read with the Gaussians
 
 
 def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """Estimate size, time and memory of a run without running it.
 
     Returns:
-        ``num_gaussians``: the largest number of Gaussians that the result can have, or, if ``exact``, their number. If
-        ``psnr_kept`` or ``loss_kept`` is a number, it is the smallest number: the run takes more until the PSNR against
-        the input is ``psnr_kept`` dB, until the photos are shown at most ``loss_kept`` dB worse, or until ``quality``
-        is met. ``ratio`` to the input, ``bytes`` as a ``.ply``. ``blocks``, ``method``, ``superpixels_per_view`` (None
-        if a budget distributes them, 0 if neighbours are merged), ``k``, ``match``, ``checkpoint``, ``fit`` and
-        ``fit_steps`` as the run uses them. ``seconds`` and ``memory_bytes``, to two digits and right within a factor of
-        about two. ``memory_problem``: None if this machine has enough memory.
+        ``num_gaussians``: the largest number of Gaussians that the result can have or, if ``exact``, their number. It
+        is the smallest number if ``psnr_kept`` or ``loss_kept`` is a number. Then the run takes more Gaussians until
+        the PSNR against the input is ``psnr_kept`` dB, or until the photos are shown at most ``loss_kept`` dB worse. If
+        ``quality`` is given, the run takes more or fewer until this is met. ``ratio`` to the input, and ``bytes`` of a
+        ``.ply``. ``blocks``, ``method``, ``superpixels_per_view`` (None if a budget distributes them, 0 if neighbours
+        are merged), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as the run uses them. ``seconds`` and
+        ``memory_bytes`` have two digits and are right within a factor of about two. ``memory_problem`` says that this
+        machine has too little memory, or is None.
     """
     if options.clean.crop is not None:
         scene = crop_scene(scene.numpy(), options.clean.crop)
@@ -52,33 +53,30 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
     choices, num_blocks = choose_for_scene(size, options), choose_blocks(size, options)
     limits, settings = choices.limits, choices.settings(options)
-    pixels = max(limits.num_pixels, scene.num_gaussians)
-    max_count = pixels if options.method.startswith("unmerged") else limits.count or limits.default
-    count, alone = min(scene.num_gaussians or pixels, max_count), stands_alone(scene, options)
+    num_pixels = max(limits.num_pixels, scene.num_gaussians)
+    max_count = num_pixels if options.method.startswith("unmerged") else limits.count or limits.default
+    no_views = is_without_views(scene, options)
     has_target = choices.keeps_fidelity or options.budget.target_psnr is not None
-    searched = find_count(scene, options) if alone and has_target and num_input <= SEARCHED else None
-    count = searched or count
-    at_once, num_rest = gaussians_at_once(pixels, num_blocks), 3 * scene.gaussians.shN.shape[1]
-    drawn = pixels if options.method == "unmerged-fit" else count
-    threads, kind = (
-        options.threads or available_threads(),
-        {OURS: choices.fit.fit, "unmerged-fit": "full"}.get(options.method, "none"),
-    )
-    steps = 0 if kind == "none" else choices.fit.steps
-    num_pixels, budget = at_once * num_blocks, options.budget
-    inside = 1.0 if alone else mean_inside(scene)
-    costs = RunCosts(settings, num_pixels, num_pixels / max(1, len(scene)), inside, steps, alone, alone)
+    found_count = find_count(scene, options) if no_views and has_target and num_input <= MAX_SEARCHED else None
+    count = found_count or min(scene.num_gaussians or num_pixels, max_count)
+    at_once, num_rest = gaussians_at_once(num_pixels, num_blocks), 3 * scene.gaussians.shN.shape[1]
+    num_drawn = num_pixels if options.method == "unmerged-fit" else count
+    fit = {OURS: choices.fit.fit, "unmerged-fit": "full"}.get(options.method, "none")
+    steps = 0 if fit == "none" else choices.fit.steps
+    all_pixels, budget = at_once * num_blocks, options.budget  # pixels of views in several blocks count several times
+    inside = 1.0 if no_views else mean_inside(scene)
+    costs = RunCosts(settings, all_pixels, all_pixels / max(1, len(scene)), inside, steps, no_views, no_views)
     choice = CountChoice(has_target, budget.auto or budget.max_drop is not None, budget.max_drop, size.rendered)
     has_trial = steps > 0 and scene.has_own_pixels and options.new_views is not False
-    parts = expected_parts(costs, limits, drawn, choice, has_trial=has_trial)
-    seconds = costs.seconds(parts, len(scene), threads)
-    memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=pixels - at_once)
+    parts = expected_parts(costs, limits, num_drawn, choice, has_trial=has_trial)
+    seconds = costs.seconds(parts, len(scene), options.threads or available_threads())
+    memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=num_pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
-        "exact": options.budget.is_filled or searched is not None,
-        "psnr_kept": FIDELITY_PSNR if choices.keeps_fidelity and size.rendered and searched is None else None,
-        "quality": options.budget.quality if searched is None else None,
+        "exact": options.budget.is_filled or found_count is not None,
+        "psnr_kept": FIDELITY_PSNR if choices.keeps_fidelity and size.rendered and found_count is None else None,
+        "quality": options.budget.quality if found_count is None else None,
         "loss_kept": FIDELITY_LOSS if choices.keeps_fidelity and not size.rendered else None,
         "ratio": count / max(1, num_input),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
@@ -86,7 +84,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "method": options.method,
         "superpixels_per_view": 0 if choices.may_merge_pairs else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
-        "fit": kind,
+        "fit": fit,
         "fit_steps": choices.fit.steps,
         "seconds": float(f"{seconds:.2g}"),
         "memory_bytes": int(float(f"{memory:.2g}")),
@@ -95,7 +93,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
 
 
 def estimate_lines(run: Mapping[str, Any]) -> list[str]:
-    """Describe an estimate in lines of text."""
+    """Describe what :func:`estimate` returns in lines of text."""
     per_view = run["superpixels_per_view"]
     superpixels = "superpixels where the scene needs them"
     if per_view is not None:
@@ -128,7 +126,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
         choose_method(settings, scene)  # for its notes and errors
-        if settings.method == OURS and settings.checkpoint != "auto":  # a named checkpoint, which the run may refuse
+        if settings.method == OURS and settings.checkpoint != "auto":  # raises the errors of a named checkpoint
             load_networks(settings, measure_size(scene))
         run = estimate(scene, settings)
     paths = {name: path and str(path) for name, path in vars(load.files).items() if name in BESIDE}

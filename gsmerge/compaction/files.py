@@ -1,4 +1,4 @@
-"""From a scene's files to the compact file: read, compact, write, report."""
+"""Compact a scene from its files: read it, compact it, write the result, and report."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact_scene
-from gsmerge.compaction.outputs import Outputs, add_outputs, frame_notes, refuse_other_cameras
+from gsmerge.compaction.outputs import Outputs, add_outputs, frame_notes, refuse_to_replace_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError
@@ -44,8 +44,8 @@ def compact_files(
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels and cameras: all files or none.
 
-    ``hashed``: hash the input for the report. ``seconds_before``: wall time of the caller's earlier steps, by name.
-    ``on_read``: called with the scene after it was read.
+    The input is hashed for the report if ``hashed``. ``seconds_before`` has the wall time of the caller's earlier
+    steps, by name. ``on_read`` is called with the scene after it was read.
 
     Returns the report, see :func:`gsmerge.compaction.report.report_document`. Raises SceneError if the scene cannot be
     read or the result cannot be written; UsageError if the settings need something that the scene does not have.
@@ -56,29 +56,29 @@ def compact_files(
         temporary = add(out)
         load = read_input(files, opacity=opacity, hints=hints, hashed=hashed)
         on_read(load)
-        views = _views_once(load.scene)
+        views = _list_first_layers(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras if views else None
-        if cameras_path is not None and cameras_path.exists() and not outputs.overwrite:  # before the work is done
-            refuse_other_cameras(cameras_path, load.scene.cameras[views], names, moved=True)
-        read = perf_counter()
+        if cameras_path is not None and cameras_path.exists() and not outputs.overwrite:  # fail before the long work
+            refuse_to_replace_cameras(cameras_path, load.scene.cameras[views], names, moved=True)
+        read_at = perf_counter()
         result = compact_scene(load.scene, settings, progress)
         if len(result.gaussians) == 0:
-            nothing = "expected Gaussians that show something, found none that remains after merging"
-            raise SceneError(files.ply, nothing, "check its scales and opacities")
-        result = _padded(result) if outputs.options.columns == "full" else result
-        compacted, results = perf_counter(), (result, *result.coarser)
+            problem = "expected Gaussians that show something, found none that remains after merging"
+            raise SceneError(files.ply, problem, "check its scales and opacities")
+        result = _pad_to_full(result) if outputs.options.columns == "full" else result
+        compacted_at, results = perf_counter(), (result, *result.coarser)
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
         comments = result_comments(result.report.new_views, load.comments)
         contents = Contents(levels, comments, cameras, names, scene_title(files.ply))
-        written = add_outputs(add, outputs, temporary, contents)
+        level_files = add_outputs(add, outputs, temporary, contents)  # the first level is the result itself
         notes = [*format_notes(out, result.gaussians), *frame_notes(outputs, cameras), *doubt_changed(load.stats)]
         document = report_document(
             result.report, recognised=load.recognised, output_path=out,
-            seconds_before={**(seconds_before or {}), "read": read - start},
-            seconds_after={"write": perf_counter() - compacted},
-            coarser=[(path, level.report) for path, level in zip([*written][1:], result.coarser, strict=True)],
-            notes=[*load.notes, *notes], written_at=written, cameras_path=cameras_path,
+            seconds_before={**(seconds_before or {}), "read": read_at - start},
+            seconds_after={"write": perf_counter() - compacted_at},
+            coarser=[(path, level.report) for path, level in zip([*level_files][1:], result.coarser, strict=True)],
+            notes=[*load.notes, *notes], written_at=level_files, cameras_path=cameras_path,
         )  # fmt: skip
     format_.finish(out)
     return document
@@ -89,16 +89,16 @@ def with_output_name(settings: CompactOptions, outputs: Outputs) -> CompactOptio
     return replace(settings, budget=replace(settings.budget, output=outputs.result.name))
 
 
-def _padded(result: CompactResult) -> CompactResult:
+def _pad_to_full(result: CompactResult) -> CompactResult:
     """Pad the harmonics of a result and its levels with zeros up to degree 3."""
     from gsmerge.compaction.placement import NUM_FULL, pad_harmonics
 
-    coarser = tuple(map(_padded, result.coarser))
+    coarser = tuple(map(_pad_to_full, result.coarser))
     return replace(result, gaussians=pad_harmonics(result.gaussians, NUM_FULL), coarser=coarser)
 
 
-def _views_once(scene: Scene) -> list[int]:
-    """Return the views without repeated layers; a repeated layer has the name and camera of an earlier view."""
+def _list_first_layers(scene: Scene) -> list[int]:
+    """List the views, but only the first of several layers of a view, which have the same name and camera."""
     cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
     keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
@@ -107,9 +107,10 @@ def _views_once(scene: Scene) -> list[int]:
 def read_input(
     files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS, hashed: bool = False
 ) -> Loaded:
-    """Read a scene from its files, with notes on missing or unusual content; nothing else of them is needed later.
+    """Read a scene from its files, with notes on missing or unusual content.
 
-    ``hashed``: also hash the Gaussians. SceneError if it cannot be read, or if a file changes meanwhile.
+    The files of Gaussians are also hashed if ``hashed``. SceneError if the scene cannot be read, or if one of its files
+    changes meanwhile.
     """
     stats = read_stats(files)
     loaded = load_files(files, opacity=opacity, hints=hints)
@@ -125,18 +126,18 @@ def read_input(
 def _compact_notes(loaded: Loaded) -> list[str]:
     """Return notes on columns that results lack, and on a scene that is a result already.
 
-    A result is recognised by the header of its file, or by its small number of Gaussians. Formats without such a header
-    are those of gsmerge if they have the cameras that it writes beside results.
+    A file of gsmerge is recognised by its header or, in formats without one, by the cameras beside it. It is a result
+    if its header says so, or if it has few Gaussians for the pixels of its views.
     """
     scene, comments, notes = loaded.scene, loaded.info.comments, list[str]()
-    named = " ".join(note for note in loaded.info.adapted if note.startswith(UNUSED))
-    lost = [name for name in loaded.info.extra_columns if name not in named]
+    unused = " ".join(note for note in loaded.info.adapted if note.startswith(UNUSED))  # another note has these
+    lost = [name for name in loaded.info.extra_columns if name not in unused]
     if lost:
         notes.append(f"merged Gaussians do not have the columns {list_names(lost)}; gsmerge convert copies them")
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
     is_own = is_from_gsmerge(comments) or result_cameras(loaded.files.ply) is not None
-    few = is_own and scene.num_gaussians <= pixels / 2
-    if few or RESULT_COMMENT in comments:
+    is_small = is_own and scene.num_gaussians <= pixels / 2
+    if is_small or RESULT_COMMENT in comments:
         count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
         remedy = "start from the original for more detail"
         notes.append(f"the scene is compact already ({count}, written by gsmerge): {remedy}")

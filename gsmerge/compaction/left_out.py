@@ -17,10 +17,10 @@ from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
 from gsmerge.settings.compact import OURS, TRIAL, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene
 
-LEAST_VIEWS = 4  # fewest views with photos; of fewer views, too little would remain
-# One of every LEFT_OUT_PART views is left out at a time, and at most MOST_LEFT_OUT views
+LEAST_VIEWS = 4  # fewest views with photos of which some are left out; of fewer views, too little would remain
+# One of every LEFT_OUT_PART views is left out in a round, but at most MOST_LEFT_OUT views
 LEFT_OUT_PART, MOST_LEFT_OUT = 6, 3
-LEAST_SEEN = 0.02  # share of a left-out photo that the other views must cover
+LEAST_SEEN = 0.02  # a left-out photo counts if the other views see more than this share of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +47,14 @@ class LeftOut:
         return np.array([score_photos(gaussians, self.photos, [i], covered=[mask]).covered_psnr for i, mask in views])
 
     def reduce(self, count: int) -> int:
-        """Return the share of ``count`` Gaussians of the whole scene that belongs to the other views."""
+        """Return the number of Gaussians for the other views, if the whole scene has ``count``."""
         views = len(self.rest.scene)
         return max(1, round(count * views / (views + len(self.photos))))
 
     def plan(self, plan: Plan, **settings: Any) -> Plan:
-        """Plan a run on the rest with the settings of ``plan``.
+        """Plan a run on the other views with the settings of ``plan``, some of which ``settings`` replace.
 
-        ``settings`` replace some of them. Others, which only the whole scene can decide, get the values of a trial.
+        Settings that only the whole scene can decide get the values of a trial.
         """
         settings = plan.settings | TRIAL | settings
         settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
@@ -72,7 +72,7 @@ def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) ->
         agreement=None,
     )  # fmt: skip
     left_out_views = subset(scene, views)
-    left_out = LeftOut(prepared_rest, scene_photos(left_out_views), cover(rest, left_out_views))
+    left_out = LeftOut(prepared_rest, scene_photos(left_out_views), mark_seen(rest, left_out_views))
     return left_out if (left_out.shares > LEAST_SEEN).any() else None
 
 
@@ -81,24 +81,27 @@ def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
 
     A photo does not count if other views see almost nothing of it.
     """
-    seen = shares > LEAST_SEEN
-    return float(np.average(scores[seen], weights=shares[seen]))
+    counts = shares > LEAST_SEEN
+    return float(np.average(scores[counts], weights=shares[counts]))
 
 
 def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Choose views to leave out in each of two rounds: evenly spread among ``views``, without neighbours in a round."""
+    """Choose the views to leave out in each of two rounds, evenly spread among ``views``.
+
+    The rounds take turns along the views, so a round leaves no two neighbours out.
+    """
     count = min(MOST_LEFT_OUT, max(1, len(views) // LEFT_OUT_PART))
     spread = [views[i] for i in pick_views(len(views), 2 * count)]
     return spread[::2], spread[1::2]
 
 
 def can_leave_out(prepared: Prepared) -> bool:
-    """Return whether views can be left out: enough of them have photos, and they have Gaussians of their own."""
+    """Return whether some views can be left out: enough views have photos, and they have Gaussians of their own."""
     reference = prepared.reference
     has_photos = reference.name == PHOTOS and len(reference.score_views) >= LEAST_VIEWS
     return has_photos and prepared.scene.has_own_pixels
 
 
-def cover(rest: PicturedScene, views: PicturedScene) -> np.ndarray:
-    """Mark the pixels ``[v,h,w]`` of ``views`` with surfaces that are also visible in views of the ``rest``."""
+def mark_seen(rest: PicturedScene, views: PicturedScene) -> np.ndarray:
+    """Return a mask ``[v,h,w]`` of the pixels of ``views`` whose surfaces are also visible in views of the ``rest``."""
     return visible_pixels(context_points(rest, NEAR_PLANE), views.cameras, NEAR_PLANE, rest.cameras)

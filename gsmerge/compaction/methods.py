@@ -30,12 +30,12 @@ class Method:
 
     Args:
         name: The name on the command line.
-        run: Prepared scene, plan and a number of Gaussians -> canonical Gaussians, at most that number unless the
-            method keeps those of the input. It times itself by stages of the record.
+        run: A function of a prepared scene, a plan and a number of Gaussians. It returns at most so many canonical
+            Gaussians, unless the method keeps those of the input. It times itself by stages of the record.
         needs_photos: The scene must have photos.
         uses: Flat names of the settings that it uses, in addition to those that all methods use.
         check: Raises a UsageError if a program that the method runs is missing.
-        prepare: Scene and options -> the prepared scene that ``run`` gets.
+        prepare: A function of a scene and options that returns the prepared scene for ``run``.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Method:
     prepare: Callable[[Scene, PrepareOptions], Prepared] = prepare
 
     def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-        """Build ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
+        """Build ``count`` canonical Gaussians by ``run``; None: as many as ``superpixels`` and K give."""
         gaussians = self.run(prepared, plan, plan.limits.default if count is None else count)
         return Fitted(gaussians, prepared.scene.cameras, None)
 
@@ -72,17 +72,20 @@ def find_method(options: CompactOptions) -> Method:
     return method
 
 
-def stands_alone(scene: Scene, options: CompactOptions) -> bool:
-    """Return whether a scene is merged by positions and colours only: it has no views, and no option needs any."""
+def is_without_views(scene: Scene, options: CompactOptions) -> bool:
+    """Return whether a run needs no views, because the scene has none and no option asks for a stage that uses them.
+
+    Its Gaussians are then merged by their positions and colours alone.
+    """
     return len(scene) == 0 and not options.replaces_stages
 
 
 def choose_method(options: CompactOptions, scene: Scene) -> Method:
-    """Choose the method for a scene, with a note on changed settings that the method ignores.
+    """Choose the method for a scene; a note lists the changed settings that the method ignores.
 
     Raises UsageError if the scene lacks what the method needs, or if a program that it runs is missing.
     """
-    if stands_alone(scene, options):
+    if is_without_views(scene, options):
         kinds = (PrepareOptions, SegmentOptions, MatchOptions, DecodeOptions)  # settings that act on views
         unused = options.changed(name for kind in kinds for name in flat_settings(kind) if name not in COUNTS)
         if unused:

@@ -1,8 +1,8 @@
-"""Estimate how much new views gain, by a trial on small photos that a short fit did not see.
+"""Estimate how much new views gain, by a trial on small photos that a short fit has not seen.
 
-Scores on photos that a fit has seen only say how well it remembers them. So the trial leaves out some views with their
-rows, and compacts the other views at a small size. The rows of the other views and the result are both scored on the
-photos that were left out, over the pixels that the rows cover.
+Scores on photos that a fit has seen only say how well it remembers them. So the trial leaves some views out with their
+Gaussians, and compacts the other views at a small size. Then both the other views' Gaussians and the result are scored
+on the photos that were left out, over the pixels that these Gaussians cover.
 """
 
 from __future__ import annotations
@@ -27,30 +27,32 @@ from gsmerge.settings.stages import SHARE
 from gsmerge.types import Cameras, PicturedScene, Pixels
 
 TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this many pixels
-# Most steps of the fit. Fits of few views differ below 150 steps (gsmerge.fit.schedule.MANY_STEPS), and predict less
+# Most steps of the fit. Below 150 steps, fits of few views are of another kind (gsmerge.fit.schedule.MANY_STEPS), and
+# predict less
 TRIAL_STEPS = 200
-# Most views of a round, the nearest to those that are left out. With more, TRIAL_STEPS would draw each too seldom to
-# tell how a run with more steps ends; and farther views show little of what the left-out views show
+# Most views of a round, the nearest to those that are left out. With more views, TRIAL_STEPS would draw each too seldom
+# to tell how a run with more steps ends. Besides, farther views show little of what the left-out views show
 TRIAL_VIEWS = 64
-# Small pictures have more detail in each pixel, so they lose more with few Gaussians. The shares of the trial and of
-# the result are relative to the usual share. The trial's share is the result's share to the power of LESS. On five
+# Small pictures have more detail in each pixel, so they lose more with few Gaussians. The trial therefore has a larger
+# share of Gaussians per pixel. Relative to the usual share, it is that of the result to the power of LESS. On five
 # captures at 1 % this lowers the error of the estimated gain from 2.3 to 1.0 dB
 USUAL, LESS = parse_share(SHARE), 0.3
-# OWN is the weight of the gain of own photos, where depth is confirmed; the rest is the weight of the trial's gain. New
-# views gain an amount between the two, or at most SPREAD dB outside, in 80 % of the results or more, of ten captures as
-# of five others (docs/internals/notebook.md). Nothing is known about more than MOST_SHARE Gaussians for each pixel
+# The expected gain of new views is a mean of the gain of own photos, with the weight OWN and only where depth is
+# confirmed, and of the gain in the trial. The true gain lies between the two, or at most SPREAD dB outside, for 80 % of
+# the results or more, on ten captures as on five others (docs/internals/notebook.md). Nothing is known about more than
+# MOST_SHARE Gaussians for each pixel
 OWN, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 
 @dataclass(frozen=True)
 class NewViews(ExpectedScores):
-    """Expected PSNR (dB) of new views of a scene, estimated on a number of ``views``."""
+    """Expected PSNR (dB) of new views of a scene, as a trial predicts it."""
 
-    views: int
+    views: int  # Number of left-out photos on which the trial measured
 
     @property
     def gain(self) -> float:
-        """PSNR that a new view gains, dB."""
+        """PSNR (dB) that a new view gains."""
         return self.after - self.before
 
     def to_dict(self) -> dict[str, float]:
@@ -60,19 +62,19 @@ class NewViews(ExpectedScores):
 
 @dataclass(frozen=True)
 class Trial:
-    """PSNR (dB) of small photos that short fits were not trained on."""
+    """What a trial measured: PSNR (dB) of small photos that its short fits have not seen."""
 
-    own_before: float  # Rendered from all rows of the input
-    before: float  # Rendered from the rows of other views
-    after: float  # Rendered from the compact result of these rows
+    own_before: float  # Rendered from all Gaussians of the input
+    before: float  # Rendered from the Gaussians of the other views
+    after: float  # Rendered from the result that the trial made of the other views
     views: int  # Number of left-out photos that count
 
     def predict(self, own_before: float, own_after: float, confirmed: float) -> NewViews:
         """Predict the PSNR of new views of a result.
 
-        ``own_before`` and ``own_after`` are the PSNR (dB) of its own photos, from the input and from the result;
-        ``confirmed`` is the share of confirmed depth. New views gain at most this share of the gain of own photos. From
-        the input, new views are assumed to be worse than own photos by the same difference as in the trial.
+        ``own_before`` and ``own_after`` are the PSNR (dB) of its own photos, rendered from the input and from the
+        result. New views gain at most a part of what own photos gain: the share of ``confirmed`` depth. Renders of the
+        input are assumed to be worse in new views than in its own views, by the same difference as in the trial.
         """
         most = confirmed * max(0.0, own_after - own_before)
         least = min(self.after - self.before, most)
@@ -82,17 +84,17 @@ class Trial:
 
 
 def can_try(prepared: Prepared, count: int = 0) -> bool:
-    """Return whether there can be a trial for a result of ``count`` Gaussians."""
+    """Return whether a trial is possible for a scene and says something about a result of ``count`` Gaussians."""
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
     return prepared.agreement is not None and can_leave_out(prepared) and count <= MOST_SHARE * pixels
 
 
 def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:
-    """Measure in a trial the PSNR of views that are left out of a fit, for a result of ``count`` Gaussians.
+    """Run the trial for a result of ``count`` Gaussians, in two rounds, and return what it measured.
 
-    Returns None with too few views or photos, or too many Gaussians. Returns None also if views have no Gaussians of
-    their own. Then the Gaussians still contain the left-out photos, so the error is 2 dB instead of 1.2, and the trial
-    takes a quarter of a run's time.
+    None if the plan wants no trial, with too few views or photos, or with too many Gaussians. None also if views have
+    no Gaussians of their own. The Gaussians would then still contain the left-out photos, so the error would be 2 dB
+    instead of 1.2, and the trial would take a quarter of a run's time.
     """
     if not plan.new_views or not can_try(prepared, count):
         return None
@@ -112,10 +114,11 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
 
 
 def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Build, share: float) -> np.ndarray | None:
-    """Compact the views around ``views`` with a short fit, and score the result on the photos of ``views``.
+    """Compact the views around ``views`` without these, at a small size, and score the result on their photos.
 
-    Returns ``[4,v]`` for the photos: the share that the remaining views see, and the PSNR (dB) of renders from all
-    rows, from the rows of the remaining views, and from the result. None if no remaining view sees what they show.
+    Returns an array ``[4,v]``. Its rows are the share of each photo that the remaining views see, and the PSNR (dB) of
+    renders from all Gaussians, from those of the remaining views, and from the result. None if no remaining view sees
+    what the photos show.
     """
     around = views_around(prepared.scene.cameras, views, TRIAL_VIEWS)
     scene = prepared.scene if len(around) == len(prepared.scene) else subset(prepared.scene, around)
@@ -125,7 +128,7 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
         return None
     superpixels = max(1, round(share * small.pixels_per_view))
     short = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(TRIAL_STEPS, plan.fit.steps))
-    # views from outside hardly change the score, nor does pruning (docs/internals/notebook.md)
+    # Without views from outside and without pruning, which hardly change the score (docs/internals/notebook.md)
     inside = replace(short.fit, tuning=replace(short.fit.tuning, outside_from=1.0))
     compacted = build(left_out.rest, replace(short, fit=inside, is_trial=True), None).gaussians
     drawn = small.file_gaussians, left_out.rows, compacted
@@ -133,14 +136,14 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
 
 
 def views_around(cameras: Cameras, views: Sequence[int], most: int) -> list[int]:
-    """Choose at most ``most`` views, ascending: ``views``, and then those whose cameras are nearest to any of them."""
+    """Choose ``views`` and those whose cameras are nearest to any of them, at most ``most`` in all; sorted."""
     distances = camera_distances(cameras)[list(views)].min(0)
     distances[list(views)] = -1.0
     return sorted(np.argsort(distances, kind="stable")[:most].tolist())
 
 
 def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
-    """Shrink the pictures by a factor ``step`` per side, and keep the front Gaussian of each remaining pixel."""
+    """Shrink the pictures by a factor ``step`` per side; each new pixel keeps one front Gaussian, of larger scales."""
     cameras, shape = scene.cameras, scene.images.shape[1:3]
     height, width = (max(1, side // step) for side in shape)
     Ks = cameras.Ks / np.array([[step], [step], [1]], cameras.Ks.dtype)

@@ -1,4 +1,4 @@
-"""Write Gaussians with their cameras: all files of an output, or none."""
+"""Write all files of an output, which are Gaussians with their cameras, or none of them."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import AXES
 from gsmerge.types import Cameras
 
-# Cameras are the same up to this difference of their viewmats, relative to the largest translation. Their Ks may differ
-# by this share, or by a hundred times this number of pixels
-SAME = 1e-5
+# Cameras count as the same if their viewmats differ by at most this number, relative to the largest translation, and
+# their Ks by at most this share or a hundred times this number of pixels
+CAMERA_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """The files of an output: all are written, or none."""
+    """The paths of the files of an output, and how they are written."""
 
     result: Path  # Its name chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it
-    viewer_cameras: Path | None = None  # May exist already with the same content, beside a result in another format
-    overwrite: bool = False
+    viewer_cameras: Path | None = None  # None: write no cameras beside it. Results in several formats share the file
+    overwrite: bool = False  # Replace files that exist
     options: FileOptions = field(default_factory=FileOptions)
 
     @property
     def format(self) -> Format:
-        """Return the format of the result; UsageError if the name has no ending that can be written."""
+        """The format of the result; UsageError if its name has no ending that can be written."""
         return output_format(self.result)
 
 
 def plan_outputs(result: Path, options: FileOptions | None = None, *, overwrite: bool = False) -> Outputs:
-    """Name the files of an output: cameras lie beside the result if its format has none, unless options say no."""
+    """Name the files of an output; cameras get a file beside the result if its format has none and options allow it."""
     options = options or FileOptions()
     is_beside = options.viewer_cameras and not find_format(result).has_cameras
     return Outputs(result, viewer_cameras_path(result) if is_beside else None, overwrite, options)
@@ -59,9 +59,9 @@ def write_outputs(outputs: Outputs, contents: Contents) -> int:
 def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of an output as part of :func:`atomic_outputs`; return the temporary files of each level.
 
-    ``temporary``: the file that was added for the result. Viewers of some formats look from the first camera of a file,
-    or of settings beside it. For these a camera is placed if there is none. Settings that are there already stay,
-    unless ``overwrite`` and gsmerge wrote them.
+    ``temporary`` is the file that was added for the result. Viewers of some formats start at the first camera in the
+    file, or in a file of settings beside it. For these a camera is placed if the scene has none. A file of settings
+    that exists already stays unchanged, unless gsmerge wrote it and may overwrite files.
     """
     format_, gaussians, has_views = outputs.format, contents.levels[0], len(contents.cameras) > 0
     contents = replace(contents, options=outputs.options)
@@ -79,7 +79,7 @@ def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Con
 
 
 def frame_notes(outputs: Outputs, cameras: Cameras) -> list[str]:
-    """Note that viewers of a format do not show the scene upright, or where it lies on the globe."""
+    """Return notes if viewers of the format do not show the scene upright, or not at its place on the globe."""
     format_, notes = outputs.format, list[str]()
     if format_ is TILESET and outputs.options.place is None:
         notes.append("without a place the scene lies in the middle of the earth: --set place=LON,LAT,HEIGHT")
@@ -103,23 +103,29 @@ def _add_cameras(add: AddOutput, path: Path, contents: Contents, *, overwrite: b
     if overwrite or not path.exists():
         add(path).write_bytes(viewer_cameras(cameras, names).encode())
     else:
-        refuse_other_cameras(path, cameras, names)
+        refuse_to_replace_cameras(path, cameras, names)
 
 
-def refuse_other_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool = False) -> None:
-    """Raise UsageError if a file has other cameras than these, to within rounding; ``moved``: by names and size."""
+def refuse_to_replace_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool = False) -> None:
+    """Raise UsageError if a file has other cameras than these, to within rounding.
+
+    With ``moved``, a run may still move these cameras, so poses are not compared.
+    """
     if not _has_cameras(path, cameras, names, moved=moved):
         remedy = "name another output, or pass --overwrite to replace it"
         raise UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
 
 def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool) -> bool:
+    """Return whether a file can be read and has these cameras; with ``moved``, poses are not compared."""
     with suppress(SceneError):
         file, farthest = read_cameras(path), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
         stored = to_cameras(file)
         same_views = [*file.names, stored.width, stored.height] == [*names, cameras.width, cameras.height]
         same_poses = same_views and (
-            moved or np.allclose(stored.viewmats, cameras.viewmats, rtol=0, atol=SAME * farthest)
+            moved or np.allclose(stored.viewmats, cameras.viewmats, rtol=0, atol=CAMERA_TOLERANCE * farthest)
         )
-        return bool(same_poses and np.allclose(stored.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME))
+        return bool(
+            same_poses and np.allclose(stored.Ks, cameras.Ks, rtol=CAMERA_TOLERANCE, atol=100 * CAMERA_TOLERANCE)
+        )
     return False

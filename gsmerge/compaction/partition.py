@@ -1,7 +1,7 @@
-"""Scene -> blocks of views that see the same surfaces, each with some views of its neighbours.
+"""Cut a scene into blocks of views that see the same surfaces; each block also gets some views of its neighbours.
 
-Views are nodes of a graph. The weight of an edge says how much of one view the other view sees. Blocks grow one by one
-from the rim of the graph; each step adds the view that shares most with the block.
+Views are nodes of a graph. The weight of an edge says how much two views see of each other's surfaces. Blocks grow one
+by one from the rim of the graph. Each step adds the view that shares most with the block.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Covisibility:
-    """The share of the surfaces of each of v views that every other view sees, from coarse depth maps."""
+    """How much each of v views sees of the surfaces of every other view, measured on coarse depth maps."""
 
     cameras: Cameras
-    depths: np.ndarray  # [v,h,w] float64, depths of a coarse grid of each view; infinite where nothing is
+    depths: np.ndarray  # [v,h,w] float64, depths on a coarse grid of each view; infinite where nothing is
     shares: np.ndarray = field(repr=False)  # [v,v] share of the samples of one view (row) that another view sees
     samples: np.ndarray = field(repr=False)  # [n,3] float64, means of some Gaussians of all views
     sample_views: np.ndarray = field(repr=False)  # [n] view of each sample
@@ -58,7 +58,10 @@ class Covisibility:
 
 
 def measure_covisibility(scene: Scene) -> Covisibility:
-    """Measure which share of every view each other view sees, with occlusion; the scene has to have pixels."""
+    """Measure which share of every view each other view sees; hidden surfaces do not count.
+
+    The scene has to have pixels.
+    """
     grid_cells = 24  # cells along the longer side of a view's depth map
     cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // grid_cells))
     rows, columns = (np.arange(step // 2, side, step) for side in (cameras.height, cameras.width))
@@ -69,6 +72,7 @@ def measure_covisibility(scene: Scene) -> Covisibility:
     valid = fronts >= 0
 
     def measure_depths(view: int) -> np.ndarray:
+        """Return the depths of the cells of a view, infinite where no Gaussian is in front of the camera."""
         z = project(means[view], cameras[[view]])[1][0]
         return np.where(valid[view] & (z > 0), z, np.inf)
 
@@ -78,6 +82,7 @@ def measure_covisibility(scene: Scene) -> Covisibility:
     samples = [means[view, stride][valid[view, stride]] for view in range(len(scene))]
 
     def measure_shares(points: np.ndarray) -> np.ndarray:
+        """Return the share of the samples of a view that each view sees."""
         return see(points, cameras, depths)[1].sum(1) / max(1, len(points))
 
     shares = np.stack(parallel_map(measure_shares, samples))
@@ -91,15 +96,14 @@ def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.nd
     Points behind the surfaces of the coarse depth maps ``depths [c,h,w]`` are not seen.
     """
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    same_depth = 0.15  # share by which a point may lie behind the depth of a cell that shows it
+    same_depth = 0.15  # a point is seen if it lies at most this share of the depth behind the surface of its cell
     return see_points(points, viewmats, Ks, depths, cameras.width, cameras.height, 0.0, 1 + same_depth)
 
 
 def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
     """Return a factor for each block's number of Gaussians that makes all blocks equally dense.
 
-    Views of other blocks also have Gaussians on the surfaces of a block, but these are dropped. The factor makes up for
-    them.
+    Views outside a block also have Gaussians on its surfaces. The block does not get these, so its own have to be more.
     """
     views = range(len(covisibility.cameras))
     owners = owning_views(covisibility.samples, covisibility, views)
@@ -114,7 +118,7 @@ def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.nda
 
 
 def partition_views(weights: np.ndarray, count: int) -> list[Block]:
-    """Cluster v views into ``count`` blocks of similar size with weak edges between them; add views of neighbours.
+    """Cut v views into ``count`` blocks of similar size with weak edges between them; add views of neighbours.
 
     ``weights [v,v]`` are symmetric and at least 0. Every view belongs to one block. A block also shares those views of
     other blocks that have the largest weights with it, up to ``SHARED`` times the number of its own views.
@@ -122,18 +126,18 @@ def partition_views(weights: np.ndarray, count: int) -> list[Block]:
     labels = grow_blocks(weights, count)
     blocks = []
     for label in range(count):
-        members = np.flatnonzero(labels == label)
-        seen = np.where(labels == label, 0, weights[members].sum(0))
-        nearest = np.argsort(-seen, kind="stable")[: round(SHARED * len(members))]
-        blocks.append(Block(tuple(members.tolist()), tuple(sorted(nearest[seen[nearest] > 0].tolist()))))
+        own = np.flatnonzero(labels == label)
+        block_weights = np.where(labels == label, 0, weights[own].sum(0))
+        nearest = np.argsort(-block_weights, kind="stable")[: round(SHARED * len(own))]
+        blocks.append(Block(tuple(own.tolist()), tuple(sorted(nearest[block_weights[nearest] > 0].tolist()))))
     return blocks
 
 
 def partition_apart(weights: np.ndarray, count: int) -> list[Block]:
     """Cut views into at most ``count`` blocks that see little of each other.
 
-    The blocks are those of :func:`partition_views`. Their number is halved, down to one, while they cut more than a
-    third of the weights.
+    The blocks are those of :func:`partition_views`. Their number is halved, down to one, as long as more than a third
+    of the weights lies on edges between blocks.
     """
     while True:
         blocks = partition_views(weights, count)
@@ -144,23 +148,23 @@ def partition_apart(weights: np.ndarray, count: int) -> list[Block]:
 
 
 def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
-    """Label views ``[v]`` with 0 to ``count - 1``, growing blocks one by one from the rim of the unlabelled views.
+    """Return the block of each view ``[v]``, 0 to ``count - 1``; blocks grow one by one from the rim of the views.
 
-    A block starts with the view that has the weakest edges to the unlabelled views, and grows by the view that shares
-    most with the block.
+    A block starts with the view that has the weakest edges to the views without a block. It grows by the view that
+    shares most with the block.
     """
     num_views = len(weights)
     labels, is_free = np.full(num_views, -1), np.ones(num_views, bool)
     for label in range(count):
         size = round(is_free.sum() / (count - label))
-        free_weights = weights[:, is_free].sum(1)  # of the edges from each view to unlabelled ones
-        block_weights = np.where(is_free, 0.0, -np.inf)  # of the edges from each unlabelled view to the block
+        free_weights = weights[:, is_free].sum(1)  # sum of the edges from each view to free ones
+        block_weights = np.where(is_free, 0.0, -np.inf)  # sum of the edges from each free view to the block
         view = int(np.where(is_free, free_weights, np.inf).argmin())
         for _ in range(size):
             labels[view], is_free[view] = label, False
             block_weights += weights[view]
             block_weights[view] = -np.inf
-            # prefer views with weak edges to the other unlabelled ones, so that no view remains alone
+            # prefer views with weak edges to other free ones, so that no view remains alone
             free_weights -= weights[view]
             score = block_weights - 0.5 * np.where(is_free, free_weights, 0)
             view = int(score.argmax())
@@ -177,12 +181,13 @@ def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence
     centres = camera_centres(cameras.viewmats.astype(np.float64))
 
     def find_owners(part: np.ndarray) -> np.ndarray:
+        """Return for each point of a part the index of its owner among ``views``."""
         squares = np.square(part - centres[:, None]).sum(-1)
         inside, seen = see(part, cameras, depths)
-        shown = np.where(seen.any(0), seen, inside)
-        squares[~shown & shown.any(0)] = np.inf
+        may_own = np.where(seen.any(0), seen, inside)
+        squares[~may_own & may_own.any(0)] = np.inf
         return squares.argmin(0)
 
-    owned_together = 1024  # points whose owners are searched together
-    parts = np.array_split(points.astype(np.float64), max(1, len(points) // owned_together))
+    part_size = 1024  # points whose owners are found together
+    parts = np.array_split(points.astype(np.float64), max(1, len(points) // part_size))
     return np.asarray(views)[np.concatenate(parallel_map(find_owners, parts))]

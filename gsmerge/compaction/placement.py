@@ -1,4 +1,4 @@
-"""Bring Gaussians and cameras into the frame of an output file, and cut harmonics to a degree."""
+"""Move Gaussians and cameras into the frame of an output file, and cut or pad their harmonics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.types import Cameras, Gaussians
 
-NUM_FULL = 15  # harmonics above degree 0 up to degree 3
+NUM_FULL = 15  # number of harmonics of the degrees 1 to 3
 
 
 def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
@@ -23,8 +23,8 @@ def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
 def find_placement(options: PlacementOptions, cameras: Cameras | None, marked: str | None = None) -> Similarity:
     """Find the map from the frame of the scene to that of its file.
 
-    The upward axis of the scene is that of the ``cameras``; without cameras, the axis that the file is ``marked`` with;
-    without a mark, -y.
+    The upward axis of the scene is the mean of the ``cameras``. Without cameras it is ``marked``, the axis that the
+    header of the file names, or else -y.
     """
     if not options.moves:
         return IDENTITY
@@ -61,10 +61,10 @@ def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return np.asarray(np.eye(3) + cross + matmul(cross, cross) / (1 + cosine))
 
 
-def place(
+def move_to_frame(
     gaussians: Gaussians, cameras: Cameras, frame: Similarity, sh_degree: int | None
 ) -> tuple[Gaussians, Cameras]:
-    """Move Gaussians and cameras into a frame, and leave out harmonics above ``sh_degree``, if it is given."""
+    """Move Gaussians and cameras by ``frame``, and leave out harmonics above ``sh_degree``, if it is given."""
     if sh_degree is not None:
         gaussians = replace(gaussians, shN=gaussians.shN[:, : (sh_degree + 1) ** 2 - 1])
     if frame is IDENTITY:

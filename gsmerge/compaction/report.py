@@ -1,4 +1,4 @@
-"""The report of a run: its content, its JSON document with a stable schema, and its lines of text."""
+"""The report of a run, as an object, as a JSON document with a stable schema, and as lines of text."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Covered:
 def compared_psnr(
     covered: Covered | None, before: float | None, after: float | None
 ) -> tuple[float | None, float | None]:
-    """Return the PSNR (dB) of input and result that are compared: over covered pixels, if the input lacks some."""
+    """Return the PSNR (dB) of input and result to compare: over covered pixels, if the input lacks some."""
     return (before, after) if covered is None else (covered.before, covered.after)
 
 
@@ -116,7 +116,7 @@ class CompactReport:
 
     @property
     def doubts(self) -> list[str]:
-        """Those of the notes that make the result doubtful."""
+        """The notes that make the result doubtful."""
         return list_doubts(self.notes)
 
     def to_dict(self) -> dict[str, Any]:
@@ -133,7 +133,7 @@ class CompactReport:
             ends = (psnr_figure(psnr, self.choices) for psnr in (self.psnr_before, self.psnr_after))
             facts += [("PSNR of its own views", " -> ".join(ends))]
         if fidelity := self.choices.get("fidelity"):
-            facts += [("PSNR", f"{psnr_words(fidelity['psnr'])} {_describe_views(fidelity)}")]
+            facts += [("PSNR", f"{psnr_words(fidelity['psnr'])} {_describe_fidelity_views(fidelity)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
 
 
@@ -151,10 +151,16 @@ def report_document(
 ) -> dict[str, Any]:
     """Return the report of one ``compact`` run as plain JSON types.
 
-    ``recognised``: facts about the input. ``seconds_before`` and ``seconds_after``: wall time by name before the
-    report's stages (imports, reading) and after them (writing). ``coarser``: file and report of each coarser level of
-    detail. ``notes``: notes of the reader, which come before those of the report. ``written_at``: the temporary files
-    of each output, before they are renamed. ``cameras_path``: the file of the views for viewers, if any.
+    Args:
+        report: The report of the result.
+        recognised: Facts about the input.
+        output_path: The file of the result.
+        seconds_before: Wall time by name before the stages of the report, such as imports and reading.
+        seconds_after: Wall time by name after these stages, such as writing.
+        coarser: File and report of each coarser level of detail.
+        notes: Notes from reading and writing, which come before those of the report.
+        written_at: The temporary files of each output, if they are not renamed yet; they have its bytes.
+        cameras_path: The file of cameras for viewers, if any.
 
     Returns:
         ``schema_version``; within a version keys are only added. ``unmet``: why a target is not met, or null.
@@ -205,12 +211,13 @@ def report_document(
 
 
 def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Sequence[Path]]) -> dict[str, Any]:
+    """Return path, bytes and number of Gaussians of an output, whose temporary files are in ``at`` if it has some."""
     num_bytes = sum(file.stat().st_size for file in at.get(path, [path]))
     return {"path": os.fspath(path), "bytes": num_bytes, "num_gaussians": report.num_output}
 
 
 def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """List what a result is: name of a figure, its value before and after, and words about it."""
+    """List the figures of a result: for each its name, the values before and after, and a short explanation."""
     files, psnr, choices = (document["input"], document["output"]), document["psnr_input_views"], document["choices"]
     counts, sizes = [f"{file['num_gaussians']:,}" for file in files], [human_bytes(file["bytes"]) for file in files]
     rows = [("Gaussians", counts[0], counts[1], human_share(document["ratio"])), ("file", sizes[0], sizes[1], "")]
@@ -225,11 +232,11 @@ def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]
     }
     for words, score in scores.items():
         if score:
-            name = _own(document) if score is psnr else ""
+            name = _name_pictures(document) if score is psnr else ""
             about = words.format(100 * score.get("share", 0))
             rows += [(name, psnr_figure(score["before"], choices), psnr_figure(score["after"], choices), about)]
     if fidelity := choices.get("fidelity"):
-        rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_views(fidelity))]
+        rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_fidelity_views(fidelity))]
     if pruned := choices.get("pruned"):
         rows += [("dropped", "", f"{pruned:,}", "Gaussians that no view shows")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
@@ -253,7 +260,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     return [document["output"]["path"], *wrapped, *shown]
 
 
-def _describe_views(fidelity: Mapping[str, Any]) -> str:
+def _describe_fidelity_views(fidelity: Mapping[str, Any]) -> str:
     """Say in which views the PSNR against the input was measured."""
     return f"from the input in {fidelity['views']} {'held-out' if fidelity['held_out'] else 'of its'} views"
 
@@ -262,24 +269,25 @@ def level_lines(document: Mapping[str, Any]) -> list[str]:
     """Return one line of text for each coarser level of detail."""
     return [
         f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
-        + (f"; {_own(document)} {psnr_figure(psnr, level['choices'])}" if psnr is not None else "")
+        + (f"; {_name_pictures(document)} {psnr_figure(psnr, level['choices'])}" if psnr is not None else "")
         + f"; {level['seconds']:.1f} s"
         for level, psnr in ((level, level["psnr_input_views"]) for level in document["levels"])
     ]
 
 
 def curve_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return the scene's curve as a small table: quality of short fits on what they left out of the photos.
+    """Return the scene's curve as a small table: by the number of Gaussians, PSNR and SSIM of a short fit.
 
-    The row nearest to the number of Gaussians in the result is marked; the result may lie between two rows.
+    They are measured on photos, or patches of photos, that the fit left out. The row nearest to the number of Gaussians
+    in the result is marked; the result may lie between two rows.
     """
     points, count = document["choices"].get("curve"), document["output"]["num_gaussians"]
     if not points:
         return []
     head = f"{'Gaussians':>12}  {'PSNR':>5}  {'SSIM':>5}"
-    asked = count + document["choices"].get("pruned", 0)
-    result = f"{asked:,}" if asked == count else f"{asked:,}, of which {count:,} are seen"
-    nearest = min(points, key=lambda p: abs(math.log(p["count"] / max(asked, 1))))
+    requested = count + document["choices"].get("pruned", 0)
+    result = f"{requested:,}" if requested == count else f"{requested:,}, of which {count:,} are seen"
+    nearest = min(points, key=lambda p: abs(math.log(p["count"] / max(requested, 1))))
     rows = [
         f"{p['count']:>12,}  {p['psnr']:5.2f}  {p['ssim']:5.3f}"
         + (f"  <- nearest to the result: {result}" if p is nearest else "")
@@ -291,14 +299,17 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:
-    """Return the PSNR on the photos as their files have them; None if it is that of the changed photos, as printed."""
+    """Return the PSNR on the photos as their files have them; None if both figures equal those on changed photos.
+
+    They are compared as printed.
+    """
     files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
     if files is None or own["after"] is None or any(f"{files[name]:.2f}" != f"{own[name]:.2f}" for name in own):
         return files
     return None
 
 
-def _own(document: Mapping[str, Any]) -> str:
-    """Name the pictures that a result was fitted to."""
+def _name_pictures(document: Mapping[str, Any]) -> str:
+    """Name the pictures that a result was fitted to, such as its own photos."""
     reference = document.get("psnr_reference")
     return "its own photos" if reference in (None, "photos") else str(reference)

@@ -1,4 +1,4 @@
-"""candidates -> result: the Gaussians with their levels of detail and the report of the run."""
+"""Candidates -> result: the Gaussians, their coarser levels of detail, and the report of the run."""
 
 from __future__ import annotations
 
@@ -115,12 +115,12 @@ class CompactResult:
         return f"CompactResult({self.gaussians!r}, {self.cameras!r}{levels})"
 
     def to_single(self) -> CompactResult:
-        """Return the same result with means in float32; it has to be of arrays."""
+        """Return the same result with float32 means; its Gaussians have to be NumPy arrays, not tensors."""
         coarser = tuple(level.to_single() for level in self.coarser)
         return replace(self, gaussians=replace(self.gaussians, means=to_float32(self.gaussians.means)), coarser=coarser)
 
     def to(self, device: torch.device | str | None) -> CompactResult:
-        """Return the same result with tensors on a device; None: with NumPy arrays, unchanged."""
+        """Return the same result with tensors on a device; without a device, return it unchanged."""
         if device is None:
             return self
         coarser = tuple(level.to(device) for level in self.coarser)
@@ -137,9 +137,10 @@ def make_result(
 ) -> CompactResult:
     """Make the result from the best candidate and its coarser levels of detail, with a report.
 
-    The input is scored here, when memory is free again, unless the plan has its score. If a result may be worse by a
-    sample of the photos, input and results are scored again on all of them, which decides it. The report contains the
-    seconds, choices and notes of the current record, followed by those of the search and of the candidates.
+    The input is scored here, when memory is free again, unless the plan has its score. Scores may come from a sample of
+    the photos. If by these a result may be worse than the input, both are scored again on all photos. The report
+    contains the seconds, choices and notes of the current record, followed by those of the search and of the
+    candidates.
     """
     run = current_record()
     input_scores, candidates = score_input(prepared, plan), (best, *levels)
@@ -158,7 +159,7 @@ def make_result(
     names = {**run.seconds, **search.seconds}
     seconds = {name: run.seconds.get(name, 0.0) + search.seconds.get(name, 0.0) for name in names}
     if "input" in seconds:
-        seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
+        seconds["input"] = seconds.pop("input")  # moved to the end, since the input is scored last
     main = _report(best, prepared, plan, before, part_scores[0], seconds, 0)
     new_views, worse = _expect_new_views(main, prepared, trial)
     main = main if worse is None else with_worse(main, worse)
@@ -195,7 +196,7 @@ def _report(
         record.notes, plan.settings, peak_memory(), psnr_reference=None if before is None else reference.name,
         **vars(parts),
     )  # fmt: skip
-    if prepared.doubt is not None:  # no score says anything, so the report has none
+    if prepared.doubt is not None:  # scores of such a scene mean nothing, so the report has none
         choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
         report = replace(report, psnr_before=None, psnr_after=None, **vars(PartScores()), choices=choices)
         return with_worse(report, prepared.doubt)
@@ -212,22 +213,23 @@ def _report(
 
 
 def with_worse(report: CompactReport, worse: str) -> CompactReport:
-    """Add the doubt that a result is worse than its input."""
+    """Return a report with the doubt ``worse``, which says that the result is worse than its input."""
     return replace(report, notes=[*report.notes, Doubt(worse)], worse=worse)
 
 
 def _expect_new_views(
     main: CompactReport, prepared: Prepared, trial: Trial | None
 ) -> tuple[NewViews | None, str | None]:
-    """Predict the PSNR of new views by a trial, and warn if they are expected to be worse than the input's.
+    """Predict the PSNR of new views by a trial; also return a warning if they are expected to be worse.
 
-    The warning, a sentence, is None if the report already says that the result is worse.
+    The first is None without a trial or without scores. The warning is None if new views are not expected to be worse
+    than those of the input, or if the report already says that the result is worse.
     """
     before, after = compared_psnr(main.covered, main.psnr_before, main.psnr_after)
     if trial is None or prepared.agreement is None or before is None or after is None:
         return None, None
     expected = trial.predict(before, after, prepared.agreement.confirmed)
-    # Smaller pictures say little
+    # no warning by smaller pictures, since a trial on these says little
     is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= TRIAL_PIXELS
     if not is_large or main.worse is not None or expected.gain >= -SPREAD:
         return expected, None

@@ -18,15 +18,16 @@ from gsmerge.runtime.record import stage
 from gsmerge.stages.prune import ROUNDING
 from gsmerge.types import Gaussians, Scene
 
-# In a sample of the scored photos one of so many tiles counts: of the input, and of the result, which has far fewer
-# Gaussians. On fifteen captures a gain is off by .27 dB (rms)
+# A sample of the scored photos takes one of INPUT_EVERY tiles for the input. For a result it takes one of RESULT_EVERY,
+# because far fewer Gaussians are drawn faster. On fifteen captures a gain is then off by .27 dB (rms)
 INPUT_EVERY, RESULT_EVERY = 10, 2
 
 
-def covers_all(before: PhotoScore | None) -> bool:
-    """Return whether an input with the score ``before`` is compared with results over whole pictures.
+def compares_all_pixels(before: PhotoScore | None) -> bool:
+    """Return whether results are compared with their input over all pixels, rather than over those that it covers.
 
-    That is the case if the input covers nearly all pixels, or none; and without a score.
+    ``before`` is the score of the input. All pixels count if the input covers nearly all of them, if it covers none, or
+    if it has no score.
     """
     return before is None or before.share >= WHOLE_SHARE or not math.isfinite(before.covered_psnr)
 
@@ -37,13 +38,13 @@ def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Pho
 
 
 def may_leave_gaps(prepared: Prepared, plan: Plan) -> bool:
-    """Return whether more than a few pixels are black in renders of the input, as where the input covers nothing."""
+    """Return whether more than a few pixels are black in renders of the input; it may cover nothing there."""
     pictures = (prepared.scene.images[view] for view in plan.scored_views)
     return bool(np.mean([(picture.max(-1) > ROUNDING).mean() for picture in pictures]) < WHOLE_SHARE)
 
 
-def written(gaussians: Gaussians, plan: Plan) -> Gaussians:
-    """Return Gaussians with the rounding of the output's file; unchanged if no file is written."""
+def round_for_output(gaussians: Gaussians, plan: Plan) -> Gaussians:
+    """Round the values of Gaussians as the output's file does; return them unchanged if no file is written."""
     return round_as_written(plan.output, gaussians) if plan.output else gaussians
 
 
@@ -52,19 +53,19 @@ def measure_result(
 ) -> PhotoScore | None:
     """Score Gaussians of the world, as the output's file rounds them, on the scored photos; None without photos.
 
-    ``covered``: a mask of pixels ``[h,w]`` of each scored photo, over which ``covered_psnr`` is measured, on the sample
-    of the input; None: the pixels that the Gaussians cover.
+    ``covered`` has a mask ``[h,w]`` for each scored photo. Then ``covered_psnr`` is measured over its pixels, on the
+    sample of the input. None: over the pixels that the Gaussians themselves cover.
     """
     if not prepared.reference.of_views:
         return None
     every, shown = RESULT_EVERY if covered is None else INPUT_EVERY, prepared.result_views()
-    return _score_photos("score", written(gaussians, plan), shown, prepared, plan, covered, every)
+    return _score_photos("score", round_for_output(gaussians, plan), shown, prepared, plan, covered, every)
 
 
 def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
     """Score the input's own Gaussians on the scored photos, and over the pixels that they cover; None without photos.
 
-    If views have Gaussians of their own, the pixels that have one are covered.
+    If views have Gaussians of their own, the covered pixels are those that have one.
     """
     if not prepared.reference.of_views:
         return None
@@ -84,7 +85,10 @@ def _score_photos(
     covered: Sequence[np.ndarray] | None,
     every: int = INPUT_EVERY,
 ) -> PhotoScore:
-    """Score Gaussians in the stage ``name`` on the scored photos, or on one of ``every`` so many of their tiles."""
+    """Score Gaussians on the scored photos; ``name`` is the stage that the time counts for.
+
+    If the plan allows samples, only one of ``every`` tiles of the photos counts.
+    """
     with stage(name):
         near, every, photos = NEAR_PLANE * prepared.frame.unit, every if plan.samples else 1, scene_photos(views)
         return score_photos(gaussians, photos, plan.scored_views, every=every, near=near, covered=covered)
@@ -93,9 +97,9 @@ def _score_photos(
 def _measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Covered | None:
     """Score a result over the pixels that the input covers; ``before`` is the score of the input.
 
-    None if the input covers all pixels, or if photos count only where the input covers them anyway.
+    None if all pixels are compared, or if photos count only where the input covers them anyway.
     """
-    if before is None or covers_all(before) or prepared.scene.empty is not None:
+    if before is None or compares_all_pixels(before) or prepared.scene.empty is not None:
         return None
     after = measure_result(gaussians, prepared, plan, before.covered)
     return None if after is None else Covered(before.share, before.covered_psnr, after.covered_psnr)
@@ -139,7 +143,7 @@ class InputScores:
 
 
 def score_input(prepared: Prepared, plan: Plan) -> InputScores:
-    """Score the input's own Gaussians; the score on the scored views is the plan's if the plan has it."""
+    """Score the input's own Gaussians; the score on the scored views is taken from the plan if it has one."""
     photos, gaussians = plan.before or measure_input(prepared, plan), prepared.input_scene.file_gaussians
     return InputScores(
         photos, _measure_on_files(gaussians, prepared, plan), _measure_protected(gaussians, prepared, plan)
@@ -148,9 +152,10 @@ def score_input(prepared: Prepared, plan: Plan) -> InputScores:
 
 @dataclass(frozen=True)
 class PartScores:
-    """PSNR of input and result on parts of the pixels, and on unchanged photos; None where that says nothing more.
+    """PSNR of input and result over parts of the pixels, and on photos before the run changed them.
 
-    The names are those of :class:`gsmerge.compaction.report.CompactReport`.
+    None where there is no such part or change. The names are those of
+    :class:`gsmerge.compaction.report.CompactReport`.
     """
 
     covered: Covered | None = None
@@ -163,9 +168,9 @@ def measure_parts(before: InputScores, gaussians: Gaussians, prepared: Prepared,
 
     ``before`` are the scores of the input.
     """
-    covered, rounded = _measure_covered(before.photos, gaussians, prepared, plan), written(gaussians, plan)
+    covered, rounded = _measure_covered(before.photos, gaussians, prepared, plan), round_for_output(gaussians, plan)
     after = None if before.on_files is None else _measure_on_files(rounded, prepared, plan)
     files = None if before.on_files is None or after is None else PhotoFiles(before.on_files, after)
-    within = None if before.protected is None else _measure_protected(rounded, prepared, plan)
-    protected = within and before.protected and (within.share, before.protected.covered_psnr, within.covered_psnr)
+    score = None if before.protected is None else _measure_protected(rounded, prepared, plan)
+    protected = score and before.protected and (score.share, before.protected.covered_psnr, score.covered_psnr)
     return PartScores(covered, files, Covered(*protected) if protected else None)

@@ -1,4 +1,4 @@
-"""Seams between blocks: Gaussians that views of several blocks show are fitted again, to all of these views."""
+"""Fit the seams between blocks: Gaussians that views of several blocks show are fitted again, to all these views."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from gsmerge.runtime.record import add_seconds, begin_part, record_choices, reco
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-FOREIGN_SHARE = 0.1  # a Gaussian is at a seam if more than this share of its weights is in views of other blocks
+FOREIGN_SHARE = 0.1  # a Gaussian is at a seam if other blocks' views have more than this share of its blending weights
 SEAM_VIEW_STEPS = 2  # steps for each view
-# Blocks are parts of one room if at least the share ROOM_SHARE of the Gaussians is at seams. Then each view gets
+# If at least the share ROOM_SHARE of the Gaussians is at seams, the blocks are parts of one room. Then each view gets
 # ROOM_VIEW_STEPS steps
 ROOM_SHARE, ROOM_VIEW_STEPS = 0.5, 4
-# Step sizes relative to the usual start: they are smaller, because the Gaussians are fitted already, but beside older
-# neighbours
+# Step sizes relative to those of other fits. They are smaller, because the Gaussians have been fitted before, though
+# beside other neighbours
 SEAM_RATE = 0.6
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart], seed: int) -> Gaussians:
     """Fit the Gaussians at seams again, to the photos of all blocks that show them.
 
-    All other Gaussians stay unchanged. ``owners [n]``: the block of each Gaussian. Each block fitted its Gaussians
-    beside its own version of the neighbouring Gaussians; here they are fitted beside the final version.
+    All other Gaussians stay unchanged. ``owners [n]`` is the block of each Gaussian. Before, each block fitted its
+    Gaussians beside its own version of the neighbouring blocks' Gaussians. Here they are fitted beside the final ones.
     """
     plan = next((start.plan for start in starts if start.plan.fit.fit != "none"), None)
     if plan is None:
@@ -46,7 +46,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
             return joined
         scene = join_views([(start.prepared.scene, ids) for start, ids in zip(starts, views, strict=True) if ids])
     rows = np.flatnonzero(peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution)
-    seam_decay = 0.1  # factor on the step sizes at the end
+    seam_decay = 0.1  # step sizes at the end, relative to those at the start
     tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=seam_decay)
     view_steps = SEAM_VIEW_STEPS if at_seam.mean() < ROOM_SHARE else ROOM_VIEW_STEPS
     seam_steps = 100  # fewest steps of the fit
@@ -86,9 +86,9 @@ def find_seams(
 
 
 def join_views(scene_views: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedScene:
-    """Join views of several scenes without Gaussians into one scene; many photos are kept in a file.
+    """Join views of several scenes without Gaussians into one scene; its photos are kept in a file if they are many.
 
-    ``scene_views`` are pairs of a scene and the ids of its views.
+    ``scene_views`` has pairs of a scene and the ids of its views to join.
     """
     total, cameras = sum(len(ids) for _, ids in scene_views), scene_views[0][0].cameras
     images, count = make_array((total, cameras.height, cameras.width, 3), np.float32), 0
@@ -102,8 +102,9 @@ def join_views(scene_views: Sequence[tuple[PicturedScene, list[int]]]) -> Pictur
 
 
 def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
-    """Yield block, view, and the rows and blending weights ``[m]`` of its Gaussians, for each block's own views.
+    """Yield four values for each block's own views: the block, the view, and rows and weights ``[m]``.
 
+    The rows are those of the Gaussians that the view draws; the weights are the sums of their blending weights there.
     Views are numbered within the prepared scene of their block.
     """
     for number, start in enumerate(starts):
@@ -111,9 +112,10 @@ def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tupl
         views = sorted({repeated[i] for i, view in enumerate(start.block.views) if view in own_views})
         photos = blank_photos(start.prepared.scene.cameras[views], 2)
 
-        def weights_of(view: int, photos: Photos = photos) -> tuple[np.ndarray, np.ndarray]:
+        def list_weights(view: int, photos: Photos = photos) -> tuple[np.ndarray, np.ndarray]:
+            """Return the rows and weights of a view of ``photos``."""
             tiled = tile_view(splats, **photos.camera(view))
             return tiled.ids, list_contributions(tiled)[0]
 
-        for view, (ids, weights) in zip(views, in_turn(weights_of, range(len(photos))), strict=True):
+        for view, (ids, weights) in zip(views, in_turn(list_weights, range(len(photos))), strict=True):
             yield number, view, ids, weights

@@ -1,4 +1,4 @@
-"""Search for the number of Gaussians: by the scene's curve, or by building one count after another for a quality."""
+"""Find the number of Gaussians: by the scene's curve, or by building one count after another for a quality."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 from gsmerge.compaction.candidate import Candidate
 from gsmerge.compaction.curve import count_reaching, count_within, curve_counts, curve_knee, measure_curve
 from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, choose_left_out, leave_out, mean_seen
-from gsmerge.compaction.scores import covers_all, may_leave_gaps, measure_input, measure_renders
-from gsmerge.facts.counts import LEVEL_FACTOR
+from gsmerge.compaction.scores import compares_all_pixels, may_leave_gaps, measure_input, measure_renders
 from gsmerge.facts.prepare import Prepared
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.photos.row_colors import PHOTOS, RENDERS
@@ -22,23 +21,25 @@ from gsmerge.stages.segment import knee_count
 # dB of PSNR per doubling of the count, assumed until two counts were tried: against photos, and against renders
 PHOTOS_SLOPE, RENDERS_SLOPE = 1.0, 3.0
 SAME_COUNT_RATIO = 1.15  # two counts are the same up to this ratio
-# A count is near enough at this many dB above a target for renders, which is SAME_COUNT_RATIO at their slope
+# A search ends at a count whose PSNR is at most this many dB above a target for renders. At their slope, that is
+# SAME_COUNT_RATIO
 NEAR_DB = 0.6
-# The same bound for photos that decide the default count. It is less than FIDELITY_LOSS, because the whole input has no
-# loss at all
+# The same bound if photos decide how many Gaussians keep the input. It is less than FIDELITY_LOSS, because the whole
+# input loses nothing
 PHOTOS_NEAR_DB = 0.2
-MAX_RUNS = 6  # most builds of a search
-MAX_TRIED = 3  # most builds of a search by left-out photos, in addition to the build of the result
-# PSNR is cut at this many dB above a target, because larger values, as of the whole input, say little of the slope
+MAX_BUILDS = 6  # most builds of a search
+MAX_LEFT_OUT_BUILDS = 3  # most builds of a search by left-out photos, in addition to the build of the result
+# A PSNR counts as at most this many dB above the target. Larger values, such as that of the whole input, say little of
+# the slope near the target
 FAR_DB = 6.0
 
 T = TypeVar("T")
 
 
-def meet(build: Callable[[int], T], first: T, choose_next: Callable[[list[T]], int | None]) -> list[T]:
-    """Build for one count after another; return everything that was built, beginning with ``first``.
+def build_in_turn(build: Callable[[int], T], first: T, choose_next: Callable[[list[T]], int | None]) -> list[T]:
+    """Build one candidate after another; return all of them, beginning with ``first``, which is built already.
 
-    ``choose_next`` chooses a count by everything that was built so far; None ends the search.
+    ``choose_next`` chooses the next count by all candidates so far; None ends the search.
     """
     built = [first]
     while (count := choose_next(built)) is not None:
@@ -60,28 +61,28 @@ class SearchFacts:
 class CountSearch:
     """Search for the number of Gaussians: one count, or several until a quality is met."""
 
-    plan: Plan  # Target and limits
+    plan: Plan  # Has the target and the limits
     first: int | None  # The count to begin with; None: as many as `superpixels` and K give
-    rendered: bool = False  # Score candidates on renders of the input, which more Gaussians always show better
-    left_out: LeftOut | None = None  # Photos that the candidates leave out and are scored on; None: the own views
-    most: int | None = None  # Gaussians from which on left-out photos gain nothing; None: as the plan allows
+    rendered: bool = False  # Candidates are scored on renders of the input, which more Gaussians always show better
+    left_out: LeftOut | None = None  # Candidates are fitted without these photos and scored on them; None: on all views
+    most: int | None = None  # Beyond this count, left-out photos gain nothing; None: the plan has the only limit
     candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
     def run(self, build: Callable[[int | None], Candidate]) -> None:
         """Build a candidate for each count that the search chooses."""
-        self.candidates = meet(build, build(self.first), self.choose_next)
+        self.candidates = build_in_turn(build, build(self.first), self.choose_next)
 
     def choose_next(self, candidates: Sequence[Candidate]) -> int | None:
         """Choose the next count by the candidates built so far; None ends the search."""
         target = self.plan.target_psnr
-        if target is None or len(candidates) >= (MAX_RUNS if self.left_out is None else MAX_TRIED):
+        if target is None or len(candidates) >= (MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS):
             return None
-        tried = psnr_by_count(candidates)
-        count = next_count(tried, target, *self._allowed_counts(), *self._expected_slope())
-        return None if count in tried else count
+        psnrs = psnr_by_count(candidates)
+        count = next_count(psnrs, target, *self._allowed_counts(), *self._expected_slope())
+        return None if count in psnrs else count
 
     def _allowed_counts(self) -> tuple[int, int]:
-        """Return the fewest and the most Gaussians that may be tried."""
+        """Return the fewest and the most Gaussians that a candidate may have."""
         plan, limits = self.plan, self.plan.limits
         least, most = limits.min_count, limits.max_count
         if plan.keeps_fidelity and not plan.auto_count:
@@ -94,10 +95,9 @@ class CountSearch:
         return least, most
 
     def _expected_slope(self) -> tuple[float, float]:
-        """Return the dB per doubling of the count to assume at first, and the dB above the target that are enough."""
+        """Return the dB per doubling of the count to assume at first, and the dB above the target that end a search."""
         if self.left_out is not None:
-            # dB per doubling of the count, the mean of eleven captures below the usual count; and dB above a target, at
-            # which a count is near enough, since that is half of a doubling
+            # The slope is the mean of eleven captures below the usual count. The search ends within half of a doubling
             left_out_slope, left_out_near_db = 0.3, 0.15
             return left_out_slope, left_out_near_db
         if self.rendered:
@@ -105,42 +105,49 @@ class CountSearch:
         return PHOTOS_SLOPE, PHOTOS_NEAR_DB if self.plan.keeps_fidelity else 0.0
 
     @property
-    def tried(self) -> dict[int, float]:
-        """PSNR (dB) by count, in the order of the candidates."""
+    def psnrs(self) -> dict[int, float]:
+        """PSNR (dB) of the candidates by count, in the order in which they were built."""
         return psnr_by_count(self.candidates)
 
     @property
     def count(self) -> int | None:
-        """Number of Gaussians of the best candidate; with left-out photos, the one at which they reach the target."""
+        """Number of Gaussians of the best candidate; with left-out photos, the number at which they reach the target.
+
+        That may lie between the counts of two candidates.
+        """
         if self.plan.target_psnr is None or self.left_out is None:
             return self.best.count
-        return count_reaching(sorted(self.tried.items()), self.plan.target_psnr) if self.met else self.best.count
+        return count_reaching(sorted(self.psnrs.items()), self.plan.target_psnr) if self.is_met else self.best.count
 
     @property
     def best(self) -> Candidate:
-        """Candidate with the fewest Gaussians that reaches the target, or the one with the highest PSNR."""
+        """Candidate with the fewest Gaussians of those that reach the target; if none does, that of the highest PSNR.
+
+        Without a target, the only candidate.
+        """
         if self.plan.target_psnr is None:
             return self.candidates[0]
-        tried, target = self.tried, self.plan.target_psnr
-        reached = [count for count, psnr in tried.items() if psnr >= target]
-        best_count = min(reached) if reached else max(tried, key=lambda count: tried[count])
+        psnrs, target = self.psnrs, self.plan.target_psnr
+        enough = [count for count, psnr in psnrs.items() if psnr >= target]
+        best_count = min(enough) if enough else max(psnrs, key=lambda count: psnrs[count])
         return next(candidate for candidate in self.candidates if candidate.count == best_count)
 
     @property
-    def met(self) -> bool:
-        """Whether a candidate reaches the target."""
-        return self.plan.target_psnr is not None and max(self.tried.values()) >= self.plan.target_psnr
+    def is_met(self) -> bool:
+        """Whether there is a target and a candidate reaches it."""
+        return self.plan.target_psnr is not None and max(self.psnrs.values()) >= self.plan.target_psnr
 
     def facts(self, result: Candidate) -> SearchFacts:
-        """Return the facts for the report; ``result`` is the final candidate, made from the best one."""
+        """Return the facts about the search for the report; ``result`` is made from the best candidate."""
         names = dict.fromkeys(name for run in self.candidates for name in run.record.seconds)
         seconds = {name: sum(run.record.seconds.get(name, 0.0) for run in self.candidates) for name in names}
         target = self.plan.target_psnr
         if target is None:
             return SearchFacts(seconds, {}, self.notes, None)
-        best, met, left_out = self.best, self.met, 0 if self.left_out is None else len(self.left_out.photos)
-        psnr = best.deciding_psnr if self.count == best.count else target  # a count between two candidates meets it
-        tried = tuple(self.tried.items())
+        best, met, left_out = self.best, self.is_met, 0 if self.left_out is None else len(self.left_out.photos)
+        # a count between two candidates is where the curve between them reaches the target
+        psnr = best.deciding_psnr if self.count == best.count else target
+        tried = tuple(self.psnrs.items())
         choices: dict[str, Any] = {
             "search": {"count": self.count, "psnr": psnr, "met": met, "tried": tried, "left_out": left_out}
         }
@@ -155,7 +162,7 @@ class CountSearch:
 
     @property
     def notes(self) -> list[str]:
-        """A note on the number of Gaussians, if it is more than usual because the result has to keep the input."""
+        """One note, if keeping the quality of the input takes more Gaussians than usual; otherwise none."""
         count, limits = self.best.count or 0, self.plan.limits
         if not self.plan.keeps_fidelity or count <= limits.default:
             return []
@@ -165,8 +172,8 @@ class CountSearch:
         if not self.rendered:
             short = f"show the photos over {FIDELITY_LOSS:g} dB worse"
             good = f"show the photos at most {FIDELITY_LOSS:g} dB worse than the input"
-        if not self.met:
-            return [f"{kept}: each of the {len(self.tried)} counts tried would {short}"]
+        if not self.is_met:
+            return [f"{kept}: each of the {len(self.psnrs)} counts tried would {short}"]
         compact_share = 0.5  # a scene is compact already if the result needs more than this share of its Gaussians
         if count > compact_share * limits.num_input:
             return [f"the scene is compact already: {kept}, since fewer would {short}"]
@@ -183,24 +190,28 @@ def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
 
 
 def add_target(plan: Plan, prepared: Prepared) -> Plan:
-    """Return the plan with the PSNR that a result needs to keep the input, measured on the photos.
+    """Return the plan with what candidates are compared with: a target of PSNR, or the pixels that the input covers.
 
-    If renders of the input stand for photos, the plan gets the pixels that the input covers instead: only these are
-    scored, because any result equals the input where both are empty.
+    If a result has to keep the quality of the input, the target is the PSNR of the input on the photos less the allowed
+    loss. If renders of the input stand for photos, only the pixels that the input covers are scored, because any result
+    equals the input where both are empty.
     """
     if prepared.reference.name == RENDERS and may_leave_gaps(prepared, plan):
         input_score = measure_renders(prepared.scene.gaussians, prepared, plan)
-        plan = plan if covers_all(input_score) else replace(plan, covered=input_score.covered)
+        plan = plan if compares_all_pixels(input_score) else replace(plan, covered=input_score.covered)
     if not plan.keeps_fidelity or plan.target_psnr is not None:
         return plan
     before = measure_input(prepared, plan)
     assert before is not None, "a scene with photos"
-    psnr = before.psnr if covers_all(before) else before.covered_psnr
+    psnr = before.psnr if compares_all_pixels(before) else before.covered_psnr
     return replace(plan, before=before, target_psnr=psnr - FIDELITY_LOSS)
 
 
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
-    """Prepare a search for the number of Gaussians; measure the scene's curve first if the options need it."""
+    """Return a search for the number of Gaussians, which has not begun; it may have only one count to build.
+
+    If the scene's curve decides that count, it is measured here.
+    """
     limits, left_out = plan.limits, leave_out_for_scores(prepared, plan)
     agreement, most = prepared.agreement, limits.max_count
     if left_out is not None and agreement is not None:  # more Gaussians gain nothing on photos that are left out
@@ -212,10 +223,11 @@ def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
 
 
 def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
-    """Leave out views, so that their photos can score a quality target or a curve; None if no view is left out.
+    """Leave out views, so that their photos can score candidates or a curve; None if no view is left out.
 
-    Without a fit no photo has been seen, so none has to be left out. A count that keeps the input is scored on the
-    input's own views.
+    Views are left out if a quality target or the curve decides the count, because a fit shows the photos that it has
+    seen better than new ones. Without a fit that is not needed. It is not needed either if candidates are compared with
+    the input, which is scored on its own views.
     """
     has_target = plan.target_psnr is not None and not plan.keeps_fidelity
     if plan.fit.fit == "none" or not (has_target or plan.max_drop is not None or plan.auto_count):
@@ -225,20 +237,20 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
             if left_out := leave_out(prepared.scene, views, prepared):
                 return left_out
     if prepared.reference.name == PHOTOS and not plan.auto_count:
-        why = f"there are fewer than {LEAST_VIEWS} photos, or no other view sees what they show"
+        reason = f"there are fewer than {LEAST_VIEWS} photos, or no other view sees what they show"
         if not prepared.scene.has_own_pixels:
-            why = "views have no Gaussians of their own, which could be left out with the photos"
-        seen = "photos that the fit has seen" if has_target else "patches of photos that the fits have not seen"
-        note(f"quality: measured on {seen}, because {why}; new views look worse")
+            reason = "views have no Gaussians of their own, which could be left out with the photos"
+        pictures = "photos that the fit has seen" if has_target else "patches of photos that the fits have not seen"
+        note(f"quality: measured on {pictures}, because {reason}; new views look worse")
     return None
 
 
 @record_part()
 def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | None) -> Candidate:
-    """Build a candidate without some views, by a ``plan`` for the other views, and score it on the left-out photos.
+    """Build a candidate from the views that remain, by a ``plan`` for these, and score it on the left-out photos.
 
-    ``count`` is the number of Gaussians of the whole scene. The candidate has the share of it that the other views have
-    of all views.
+    ``count`` is the number of Gaussians for all views. The candidate has a part of it, by the share of views that
+    remain.
     """
     assert count is not None
     begin_part()
@@ -249,10 +261,10 @@ def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | Non
 
 
 def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int) -> int | None:
-    """Choose the number of Gaussians by the budget or the scene's curve; None: ``superpixels`` and K decide.
+    """Choose the number of Gaussians by the budget or the scene's curve; None if ``superpixels`` and K decide.
 
-    ``left_out``: photos that the curve is measured on; None: patches of all photos. ``most``: largest count of the
-    curve.
+    The curve is measured on the photos of ``left_out``; without them, on patches of all photos. ``most`` is its largest
+    count.
     """
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
@@ -268,39 +280,41 @@ def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut
     return curve_knee(points) if drop is None else count_within(points, drop)
 
 
-def level_counts(finest: int, plan: Plan) -> list[int]:
-    """Return the numbers of Gaussians of the coarser levels; none is below the least allowed count."""
-    counts = [finest // LEVEL_FACTOR**i for i in range(1, plan.levels)]
-    return [count for count in counts if count >= plan.limits.min_count]
-
-
 def next_count(
-    tried: Mapping[int, float], target: float, least: int, most: int, slope: float = PHOTOS_SLOPE, near: float = 0.0
+    psnrs: Mapping[int, float], target: float, least: int, most: int, slope: float = PHOTOS_SLOPE, near: float = 0.0
 ) -> int:
-    """Choose the next count to try in the search for the fewest Gaussians that reach a PSNR, within 15 %.
+    """Choose the next count to build in the search for the fewest Gaussians that reach a PSNR, within 15 %.
 
-    ``tried`` has the PSNR (dB) of at least one count. The PSNR is assumed to rise with the count. A count that is in
-    ``tried`` ends the search; the search also ends at a count at most ``near`` dB above the target. ``slope``: dB per
-    doubling that are assumed until two counts were tried.
+    A count that was built already is returned if it is near enough, so the search ends. The PSNR is assumed to rise
+    with the count. It is interpolated between the nearest counts on both sides of the target, or extrapolated from one
+    side.
+
+    Args:
+        psnrs: PSNR (dB) by count, of at least one count.
+        target: The PSNR (dB) to reach.
+        least: Fewest Gaussians to build.
+        most: Most Gaussians to build.
+        slope: dB per doubling of the count to assume, until two counts were built.
+        near: A count at most this many dB above the target is near enough.
     """
-    above = min((c for c, psnr in tried.items() if psnr >= target), default=None)
-    below = max((c for c, psnr in tried.items() if psnr < target and (above is None or c < above)), default=None)
-    if above is not None and tried[above] <= target + near:
+    above = min((c for c, psnr in psnrs.items() if psnr >= target), default=None)
+    below = max((c for c, psnr in psnrs.items() if psnr < target and (above is None or c < above)), default=None)
+    if above is not None and psnrs[above] <= target + near:
         return above
     if above is not None and below is not None:
         if above <= below * SAME_COUNT_RATIO:
             return above
         width = float(log(above / below))  # of the interval between the two counts; PSNR is linear in it
-        rise = (min(tried[above], target + FAR_DB) - tried[below]) / width
-        step = (target - tried[below]) / rise if rise > 0 else width / 2
+        rise = (min(psnrs[above], target + FAR_DB) - psnrs[below]) / width
+        step = (target - psnrs[below]) / rise if rise > 0 else width / 2
         return round(below * float(exp(min(max(step + 0.1 * width, 0.15 * width), 0.85 * width))))
-    if above is None and len(tried) > 1:
-        first, last = sorted(tried)[-2:]
-        measured = (tried[last] - tried[first]) / float(log(last / first) / log(2.0))
+    if above is None and len(psnrs) > 1:
+        first, last = sorted(psnrs)[-2:]
+        measured = (psnrs[last] - psnrs[first]) / float(log(last / first) / log(2.0))
         slope = min(max(measured, slope / 3), slope)
     edge = below if above is None else above
-    assert edge is not None  # one count has been tried
-    doublings = (target - tried[edge]) / slope
+    assert edge is not None  # one count has been built
+    doublings = (target - psnrs[edge]) / slope
     if above is None:
         return min(most, round(edge * float(power(2, min(max(doublings, 0.5 / slope), 3.0)))))
     return max(least, round(edge * float(power(2, max(min(doublings, -0.5 / slope), -3.0)))))

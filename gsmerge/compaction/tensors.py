@@ -108,18 +108,18 @@ def compact_tensors(
     if order not in TENSOR_ORDERS:
         raise ValueError(f"order: expected one of {', '.join(TENSOR_ORDERS)}, got {order!r}")
     columns = {
-        "means": _rows("means", means, 3),
-        "quats": _rows("quats", quats, 4),
-        "scales": _rows("scales", scales, 3),
-        "opacities": _rows("opacities", opacities),
-        "sh0": _read_base(sh0, colors),
+        "means": _copy_rows("means", means, 3),
+        "quats": _copy_rows("quats", quats, 4),
+        "scales": _copy_rows("scales", scales, 3),
+        "opacities": _copy_rows("opacities", opacities),
+        "sh0": _copy_sh0(sh0, colors),
     }
-    columns["shN"] = _read_harmonics(shN, len(columns["means"]))
-    gaussians, valid, notes = make_gaussians(columns)
+    columns["shN"] = _copy_harmonics(shN, len(columns["means"]))
+    gaussians, valid, notes = _check_gaussians(columns)
     cameras, photos = NO_CAMERAS, None
     if order != "none" or viewmats is not None or images is not None:
-        cameras, photos = _read_views(viewmats, Ks, images, shape)
-    scene, scene_notes = make_scene(gaussians, valid, cameras, photos, names, order)
+        cameras, photos = _check_cameras_and_images(viewmats, Ks, images, shape)
+    scene, scene_notes = _combine(gaussians, valid, cameras, photos, names, order)
     scene_notes += _rotation_notes(scene.gaussians.quats)
     result = compact(scene, progress=progress, **settings)
     result.report.notes[:0] = notes + scene_notes
@@ -128,7 +128,7 @@ def compact_tensors(
     return result.to(means.device if hasattr(means, "detach") else None)
 
 
-def make_scene(
+def _combine(
     gaussians: Gaussians,
     valid: np.ndarray,
     cameras: Cameras,
@@ -136,7 +136,11 @@ def make_scene(
     names: Sequence[str] | None,
     order: str,
 ) -> tuple[Scene, list[str]]:
-    """Combine Gaussians and views into a scene in the given order; return the scene and notes."""
+    """Combine Gaussians and views into a scene after a check that they fit; return the scene and notes.
+
+    ``valid`` is a mask ``[n]`` of the Gaussians that the scene gets. ``order`` says whether they are the pixels of the
+    views.
+    """
     if names is None or len(cameras) == 0:
         names = [f"view{view}" for view in range(len(cameras))]
     views = tuple(map(str, names))
@@ -157,66 +161,69 @@ def make_scene(
 
 
 def _to_numpy(name: str, values: Any) -> np.ndarray:
-    """Return an array or tensor as a NumPy array; raise SceneError if it holds no numbers."""
+    """Return an array or tensor as a NumPy array; SceneError if it holds no numbers."""
     check_numbers(name, values)
     return as_array(values)
 
 
-def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
-    """Copy values ``[...,*tail]`` to ``[n,*tail]`` float32; means may be float64."""
+def _copy_rows(name: str, values: Any, *row_shape: int) -> np.ndarray:
+    """Copy values of shape ``[...,*row_shape]`` to ``[n,*row_shape]`` float32; means may stay float64."""
     array = _to_numpy(name, values)
-    if array.ndim < len(tail) or array.shape[array.ndim - len(tail) :] != tail:
-        expected = ", ".join(map(str, ("n", *tail)))
+    if array.ndim < len(row_shape) or array.shape[array.ndim - len(row_shape) :] != row_shape:
+        expected = ", ".join(map(str, ("n", *row_shape)))
         raise SceneError(name, f"expected shape [{expected}], found {list(array.shape)}")
-    array = array.reshape(-1, *tail)
+    array = array.reshape(-1, *row_shape)
     return array.copy() if name == "means" and array.dtype == np.float64 else to_float32(array)
 
 
-def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
-    """Make Gaussians from columns, which are changed in place; rows with NaN or infinities become transparent.
+def _check_gaussians(columns: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
+    """Make Gaussians from columns after checks; SceneError if values have another convention.
 
-    Returns the Gaussians, a mask ``[n]`` of valid rows, which are finite and not empty, and notes.
+    The columns are changed in place. Rows with NaN or infinities become transparent, opacities are cut to [0, 1], and
+    quaternions get the length 1. Returns the Gaussians, a mask ``[n]`` of the rows that are finite and not empty, and
+    notes.
     """
-    n = len(out["means"])
-    for name, column in out.items():
+    n = len(columns["means"])
+    for name, column in columns.items():
         if len(column) != n:
             remedy = "pass sh0=sh[:, :1] and shN=sh[:, 1:]" if name == "sh0" and len(column) % max(n, 1) == 0 else ""
             raise SceneError(name, f"expected {n} rows, one for each mean, found {len(column)}", remedy)
     if n == 0:
         raise SceneError("means", "expected at least one Gaussian, found none")
     valid = np.ones(n, np.bool_)
-    for column in out.values():
+    for column in columns.values():
         valid &= np.isfinite(column.reshape(n, -1)).all(1)
-    num_bad = clear_invalid("means", out | {"valid": valid})
-    check_values(out)
-    _check_lengths(out["quats"][valid])
-    np.clip(out["opacities"], 0, 1, out=out["opacities"])
-    min_difference = 1e-5  # of a quaternion's length from 1, from which on it is normalised
-    off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > min_difference)
-    out["quats"][off] = normalize(out["quats"][off])
-    out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
+    num_bad = clear_invalid("means", columns | {"valid": valid})
+    check_values(columns)
+    quats, opacities = columns["quats"], columns["opacities"]
+    _check_lengths(quats[valid])
+    np.clip(opacities, 0, 1, out=opacities)
+    max_difference = 1e-5  # a quaternion is normalised if its length differs from 1 by more
+    rows = np.flatnonzero(np.abs(np.linalg.norm(quats, axis=1) - 1) > max_difference)
+    quats[rows] = normalize(quats[rows])
+    quats[(quats == 0).all(1)] = (1, 0, 0, 0)
     notes = [count_words(num_bad, "row", "with NaN or inf, set aside")] if num_bad else []
-    empty = find_empty("means", out | {"valid": valid})
-    clear_rows(out | {"valid": valid}, empty)
+    empty = find_empty("means", columns | {"valid": valid})
+    clear_rows(columns | {"valid": valid}, empty)
     notes += [count_words(len(empty), "empty row", "at the origin, set aside")] if len(empty) else []
-    return Gaussians(**out), valid, notes
+    return Gaussians(**columns), valid, notes
 
 
-def _read_base(sh0: Array | None, colors: Array | None) -> np.ndarray:
-    """Return ``sh0 [n,1,3]`` as given, or compute it from colours."""
+def _copy_sh0(sh0: Array | None, colors: Array | None) -> np.ndarray:
+    """Return a copy of ``sh0 [n,1,3]``, or compute it from ``colors``; SceneError if both or neither are given."""
     if (sh0 is None) == (colors is None):
         found = "neither" if sh0 is None else "both"
         raise SceneError("sh0", f"expected either sh0 or colors, found {found}")
     if sh0 is not None:
-        return _rows("sh0", sh0, 3).reshape(-1, 1, 3)
-    rgb = _rows("colors", colors, 3)
-    max_color = 2.0  # largest colour; harmonics may take colours a little beyond 1
-    _expect_unit_range("colors", rgb[np.isfinite(rgb)], max_color - 1)
+        return _copy_rows("sh0", sh0, 3).reshape(-1, 1, 3)
+    rgb = _copy_rows("colors", colors, 3)
+    slack = 1.0  # harmonics may take colours beyond [0, 1], but hardly by more than this
+    _expect_unit_range("colors", rgb[np.isfinite(rgb)], slack)
     return rgb_to_sh0(rgb)[:, None]
 
 
-def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
-    """Return ``shN [n,k-1,3]``, with k = 1 if there are no higher harmonics; SceneError for any other shape."""
+def _copy_harmonics(shN: Array | None, n: int) -> np.ndarray:
+    """Return a copy of ``shN [n,k-1,3]``, with k = 1 if there are no higher harmonics; SceneError for other shapes."""
     shape = (0, 3) if shN is None else _to_numpy("shN", shN).shape
     if shape[-2:] == (0, 3):
         return np.zeros((n, 0, 3), np.float32)
@@ -225,14 +232,13 @@ def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
         swapped = len(shape) >= 3 and shape[-2] == 3 and shape[-1] in counts
         problem = f"expected shape [n, k-1, 3] with 3, 8, 15 or 24 coefficients, found {list(shape)}"
         raise SceneError("shN", problem, "pass shN.transpose(-1, -2): each coefficient's colours last" * swapped)
-    return _rows("shN", shN, shape[-2], 3)
+    return _copy_rows("shN", shN, shape[-2], 3)
 
 
 def _check_lengths(quats: np.ndarray) -> None:
-    """Raise SceneError for quaternions of other lengths than 1; a scene may have them, as no stage uses lengths."""
+    """Raise SceneError if many quaternions do not have the length 1, since they may be something else."""
     lengths = np.linalg.norm(quats, axis=1)
-    # Difference of a quaternion's length from 1; share of rows that may exceed it
-    max_difference, max_share = 0.01, 0.01
+    max_difference, max_share = 0.01, 0.01  # of a length from 1; share of rows that may differ by more
     share = float((np.abs(lengths - 1) > max_difference).mean())
     if share > max_share:
         sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
@@ -241,7 +247,7 @@ def _check_lengths(quats: np.ndarray) -> None:
 
 
 def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
-    """Raise SceneError for colours more than ``slack`` outside [0, 1]; the message guesses their range."""
+    """Raise SceneError for colours more than ``slack`` outside [0, 1]; the remedy guesses which range they have."""
     low, high = float(values.min(initial=0)), float(values.max(initial=0))
     if -slack <= low and high <= 1 + slack:
         return
@@ -253,16 +259,16 @@ def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
     raise SceneError(name, f"expected sRGB in [0, 1], found {low:.3g} to {high:.3g}", remedy)
 
 
-def _read_views(
+def _check_cameras_and_images(
     viewmats: Array | None, Ks: Array | None, images: Array | None, shape: Sequence[int] | None
 ) -> tuple[Cameras, np.ndarray | None]:
-    """Return the cameras and ``images [v,h,w,3]``, after each was checked alone."""
+    """Return the cameras and ``images [v,h,w,3]``; SceneError for shapes or values that these cannot have."""
     if viewmats is None or Ks is None:
         raise SceneError("viewmats" if viewmats is None else "Ks", "expected one matrix for each view, found none")
     photos = None if images is None else _to_numpy("images", images)
     views, height, width = _view_shape(shape, photos)
-    matrices = _matrices("viewmats", viewmats, ((3, 4), (4, 4)), views)
-    intrinsics = _matrices("Ks", Ks, ((3, 3),), views)
+    matrices = _to_matrices("viewmats", viewmats, ((3, 4), (4, 4)), views)
+    intrinsics = _to_matrices("Ks", Ks, ((3, 3),), views)
     poses = np.tile(np.eye(4), (views, 1, 1))
     poses[:, : matrices.shape[1]] = matrices
     check_poses(poses, intrinsics)
@@ -283,8 +289,8 @@ def _read_views(
     return cameras, to_float32(photos.reshape(expected)).clip(0, 1)
 
 
-def _matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: int) -> np.ndarray:
-    """Return one float64 matrix for each view; SceneError if its shape is none of ``shapes``."""
+def _to_matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: int) -> np.ndarray:
+    """Return a float64 matrix for each of so many ``views``; SceneError if their shape is none of ``shapes``."""
     array = _to_numpy(name, values).astype(np.float64, order="C")
     if array.shape[-2:] not in shapes or array.size != views * array.shape[-2] * array.shape[-1]:
         expected = " or ".join(str([views, *shape]) for shape in shapes)
@@ -293,7 +299,7 @@ def _matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: 
 
 
 def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple[int, int, int]:
-    """Return the number of views, height and width: as given, or those of the images."""
+    """Return the number of views, their height and width: those of ``shape``, or else those of the photos."""
     if shape is not None:
         if len(shape) != 3:
             raise SceneError("shape", f"expected views, height and width, found {list(shape)}")
@@ -310,15 +316,18 @@ def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple
 
 def _image_error(photos: np.ndarray, expected: str) -> SceneError:
     """Return the error for images of a wrong shape, with a remedy."""
-    first = photos.ndim >= 4 and photos.shape[-3] == 3 != photos.shape[-1]
-    remedy = "channels come first: pass images.permute(0, 2, 3, 1)" if first else "resize them to the model's input"
+    is_turned = photos.ndim >= 4 and photos.shape[-3] == 3 != photos.shape[-1]
+    remedy = "channels come first: pass images.permute(0, 2, 3, 1)" if is_turned else "resize them to the model's input"
     return SceneError("images", f"expected shape {expected}, found {list(photos.shape)}", remedy)
 
 
 def _check_pixels(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, names: tuple[str, ...]
 ) -> tuple[Cameras, list[str]]:
-    """Check that Gaussians project into their own pixels; return the cameras, moved slightly if needed, and notes."""
+    """Return the cameras, moved slightly if needed, and notes; SceneError unless Gaussians project into their pixels.
+
+    The error names what else the cameras may be, such as those of another convention or another size.
+    """
     pairs = sample_pixels(gaussians, cameras, valid)
     alignment = check_pairs(pairs, cameras)
     if alignment.ok:
@@ -340,10 +349,10 @@ def _check_pixels(
 
 
 def _rotation_notes(quats: np.ndarray) -> list[str]:
-    """Return a note on quaternions whose w may come last, or none: the last column is never negative, the first is.
+    """Return a note if the w of quaternions may come last: the last column is never negative, and the first is.
 
-    Quaternions computed from matrices rarely have a negative w. An exception is Depth Anything 3, which makes the last
-    component of wxyz positive.
+    Quaternions that are computed from matrices rarely have a negative w. The note may be wrong for Depth Anything 3,
+    whose quaternions wxyz have a last component that is never negative.
     """
     if not quats[:, 3].min(initial=0) >= 0 > quats[:, 0].min(initial=0):
         return []
@@ -351,7 +360,7 @@ def _rotation_notes(quats: np.ndarray) -> list[str]:
 
 
 def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:
-    """Raise SceneError for poses that see the Gaussians only in another convention; return notes on other poses."""
+    """Raise SceneError if poses see the Gaussians only in another convention; return notes on other doubtful poses."""
     poses, check, note = choose_poses(gaussians, valid, cameras, photo_array(images), W2C_OPENCV)
     if poses is not None:
         raise _convention_error(poses.convention, poses.description, check.description)

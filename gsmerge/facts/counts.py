@@ -11,7 +11,7 @@ from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, 
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 
 STREAMED_LEVELS = 3  # levels of detail of a lod-meta.json; the coarsest, a sixteenth of the Gaussians, loads at once
-LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
+LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the next finer one
 FEW_PIXELS = 1 << 18  # pixels of a few small photos
 # A scene has few Gaussians if it has less than this number per pixel of the photos, of which at most FEW_PIXELS pixels
 # count. The superpixels are then a share of the pixels, but at most this share of the Gaussians
@@ -33,6 +33,11 @@ def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int |
     if size := file_size(options):
         return min(count_for_bytes(size.file, size.num_bytes, sh_degree), limit)
     return min(parse_budget(str(options.budget), num_input), limit)
+
+
+def level_counts(finest: int, num_levels: int, least: int = 1) -> list[int]:
+    """Return the numbers of Gaussians of the coarser levels of detail, below ``finest``; none is below ``least``."""
+    return [count for level in range(1, num_levels) if (count := finest // LEVEL_FACTOR**level) >= least]
 
 
 @dataclass(frozen=True)

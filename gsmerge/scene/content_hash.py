@@ -1,4 +1,4 @@
-"""Hash all files that a scene is read from, see whether they change, and fill the names of scenes into paths."""
+"""Hash the files that a scene is read from, detect changes of them, and fill the names of scenes into paths."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def digest(value: Mapping[str, Any]) -> str:
 
 
 def content_hash(files: Sequence[Path]) -> str:
-    """Compute one SHA-256 over the names and contents of files and of everything in folders."""
+    """Compute one SHA-256 over the names and contents of files, and of all files in folders."""
     state = hashlib.sha256()
     for root in files:
         for path in _walk(root):
@@ -43,23 +43,23 @@ def content_hash(files: Sequence[Path]) -> str:
 
 
 def _walk(root: Path) -> list[Path]:
-    """List a file, or all files in a folder, sorted."""
+    """List all files in a folder, sorted; of a file, only itself."""
     return sorted(path for path in walk_files(root) if path.is_file()) if root.is_dir() else [root]
 
 
 def read_stats(files: SceneFiles) -> dict[Path, tuple[int, ...]]:
-    """Return size, time of change and inode of each file of a scene, for :func:`list_changed`."""
+    """Return the state of each file of a scene, for :func:`list_changed`: size, time of the last change, and inode."""
     roots = [root for scene in (files, *files.more) for root in scene.paths]
     return {path: stat for root in roots for path in _walk(root) if (stat := _read_stat(path)) is not None}
 
 
 def list_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
-    """List the files whose content has changed since their ``stats`` were read, but not those that are gone."""
+    """List the files that have changed since their ``stats`` were read; deleted files are not listed."""
     return [str(path) for path, stat in stats.items() if _read_stat(path) not in (None, stat)]
 
 
 def doubt_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
-    """Doubt a result, in at most one note, if files of its scene have changed since they were read."""
+    """Return one doubt about a result if files of its scene have changed since they were read; otherwise none."""
     changed = list_changed(stats)
     more = f" and {count_words(len(changed) - 1, 'other file')}" if len(changed) > 1 else ""
     text = "changed during the run; the result is of what was read before"
@@ -67,6 +67,7 @@ def doubt_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
 
 
 def _read_stat(path: Path) -> tuple[int, ...] | None:
+    """Return size, time of the last change and inode of a file; None if it cannot be accessed."""
     with suppress(OSError):
         stat = path.stat()
         return stat.st_size, stat.st_mtime_ns, stat.st_ino
@@ -74,7 +75,7 @@ def _read_stat(path: Path) -> tuple[int, ...] | None:
 
 
 def list_files(files: SceneFiles) -> list[Path]:
-    """List all files and folders from which a scene is read, each once."""
+    """List all files and folders that a scene is read from, each once."""
     paths = list(files.paths)
     for cameras in filter(None, (files.cameras, *files.others)):
         root = cameras if cameras.is_dir() else cameras.parent
@@ -85,7 +86,7 @@ def list_files(files: SceneFiles) -> list[Path]:
 
 
 def list_photos(files: SceneFiles, cameras: Path) -> list[Path]:
-    """List the photos that may show the views of some cameras, and the masks that the cameras' file names."""
+    """List the photos that may show the views of a camera file, and the masks that this file names."""
     try:
         camera_file = read_cameras(cameras)
         proposal = propose_photos(files, camera_file)

@@ -1,4 +1,4 @@
-"""The table of known exporters, and hints of the caller on how to read a file.
+"""Know the exporters of files of Gaussians by a table, and take the caller's hints on how to read a file.
 
 To add a model, add a :class:`Model` to the exporter whose columns, order and encodings it shares, or add an exporter.
 ``python tasks.py reference`` renews docs/reference/exporters.md.
@@ -34,14 +34,14 @@ def make_hints(values: dict[str, Any]) -> ReadHints:
 
 @dataclass(frozen=True)
 class Model:
-    """A model or program, whose code for saving was read to describe its files."""
+    """A model or program whose files are known, because its code for saving was read."""
 
     title: str  # the name that people use
-    source: str  # repository and commit; files with a commit of their own were read again later
-    output: str  # description of its files, as far as the exporter does not describe them
+    source: str  # repository and commit that were read; single files may have a later commit
+    output: str  # what files it writes, beyond what the exporter says
     result: str = "read right"  # how gsmerge reads these files, and what the user has to add
     place: str = ""  # pattern of its files' paths, if no other model with the same columns uses these paths
-    camera_advice: str = ""  # how to get its cameras if they are missing, a clause
+    camera_advice: str = ""  # a clause that says how to get its cameras if they are missing
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,12 @@ class Exporter:
 
 
 _NORMALS = ("nx", "ny", "nz")
-# Results of reading: what users have to add, or what is lost
+# Values of ``Model.result``: what users have to add, or what is lost
 _NAME_CAMERAS = "read right with cameras, or with those that its grid shows"
 _NO_PIXELS = "read without pixels"
 _IF_GRID_SHOWS = "read right where the rows show their grid, else without pixels"
 _WITH_CAMERAS = "read without pixels; photos are used where cameras are named"
-# Place of a trained scene, and how to get its cameras
+# ``place`` and ``camera_advice`` of a trained scene
 _TRAINED = "iteration_*/point_cloud.ply", "cameras.json of the run has the cameras: name its folder, or the file itself"
 
 _EXPORTERS = (
@@ -381,7 +381,7 @@ EXPORTERS = {exporter.name: exporter for exporter in _EXPORTERS}
 
 
 def find_exporter(name: str) -> Exporter | None:
-    """Return the exporter with a name; None for "auto", ValueError if there is none."""
+    """Return the exporter with a name; None for "auto". ValueError for an unknown name."""
     if name != "auto" and name not in EXPORTERS:
         raise ValueError(f"exporter: expected 'auto' or one of {', '.join(EXPORTERS)}, got {name!r}")
     return EXPORTERS.get(name)
@@ -390,9 +390,9 @@ def find_exporter(name: str) -> Exporter | None:
 def choose_exporters(name: str, info: FileInfo, order: str, cameras: str) -> tuple[Exporter, ...]:
     """Return the exporter with a name; for "auto", all exporters that may have written the file.
 
-    Exporters that leave a mark in the header precede exporters that leave none, and those of the same order precede
-    those of another one. ``order`` is the order of the rows, "none" if they belong to no pixels, and ``cameras`` the
-    format of the cameras, "" without any.
+    If the header has a mark, only exporters that leave a mark count. Of the exporters that count, those that write rows
+    in this ``order`` are returned; if there are none, those that leave a mark. ``order`` is "none" if rows belong to no
+    pixels. ``cameras`` is the format of the cameras, "" without any.
     """
     exporter = find_exporter(name)
     if exporter is not None:

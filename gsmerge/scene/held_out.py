@@ -1,4 +1,4 @@
-"""Read held-out photos with their cameras in the frame of a scene; renders of the scene are compared with them."""
+"""Read held-out photos, with which renders of a scene are compared, and their cameras in the frame of the scene."""
 
 from __future__ import annotations
 
@@ -26,32 +26,32 @@ _OPTION = "evaluate --target-images"  # gsmerge view has no such option
 
 @dataclass(frozen=True)
 class HeldOutViews(Views):
-    """Held-out views: t views that the scene was not made from, in the frame of its Gaussians."""
+    """Held-out views, from which the scene was not made, in the frame of its Gaussians."""
 
-    places: tuple[int, ...]  # index of each view in the camera file, which is its place along the trajectory
-    context_places: tuple[int, ...] | None  # index of each view of the scene in the file; None if one is not in it
+    places: tuple[int, ...]  # index of each held-out view in the camera file, which is its place along the trajectory
+    context_places: tuple[int, ...] | None  # index in this file of each view of the scene; None if it lacks one
     notes: tuple[str, ...] = ()  # what was adapted, one sentence each
 
 
 def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
-    """Read held-out photos and their cameras, in any format of a scene.
+    """Read held-out photos and their cameras, in any format that a scene may have.
 
     Views from which the scene was made are left out. If the file has these views under the same names, their poses give
     the map from the file's world to the world of the Gaussians. Otherwise the file is assumed to share the world of the
-    scene's own cameras. Poses are read in the convention in which the scene's cameras fit. ``images``: folder of the
-    photos; None: the files that the camera file names. SceneError if a file is missing or damaged, or no view is left.
+    scene's own cameras. Poses are read in the convention in which the scene's cameras fit. ``images`` is the folder of
+    the photos; None: the camera file names them. SceneError if a file is missing or damaged, or if no view remains.
     """
     path = Path(cameras)
     if not path.exists():
         raise SceneError(path, "expected cameras of held-out views, found no such file or folder")
     camera_file, shared = read_into_frame(load, path)
-    shared |= _repeated(camera_file.viewmats, load.scene)
+    shared |= _match_by_pose(camera_file.viewmats, load.scene)
     places = [i for i in range(len(camera_file)) if i not in shared]
     if not places:
         problem = "expected held-out views, found only views that the scene was made from"
         raise SceneError(path, problem, "name a camera file that has other views of the scene")
     held_out = select_views(camera_file, places)
-    files = SceneFiles(load.files.ply, path, _folder(path, held_out, images), photo_option=_OPTION)
+    files = SceneFiles(load.files.ply, path, _find_photo_folder(path, held_out, images), photo_option=_OPTION)
     photos = stored_photos(files, held_out)
     if not len(photos):
         root = path if path.is_dir() else path.parent
@@ -74,21 +74,26 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
 
 
 def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
-    """Read a camera file into the frame of a scene's Gaussians; also map its views to views of the scene.
+    """Read a camera file, and move its cameras into the frame of a scene's Gaussians; also map views to the scene's.
 
-    Frame and convention are chosen as in :func:`read_held_out`.
+    The map has the indices of the views in the file that the scene also has, and their indices in the scene. The
+    convention and the frame are found as in :func:`read_held_out`.
     """
     stored, cameras = read_cameras(path), load.cameras
     candidates = [stored]
     if cameras is not None and cameras.source == stored.source and cameras.convention != stored.convention:
         candidates.insert(0, with_convention(stored, cameras.convention))  # in which the scene's own cameras fit
+    # a candidate with shared views is preferred
     worlds = [(candidate, *_find_world(candidate, load)) for candidate in candidates]
     camera_file, world, shared = next((entry for entry in worlds if entry[2]), worlds[0])
     return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
 
 
-def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
-    """Return the folder of the photos that was named, or the file with photos inside; None: search for their names."""
+def _find_photo_folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
+    """Return the folder ``images``, or else the camera file if it has photos inside; None if they have to be searched.
+
+    SceneError if ``images`` is no folder.
+    """
     if images is not None:
         if not Path(images).is_dir():
             actual = "a file" if Path(images).exists() else "no such folder"
@@ -97,8 +102,8 @@ def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | N
     return path if len(cameras.images) else None
 
 
-def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
-    """Map indices in the file to views of the scene that have the same name; empty if stems are not unique."""
+def _match_by_name(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
+    """Map views of a file to views of the scene with the same name, by index; empty if stems are not unique."""
     places, views = (
         {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(view_names)}
         for view_names in (camera_file.names, names)
@@ -111,16 +116,17 @@ def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, 
 def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict[int, int]]:
     """Find the similarity from the file's world to the world of the Gaussians, and the views that the scene also has.
 
-    The result maps indices in the file to views of the scene with the same name; it is empty if their poses differ.
+    The latter maps views of the file to views of the scene with the same name, by index. It is empty if no similarity
+    brings their poses together.
     """
-    stored, named = _similarity_from_stored(load), _shared_views(camera_file, load.scene.names)
-    if not named:
+    stored, shared = _similarity_from_stored(load), _match_by_name(camera_file, load.scene.names)
+    if not shared:
         return stored, {}
-    theirs = camera_file.viewmats[list(named)]
-    ours = load.scene.cameras.viewmats[list(named.values())]
-    min_shared = 3  # views that determine the similarity between two worlds
-    frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(named) >= min_shared)
-    max_angle = 0.2  # degrees by which a view's two poses may differ after one frame is moved to the other
+    theirs = camera_file.viewmats[list(shared)]
+    ours = load.scene.cameras.viewmats[list(shared.values())]
+    min_shared = 3  # fewest views that determine the similarity between two worlds
+    frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(shared) >= min_shared)
+    max_angle = 0.2  # degrees by which a view's two poses may differ in one frame
     max_shift = 0.005  # largest distance between a view's two poses, relative to the extent of all views
     for frame in frames:
         moved, centres = frame.move_viewmats(theirs), camera_centres(ours)
@@ -129,7 +135,7 @@ def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict
         spread = float(np.linalg.norm(np.ptp(centres, axis=0), axis=0)) or 1.0
         angle = np.degrees(arccos(cosines.clip(-1, 1))).max()
         if angle <= max_angle and distance / spread <= max_shift:
-            return frame, named
+            return frame, shared
     return stored, {}
 
 
@@ -147,14 +153,15 @@ def _similarity_from_stored(load: Loaded) -> Similarity:
     return fit_similarity(camera_file.viewmats, load.cameras.viewmats)
 
 
-def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
-    """Map views, whose poses ``moved [t,4,4]`` are in the scene's frame, to views of the scene with the same pose."""
+def _match_by_pose(viewmats: np.ndarray, scene: Scene) -> dict[int, int]:
+    """Map views with ``viewmats [t,4,4]`` in the scene's frame to views of the scene with the same pose, by index."""
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
-    same_pose = 1e-4  # largest distance of equal poses, relative to the scene's distance; and difference of rotations
-    # The limit is relative to the distance of the scene, since a single view has no distance between views
+    # Equal poses may differ by this much in each element of their rotations, and in their centres by this share of the
+    # distance to the scene. A distance between views would not do, since there may be a single view
+    same_pose = 1e-4
     limit = same_pose * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
-    same_place = np.linalg.norm(camera_centres(moved)[:, None] - camera_centres(ours), axis=2) <= limit
-    same_rotation = np.abs(moved[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= same_pose
+    same_place = np.linalg.norm(camera_centres(viewmats)[:, None] - camera_centres(ours), axis=2) <= limit
+    same_rotation = np.abs(viewmats[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= same_pose
     return {int(i): int(view) for i, view in zip(*np.nonzero(same_place & same_rotation), strict=True)}

@@ -1,4 +1,4 @@
-"""The input of a run: a scene in memory, whose values are checked, or a path, which is read."""
+"""Take the input of a run: check a scene in memory, or read one from a path."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from gsmerge.scene.read import load_scene
 from gsmerge.types import Scene, StrPath
 from gsmerge.values.arrays import Array, as_array, check_numbers
 
-TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by so much
+TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by this much
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
-    """Return a scene unchanged after a check, or read it from a path; note what reading its files had to say."""
+    """Return a scene unchanged after a check, or read it from a path; its notes go into the record of the run."""
     if isinstance(scene, Scene):
         check_scene(scene)
     else:
@@ -30,7 +30,7 @@ def as_scene(scene: Scene | StrPath) -> Scene:
 
 
 def check_scene(scene: Scene) -> None:
-    """Raise SceneError for a scene with values of another convention; readers make no such scene."""
+    """Raise SceneError for a scene with values of another convention, as callers may make it; readers do not."""
     gaussians, cameras = vars(scene.gaussians), scene.cameras
     arrays = {**gaussians, "viewmats": cameras.viewmats, "Ks": cameras.Ks, "images": scene.images}
     for name, values in arrays.items():
@@ -41,7 +41,7 @@ def check_scene(scene: Scene) -> None:
 
 
 def check_values(columns: Mapping[str, Array]) -> None:
-    """Raise SceneError for log scales and logits; rows with NaN or infinities do not count."""
+    """Raise SceneError if scales are logarithms or opacities are logits; rows with NaN or infinities do not count."""
     scales, opacities = as_array(columns["scales"]), as_array(columns["opacities"])
     if len(scales) == 0 or (_lie_within(scales, 0, np.inf) and _lie_within(opacities, 0, 1)):
         return

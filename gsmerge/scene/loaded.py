@@ -1,4 +1,4 @@
-"""A scene as it was read, with all facts about its files."""
+"""The type of a scene that was read from files, with all facts about these."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Loaded:
     """A scene, with all facts about its files and how they were read."""
 
     scene: Scene  # with pixels if the rows have them
-    info: FileInfo
-    files: SceneFiles
+    info: FileInfo  # header and encodings of the file of Gaussians
+    files: SceneFiles  # the paths of all its files
     # the cameras as stored in their file, in the order of the views; None without cameras, or if they do not fit
     cameras: CameraFile | None
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
@@ -31,38 +31,49 @@ class Loaded:
     # how well every view's Gaussians project into their own pixels; None if rows have no pixels
     alignment: Alignment | None = None
     recovery: Recovery | None = None  # the layout of rows that fits best, and by how much; None without pixels
-    problem: str | None = None  # why the rows have no pixels, in one sentence; None if they have
+    problem: str | None = None  # why the rows have no pixels, in one sentence; None if they have pixels
     # how far each camera was moved to its Gaussians; empty if none was moved
     moves: Sequence[dict[str, Any]] = ()
     joined: Sequence[dict[str, Any]] = ()  # where each of several joined scenes lies; empty for one scene
     photos_explain: bool = False  # whether the photos that names propose explain what most views show
-    stats: Mapping[Path, tuple[int, ...]] = field(default_factory=dict)  # of the files before they were read
-    sha256: str | None = None  # of the files of Gaussians, one after the other; None if it was not asked for
-    own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
+    stats: Mapping[Path, tuple[int, ...]] = field(default_factory=dict)  # states of the files before they were read
+    sha256: str | None = None  # hash of the files of Gaussians, one after the other; None if it was not asked for
+    own_views: int = 0  # if rows have no pixels in these cameras: views of the grid that they form alone; 0 for none
 
     @property
     def doubts(self) -> list[str]:
-        """Those of the notes that make results doubtful, as on cameras and photos that are left out."""
+        """The notes that make results doubtful, such as those on cameras and photos that are left out."""
         return list_doubts(self.notes)
 
     @property
     def comments(self) -> tuple[str, ...]:
-        """Comments of the file's header that a result copies; not the comment on 2D Gaussians, since results are 3D."""
+        """Comments of the file's header that a result copies; without that on 2D Gaussians, since results are 3D."""
         return tuple(comment for comment in kept_comments(self.info) if comment != FLAT_COMMENT)
 
     @property
     def recognised(self) -> dict[str, Any]:
-        """Facts about the input for a report."""
+        """Facts about the input for a report, as plain JSON types."""
         cameras, recovery, info = self.scene.cameras, self.recovery, self.info
-        facts: dict[str, Any] = {"path": str(self.files.ply), "sha256": self.sha256, "bytes": info.file_bytes}
-        facts |= {"num_gaussians": self.scene.num_gaussians}
-        facts |= {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
-        facts |= {"num_photos": len(self.scene.photo_views)}
-        facts |= {"exporters": [entry.name for entry in self.exporters], "rows": recovery and recovery.description}
-        facts |= {"moved_cameras": list(self.moves)}
+        facts = {
+            "path": str(self.files.ply),
+            "sha256": self.sha256,
+            "bytes": info.file_bytes,
+            "num_gaussians": self.scene.num_gaussians,
+            "num_views": len(cameras),
+            "height": cameras.height,
+            "width": cameras.width,
+            "num_photos": len(self.scene.photo_views),
+            "exporters": [entry.name for entry in self.exporters],
+            "rows": recovery and recovery.description,
+            "moved_cameras": list(self.moves),
+        }
         if self.files.parts:
             facts["parts"] = [str(path) for path in self.files.parts]
         if self.joined:
             facts["files"] = list(self.joined)
-        facts |= {"layout": info.layout, "sh_degree": info.sh_degree, "opacity_encoding": info.opacity_encoding}
-        return facts | {"num_nonfinite": info.num_nonfinite}
+        return facts | {
+            "layout": info.layout,
+            "sh_degree": info.sh_degree,
+            "opacity_encoding": info.opacity_encoding,
+            "num_nonfinite": info.num_nonfinite,
+        }

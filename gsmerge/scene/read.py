@@ -1,4 +1,7 @@
-"""Read a scene from its files: a :class:`gsmerge.types.Scene` with the pixel of every row if rows have pixels."""
+"""Read a scene from its files: Gaussians with the pixel of each if rows have pixels, cameras and photos.
+
+A function returns a :class:`SceneError`, rather than raising it, if its caller may read the scene in another way.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +66,7 @@ from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
 T = TypeVar("T")
-SUMMED_FACTS = ("file_bytes", "num_nonfinite")  # facts about the files of several scenes that are added
+SUMMED_FACTS = ("file_bytes", "num_nonfinite")  # facts about files that are added up if scenes are joined
 
 
 @check_arguments
@@ -144,7 +147,7 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 
 def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
-    """Join several scenes of the same place to one, with the notes of all."""
+    """Join several scenes of the same place to one, which has the notes of all."""
     from gsmerge.cameras.registration.join import join_scenes
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
@@ -166,10 +169,10 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
 def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> GaussianFile:
     """Read the Gaussians of a scene's files.
 
-    A named exporter that writes logits decides the encoding of opacities, unless ``opacity`` does.
+    If the hints name an exporter that writes logits, opacities are read as logits, unless ``opacity`` says otherwise.
     """
     exporter = find_exporter(hints.exporter)
-    # An exporter of raw opacities does not decide: they are recognised, and some of its versions write logits
+    # An exporter of raw opacities decides nothing: raw opacities are recognised, and some of its versions write logits
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"
     encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales, "colors": hints.colors}
@@ -182,53 +185,65 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
     Cameras and photos that were found beside the scene and do not belong to it are left out, with a note. SceneError as
     in :func:`read_scene`. ``photos=False``: search no photos.
     """
-    answer = _choose_cameras(ply, files, hints, photos=photos)
-    lacks_views = isinstance(answer, Loaded) and answer.own_views > len(answer.scene)
-    if isinstance(answer, Loaded) and not lacks_views:
-        return answer
-    is_stray = isinstance(answer, SceneError) and "cameras" not in files.named and not _is_fault_of_named(files, answer)
-    if files.cameras not in (None, files.ply) and (lacks_views or is_stray):
-        fewer = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
-        alone = _read_views(ply, fewer, hints, photos=photos)
-        lacks_named = "images" in files.named and files.images is not None
-        if isinstance(alone, Loaded) and not (lacks_named and alone.scene.images is None):
-            stored = _read_or_error(partial(read_scene_cameras, ply, files))
-            text = describe_missing(alone.scene.names, stored, is_right=lacks_views)
-            if text is not None:
-                return replace(alone, notes=(text, *(n for n in alone.notes if not n.startswith(NO_CAMERAS_USED))))
-            if isinstance(answer, SceneError):
-                return _note_left_out(alone, files, [str(files.cameras)], answer)
-    if isinstance(answer, Loaded):
-        return answer
+    result = _choose_cameras(ply, files, hints, photos=photos)
+    lacks_views = isinstance(result, Loaded) and result.own_views > len(result.scene)
+    may_leave_out = lacks_views or (
+        isinstance(result, SceneError) and "cameras" not in files.named and not _is_fault_of_named(files, result)
+    )
+    if may_leave_out and files.cameras not in (None, files.ply):
+        result = _read_without_cameras(ply, files, hints, result, photos=photos)
+    if isinstance(result, Loaded):
+        return result
     if "cameras" not in files.named:
         _check_hints(ply, hints)
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
     read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
-    raise SceneError(answer.path, answer.problem, "; ".join(filter(None, (answer.remedy, read_alone))))
+    raise SceneError(result.path, result.problem, "; ".join(filter(None, (result.remedy, read_alone))))
+
+
+def _read_without_cameras(
+    ply: GaussianFile, files: SceneFiles, hints: ReadHints, result: Loaded | SceneError, *, photos: bool
+) -> Loaded | SceneError:
+    """Read a scene without its camera file, with a note; its views are those of the grid that its rows form.
+
+    ``result`` is what reading with that file gave: a scene with fewer views than the grid, or an error. It is returned
+    if the scene cannot be read without the file, would lose photos that the caller named, or has no other views.
+    """
+    fewer = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
+    load = _read_views(ply, fewer, hints, photos=photos)
+    needs_photos = "images" in files.named and files.images is not None
+    if isinstance(load, SceneError) or (needs_photos and load.scene.images is None):
+        return result
+    stored = _read_or_error(partial(read_scene_cameras, ply, files))
+    text = describe_missing(load.scene.names, stored, is_right=isinstance(result, Loaded))
+    if text is not None:
+        return replace(load, notes=(text, *(note for note in load.notes if not note.startswith(NO_CAMERAS_USED))))
+    return _note_left_out(load, files, [str(files.cameras)], result) if isinstance(result, SceneError) else result
 
 
 def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Read the views of the first cameras that fit for certain, or else of the first that can be read; or why of none.
+    """Read a scene with the first of its cameras that fit for certain, or else with the first that can be read.
 
-    A note says which cameras are read if there are others.
+    A note says which cameras are read if there are others. Returns the first error if none can be read.
     """
     loads, errors = list[Loaded](), list[SceneError]()
     for choice in files.choices:
-        answer = _read_views(ply, choice, hints, photos=photos)
-        if isinstance(answer, SceneError):
-            errors.append(answer)
+        load = _read_views(ply, choice, hints, photos=photos)
+        if isinstance(load, SceneError):
+            errors.append(load)
             continue
-        noted = replace(answer, notes=(*files.describe_choice(choice.cameras), *answer.notes))
-        if _fit_for_certain(answer, files):
-            return noted
-        loads.append(answer if choice.cameras == files.cameras else noted)
+        with_note = replace(load, notes=(*files.describe_choice(choice.cameras), *load.notes))
+        if _fit_for_certain(load, files):
+            return with_note
+        loads.append(load if choice.cameras == files.cameras else with_note)
     return loads[0] if loads else errors[0]
 
 
 def _fit_for_certain(load: Loaded, files: SceneFiles) -> bool:
-    """Return whether cameras fit for certain: rows are their pixels, or the photos explain their views.
+    """Return whether cameras fit for certain, so that no others have to be tried.
 
-    Without photos, cameras beside the scene are believed, and those in folders below it are not.
+    With photos, they do if rows are their pixels, if the photos explain their views, or if there are no others. Without
+    photos, they do if rows are their pixels or nothing is doubtful, but never if they lie in a folder below the scene.
     """
     if load.scene.images is None:
         return not files.below and (load.scene.has_own_pixels or not load.doubts)
@@ -236,11 +251,11 @@ def _fit_for_certain(load: Loaded, files: SceneFiles) -> bool:
 
 
 def _confirm_colors(load: Loaded) -> Loaded:
-    """Return a scene whose colours are read as RGB or as harmonics, as photos show it, if the file leaves that open."""
+    """Decide by the photos whether colours are RGB or harmonics, if the file leaves that open; return the scene."""
     info, units = load.info, load.info.open_units
     if units is None or load.scene.images is None:
         return load
-    tries_rgb = info.color_units is None  # else the file was read as RGB, and harmonics are tried
+    tries_rgb = info.color_units is None  # otherwise the file was read as RGB, and harmonics are tried
     other = (read_as_rgb if tries_rgb else read_as_harmonics)(load.scene, units)
     if not has_nearer_colors(other, load.scene):
         return load
@@ -252,73 +267,86 @@ def _confirm_colors(load: Loaded) -> Loaded:
 
 
 def _read_or_error(read: Callable[[], T]) -> T | SceneError:
-    """Return what files give, or else why they give nothing: a file is damaged, or they do not fit each other."""
+    """Return what ``read`` returns, or the SceneError that it raises."""
     try:
         return read()
     except SceneError as error:
-        return type(error)(error.path, error.problem, error.remedy)  # a copy: the traceback keeps arrays in memory
+        return type(error)(error.path, error.problem, error.remedy)  # a copy, as the traceback keeps arrays in memory
 
 
 def _note_left_out(load: Loaded, files: SceneFiles, names: list[str], cause: SceneError) -> Loaded:
-    """Add a note to a scene that was read without some ``files``, which ``names`` describe; it says why."""
+    """Return a scene with the doubt that some ``files`` are left out, which ``names`` describe.
+
+    The text gives the ``cause`` and a remedy. It replaces notes on photos that could not be used without these files.
+    """
     photos = f"the photos in {files.images or files.ply.parent}"
-    repeated = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
-    names = [*names, *([photos] if repeated else [])]
+    replaced = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
+    names = [*names, *([photos] if replaced else [])]
     is_known = cause.path in map(str, (files.ply, files.ply.parent, files.cameras, files.images))
-    where = "" if is_known else f"{cause.path}: "
+    damaged = "" if is_known else f"{cause.path}: "
     option, value = ("cameras", "FILE") if names[0] == str(files.cameras) else ("images", "FOLDER")
     remedy = cause.remedy or f"pass --{option} {value}, or --{option} {NONE}"
     verb = "is" if names == [str(files.cameras)] else "are"
-    doubt = Doubt(" ".join(f"{' and '.join(names)} {verb} left out: {where}{cause.problem}; {remedy}".split()))
-    return replace(load, notes=(doubt, *(text for text in load.notes if text not in repeated)))
+    doubt = Doubt(" ".join(f"{' and '.join(names)} {verb} left out: {damaged}{cause.problem}; {remedy}".split()))
+    return replace(load, notes=(doubt, *(text for text in load.notes if text not in replaced)))
 
 
 def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Read the cameras and photos of a scene, and combine them with its Gaussians; return why if they do not fit."""
+    """Combine a scene's Gaussians with its cameras, if it has any, and photos; return the error if they do not fit."""
     camera_file = _read_or_error(partial(read_scene_cameras, ply, files))
     if camera_file is None:
         return _make_scene_without_views(ply, files, hints)
     if isinstance(camera_file, SceneError):
         return camera_file
-    answer = _add_photos(ply, files, camera_file, hints, photos=photos)
-    return _confirm_colors(answer) if isinstance(answer, Loaded) else answer
+    load = _add_photos(ply, files, camera_file, hints, photos=photos)
+    return _confirm_colors(load) if isinstance(load, Loaded) else load
 
 
 def _add_photos(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, *, photos: bool
 ) -> Loaded | SceneError:
-    """Combine Gaussians and cameras with their photos; return why if the cameras do not see the Gaussians.
+    """Combine Gaussians and cameras with their photos; return the error if the cameras do not see the Gaussians.
 
-    Photos that were found and do not show the views are left out, with a note, unless they are the only evidence
-    against the cameras.
+    Photos that the caller did not name are left out, with a note, if they cannot be read or do not show the views; see
+    also :func:`_leave_out_photos`. ``photos=False``: leave all photos out.
     """
     proposal = _read_or_error(partial(propose_photos, files, camera_file)) if photos else None
     if isinstance(proposal, Proposal) and proposal.by_names:
         files = replace(files, images=proposal.folder)
     inside = _read_or_error(partial(photos_inside, files, camera_file)) if photos and proposal is None else ()
-    unread = next((answer for answer in (proposal, inside) if isinstance(answer, SceneError)), None)
-    if unread is not None and ("images" in files.named or files.images == files.cameras):
-        return unread
+    error = next((value for value in (proposal, inside) if isinstance(value, SceneError)), None)
+    if error is not None and ("images" in files.named or files.images == files.cameras):
+        return error
     if isinstance(proposal, Proposal):
-        load = _assign_photos(ply, files, camera_file, proposal, hints)
-        of_one_shape = select_one_shape(camera_file, proposal) if isinstance(load, SceneError) else None
-        if of_one_shape is not None:
-            cameras_left, photos_left, doubts = of_one_shape
-            answer = _assign_photos(ply, files, cameras_left, photos_left, hints)
-            load = replace(answer, notes=(*answer.notes, *doubts)) if isinstance(answer, Loaded) else load
-        return (
-            _leave_out_photos(ply, files, camera_file, proposal, hints, load) if isinstance(load, SceneError) else load
-        )
+        return _add_proposed_photos(ply, files, camera_file, proposal, hints)
     pictures = ScenePhotos(() if isinstance(inside, SceneError) else inside)
     load = _read_or_error(partial(_make_scene_with_views, ply, files, camera_file, pictures, hints))
     if isinstance(load, SceneError):
         return load
-    if unread is not None:
-        return _note_left_out(load, files, [f"the photos in {files.images}"], unread)
+    if error is not None:
+        return _note_left_out(load, files, [f"the photos in {files.images}"], error)
     lacks_photos = photos and "images" not in files.named and load.scene.images is None
-    is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside it are clips of it
+    is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # then films beside it show it
     films = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
     return replace(load, notes=(*load.notes, *films))
+
+
+def _add_proposed_photos(
+    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
+) -> Loaded | SceneError:
+    """Combine Gaussians and cameras with the photos of a proposal, or with those of the most frequent aspect ratio.
+
+    If both fail, the photos are left out; see :func:`_leave_out_photos`.
+    """
+    load = _assign_photos(ply, files, camera_file, proposal, hints)
+    if isinstance(load, Loaded):
+        return load
+    if (one_shape := select_one_shape(camera_file, proposal)) is not None:
+        remaining_cameras, remaining_photos, doubts = one_shape
+        fewer = _assign_photos(ply, files, remaining_cameras, remaining_photos, hints)
+        if isinstance(fewer, Loaded):
+            return replace(fewer, notes=(*fewer.notes, *doubts))
+    return _leave_out_photos(ply, files, camera_file, proposal, hints, load)
 
 
 def _assign_photos(
@@ -326,49 +354,55 @@ def _assign_photos(
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras with the photos that names propose, or with other photos that show the views.
 
-    Notes name photos that cannot be read, and views without a photo. Returns why if no photo shows any view.
+    1. If photos have another shape than the cameras, a part of each may show its view. Then this part is used.
+    2. The scene is read with the proposed photos, without those that are broken, or else without photos.
+    3. This scene shows which photo belongs to which view. If a part of each photo fits better, this part is used.
+    4. The scene is read again if other photos belong to the views than were proposed.
+
+    Notes name photos that cannot be read, and views without a photo. Returns the error if no photo shows any view.
     """
 
     def read(cameras: CameraFile, chosen: Sequence[Assignment | None]) -> Loaded | SceneError:
+        """Read the scene with the chosen photo of each camera."""
         return _read_or_error(
             lambda: _make_scene_with_views(ply, files, cameras, read_photos(proposal, chosen, cameras), hints)
         )
 
     is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # photos may have any size
-    is_odd = not is_grid and has_other_shape(proposal, camera_file)
-    bare = partial(_make_scene_with_views, ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
-    if is_odd:
-        alone = _read_or_error(bare)
-        fitted = choose_part(alone.scene, proposal, camera_file) if isinstance(alone, Loaded) else None
-        if fitted is not None:
-            return _assign_photos(ply, files, camera_file, fitted, hints)
-    tried: Loaded | SceneError | None = None
+    shapes_differ = not is_grid and has_other_shape(proposal, camera_file)
+    read_bare = partial(_make_scene_with_views, ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
+    if shapes_differ:
+        bare = _read_or_error(read_bare)
+        if isinstance(bare, Loaded) and (parts := choose_part(bare.scene, proposal, camera_file)) is not None:
+            return _assign_photos(ply, files, camera_file, parts, hints)
+    proposed: Loaded | SceneError | None = None  # the scene with the proposed photos; None if none are proposed
     if not is_grid and any(proposal.choice):
-        tried = read(camera_file, proposal.choice)
-        sound = proposal.without_broken() if isinstance(tried, SceneError) else None
-        if sound is not None:
-            proposal = sound
-            tried = read(camera_file, proposal.choice)
-    base = tried if isinstance(tried, Loaded) else _read_or_error(bare)
+        proposed = read(camera_file, proposal.choice)
+        unbroken = proposal.without_broken() if isinstance(proposed, SceneError) else None
+        if unbroken is not None:
+            proposal = unbroken
+            proposed = read(camera_file, proposal.choice)
+    base = proposed if isinstance(proposed, Loaded) else _read_or_error(read_bare)
     if isinstance(base, SceneError):
-        return base if tried is None else tried
+        return base if proposed is None else proposed
     fit = fit_to_grid(base.scene, proposal) if is_grid and proposal.pool else None
     guessed = list_guessed(base.scene, camera_file)
     proposal = proposal.without_views(guessed)
-    chosen, are_alike = assign_to_views(base.scene, proposal, read=base is tried, guessed=guessed, fit=fit)
-    if proposal.fit == WHOLE_FIT and not is_odd and (not are_alike or has_bars(base.scene)):
-        fitted = choose_part(base.scene, proposal, camera_file, fit)
-        if fitted is not None:
-            return _assign_photos(ply, files, camera_file, fitted, hints)
-    if not any(chosen) or (is_odd and not are_alike):  # photos of another shape say nothing against cameras
-        is_cause = isinstance(tried, SceneError) and (not is_odd or any(camera_file.lenses))
-        return tried if isinstance(tried, SceneError) and is_cause else explain_mismatch(proposal, camera_file)
-    is_as_named = base is tried and chosen == proposal.choice
-    answer = base if is_as_named else read(name_by_photos(camera_file, proposal, chosen, fit), chosen)
-    if isinstance(answer, SceneError):
-        return answer
+    chosen, explain_most = assign_to_views(base.scene, proposal, read=base is proposed, guessed=guessed, fit=fit)
+    may_be_parts = proposal.fit == WHOLE_FIT and not shapes_differ and (not explain_most or has_bars(base.scene))
+    if may_be_parts and (parts := choose_part(base.scene, proposal, camera_file, fit)) is not None:
+        return _assign_photos(ply, files, camera_file, parts, hints)
+    if not any(chosen) or (shapes_differ and not explain_most):
+        # an error of photos of another shape says nothing, unless lenses may have changed the shape
+        if isinstance(proposed, SceneError) and (not shapes_differ or any(camera_file.lenses)):
+            return proposed
+        return explain_mismatch(proposal, camera_file)
+    is_as_proposed = base is proposed and chosen == proposal.choice
+    load = base if is_as_proposed else read(name_by_photos(camera_file, proposal, chosen, fit), chosen)
+    if isinstance(load, SceneError):
+        return load
     described = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
-    return replace(answer, notes=(*proposal.notes, *answer.notes, *described), photos_explain=are_alike)
+    return replace(load, notes=(*proposal.notes, *load.notes, *described), photos_explain=explain_most)
 
 
 def _leave_out_photos(
@@ -379,27 +413,27 @@ def _leave_out_photos(
     hints: ReadHints,
     cause: SceneError,
 ) -> Loaded | SceneError:
-    """Leave out photos that show no view, with a note; return why if they were named, or the cameras are in doubt.
+    """Combine Gaussians and cameras without their photos, with a note; return the error if photos must not be left out.
 
-    ``cause``: why photos and cameras do not fit each other. Without photos, cameras of another scene may see these
-    Gaussians as well, unless rows are their pixels, the photos are at fault, or they were found by names.
+    ``cause`` says why photos and cameras do not fit each other. Photos that the caller named are never left out. Others
+    are left out if the cameras are sure to be those of the scene: rows are their pixels, a photo is at fault, or photos
+    were found by the cameras' names. Otherwise the cameras may be those of another scene, which see these Gaussians as
+    well.
     """
     are_named = "images" in files.named
-    if are_named and "cameras" not in files.named and cause.path == camera_file.path:  # the named files are at fault
-        return explain_mismatch(proposal, camera_file)
+    if are_named and "cameras" not in files.named and cause.path == camera_file.path:
+        return explain_mismatch(proposal, camera_file)  # it blames the named photos, not the cameras that were found
     if are_named or _is_fault_of_named(files, cause):
         return cause
     bare = _read_or_error(partial(_make_scene_with_views, ply, files, camera_file, ScenePhotos(), hints))
     are_at_fault = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(proposal.folder)
-    if isinstance(bare, SceneError):
-        return cause
-    if not (bare.scene.has_own_pixels or are_at_fault or proposal.by_names):
+    if isinstance(bare, SceneError) or not (bare.scene.has_own_pixels or are_at_fault or proposal.by_names):
         return cause
     return _note_left_out(bare, replace(files, images=proposal.folder), [f"the photos in {proposal.folder}"], cause)
 
 
 def _is_fault_of_named(files: SceneFiles, cause: SceneError) -> bool:
-    """Return whether a picture at fault is in a folder that the caller named, or is named as a mask."""
+    """Return whether an error is about a picture in a folder that the caller named, or about a camera's named mask."""
     folders = (getattr(files, name) for name in ("images", "masks", "protect") if name in files.named)
     return isinstance(cause, CameraMaskError) or any(
         folder is not None and Path(cause.path).is_relative_to(folder) for folder in folders
@@ -414,7 +448,7 @@ def _make_scene_with_views(
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
     limited, size_notes = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
-    if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians
+    if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians, so none are aligned
         problem = "expected one Gaussian per pixel, found the Gaussians of a state"
         cameras = to_cameras(pinholes, photo_size(limited))
         result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
@@ -432,16 +466,17 @@ def _make_scene_with_views(
     if unused and not size:
         kind = Doubt if files.named.intersection(unused) else str
         notes.append(kind(f"the pictures of --{' and --'.join(unused)} are not used, since there are no photos"))
-    place = camera_file, photos, size, result.transform, result.cameras
-    found = _read_or_error(lambda: find_larger_and_masks(files, *place))
-    if isinstance(found, SceneError):
-        if "masks" in files.named or Path(found.path) in photos.paths or _is_fault_of_named(files, found):
-            raise found
-        remedy = found.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        notes.append(Doubt(f"masks are left out: {found.path}: {found.problem}; {remedy}"))
-        found = find_larger_and_masks(replace(files, masks=None, named=files.named | {"masks"}), *place)
-    large, masks, mask_notes = found
-    return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
+    views = camera_file, photos, size, result.transform, result.cameras
+    larger_and_masks = _read_or_error(lambda: find_larger_and_masks(files, *views))
+    if isinstance(larger_and_masks, SceneError):
+        error = larger_and_masks
+        if "masks" in files.named or Path(error.path) in photos.paths or _is_fault_of_named(files, error):
+            raise error
+        remedy = error.remedy or f"pass --masks FOLDER, or --masks {NONE}"
+        notes.append(Doubt(f"masks are left out: {error.path}: {error.problem}; {remedy}"))
+        larger_and_masks = find_larger_and_masks(replace(files, masks=None, named=files.named | {"masks"}), *views)
+    large, masks, mask_notes = larger_and_masks
+    return _make_loaded(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
 
 
 def _choose_row_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
@@ -453,7 +488,7 @@ def _choose_row_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHin
 
 
 def _make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
-    """Make a scene without views, since views are placed later; a note says that photos are not used."""
+    """Make a scene that has no views; a run places views itself. A note says that photos are not used."""
     advice = find_cameras_of_model(ply.info)
     notes = [advice] if advice else []
     _check_hints(ply, hints)
@@ -463,17 +498,17 @@ def _make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadH
             reason = f"only cameras show which views they have, and --cameras {NONE} leaves cameras out"
         notes += [f"the photos in {files.images} are not used: {reason}"]
     problem = "expected one Gaussian per pixel, found no cameras"
-    return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
+    return _make_loaded(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
 
 
 def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
-    """Raise SceneError for rows without pixels if a hint describes the order of pixels."""
+    """Raise SceneError if a hint gives the order of the rows' pixels; only called if rows have no pixels."""
     if hints.order not in ("auto", "none"):
         problem = f"expected rows that are pixels of views, as --hint order={hints.order} says, found others"
         raise SceneError(ply.info.path, problem, "leave the hint out, or name the cameras that fit with --cameras")
 
 
-def _make_load(
+def _make_loaded(
     ply: GaussianFile,
     files: SceneFiles,
     hints: ReadHints,
@@ -483,9 +518,10 @@ def _make_load(
     masks: Masks = NO_MASKS,
     absent: Sequence[int] = (),
 ) -> Loaded:
-    """Make the scene of the visible Gaussians and all views, with notes on how it was read.
+    """Make a scene of the visible Gaussians and all views, with all facts about how it was read.
 
-    ``large`` and ``masks`` are those of the views; ``absent``: indices of the cameras without a photo.
+    ``result`` has the cameras, the photos, and the pixels of the rows. ``large`` and ``masks`` are those of the views.
+    ``absent`` has the indices of the cameras without a photo.
     """
     camera_file, recovery = result.camera_file, result.recovery
     gaussians, pixels = take_gaussians(ply, result)
@@ -496,7 +532,7 @@ def _make_load(
     photos = result.images if len(result.images) else None
     names = () if camera_file is None else camera_file.names
     scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)
-    last_rows = () if pixels is None else pixels.fronts.max((1, 2))  # of each view, -1 for none
+    last_rows = () if pixels is None else pixels.fronts.max((1, 2))  # -1 for a view without rows
     empty = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
     number = f"{len(empty)} of {len(scene)} views {'has' if len(empty) == 1 else 'have'}"
     doubts = [Doubt(f"{number} no Gaussians: {list_some(empty)}")] if empty else []
@@ -526,15 +562,15 @@ def _make_load(
 
 
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
-    """Move a file's cameras into the frame of the Gaussians if pixels or colours show that frame; else keep them.
+    """Read a scene with its cameras moved into the frame of the Gaussians, if pixels or colours show that frame.
 
-    ``photos``: read photos, and raise SceneError if named ones cannot be read; False: leave photos out. SceneError if
-    named cameras have no size.
+    Otherwise the cameras stay as their file has them. With ``photos``, photos are read, and named photos that cannot be
+    read raise SceneError. Without, no photos are needed. SceneError if named cameras have no size.
     """
-    for with_photos in dict.fromkeys((True, photos)):  # photos can show the frame even if they are not kept
-        answer = _choose_cameras(ply, files, hints, photos=with_photos)
-        if isinstance(answer, Loaded):
-            return answer
+    for with_photos in dict.fromkeys((True, photos)):  # photos help to find the frame even if they are not needed
+        load = _choose_cameras(ply, files, hints, photos=with_photos)
+        if isinstance(load, Loaded):
+            return load
     camera_file = _read_or_error(partial(read_scene_cameras, ply, files))
     if isinstance(camera_file, CameraFile):
         kept = _read_or_error(partial(_keep_stored_cameras, ply, files, camera_file, hints, photos=photos))
@@ -546,9 +582,9 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
 def _keep_stored_cameras(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, *, photos: bool
 ) -> Loaded | None:
-    """Return the scene with its cameras as their file stores them, with a note.
+    """Return the scene with its cameras as their file stores them, with a note that they do not fit.
 
-    None for cameras that were not named and do not see the Gaussians.
+    None if cameras that were not named do not see the Gaussians.
     """
     from gsmerge.cameras import check_cameras  # few scenes need it
 
@@ -558,4 +594,4 @@ def _keep_stored_cameras(
         return None
     note = Doubt("the cameras do not fit the Gaussians; they stay as stored in their file")
     as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
-    return replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)
+    return replace(_make_loaded(ply, files, hints, as_stored, [note]), cameras=None)

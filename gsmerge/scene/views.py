@@ -25,12 +25,12 @@ from gsmerge.photos.masks import NO_MASKS, Masks, read_masks
 from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.types import Cameras, LargePhotos
 
-_MAX_BYTES = 2 << 30  # size of all photos as floats, up to which photos are not resized unless rows have no pixels
-_ROUNDING = 1e-6  # pixels
+_MAX_BYTES = 2 << 30  # photos of at most this size, as floats, are not resized unless rows have no pixels
+_ROUNDING = 1e-6  # pixels by which the edge of a window may be off
 
 
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
-    """Read a scene's cameras from their file or the ``.ply``, or estimate them; None if there are none.
+    """Read a scene's cameras from their file or the ``.ply``, or estimate them from the rows; None if that fails too.
 
     SceneError for a file of poses alone, without a focal length. Repeated views are dropped, unless the number of rows
     is a multiple of the number of views.
@@ -41,7 +41,7 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
             raise missing_intrinsics(stored.path)
         # if the number is a multiple, each view may have rows of its own
         return drop_repeats(stored) if len(ply.gaussians) % len(stored) else stored
-    if files.is_state:
+    if files.is_state:  # cameras of a state are in its own file, or there are none
         return None
     sharp = None if "cameras" in files.named else read_sharp_camera(files.ply)
     if sharp is not None:
@@ -61,15 +61,15 @@ def find_larger_and_masks(
 ) -> tuple[LargePhotos | None, Masks, list[str]]:
     """Find the photos at the size of their files, if that is larger than the scene's, and masks of pixels that count.
 
-    A photo's file is read again when the photo is asked for; photos inside other files stay in memory. Masks come from
-    files and from transparency.
+    A larger photo is read from its file when it is used; photos inside other files stay in memory. Masks come from
+    files and from the photos' transparency.
 
     Args:
         files: The files of the scene.
         camera_file: The cameras as stored, with lenses.
         photos: The photos of these cameras.
         size: Size of the undistorted photos; None without photos.
-        transform: Transform of the photos to the pixels of the rows; None if they were not changed.
+        transform: How photos were resized and cropped to the pixels of the rows; None if they were not changed.
         cameras: The scene's cameras, in the order of the camera file.
 
     Returns:
@@ -90,6 +90,7 @@ def find_larger_and_masks(
         return np.ascontiguousarray(picture[window.rows, window.columns])
 
     def read(view: int) -> np.ndarray:
+        """Return the larger photo of a view."""
         if not paths:
             return cut(view, photos.pictures[view])
         return cut(view, decode_photos([paths[view]], [photos.turns[view]], stored, photos.part)[0])
@@ -103,7 +104,7 @@ def find_larger_and_masks(
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """The window of a photo's file that a view shows."""
+    """The part of a photo's file that a view shows."""
 
     rows: slice
     columns: slice
@@ -112,10 +113,13 @@ class _Window:
 
 
 def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
-    """Find the window that the views show in files of the size ``stored``; see :func:`find_larger_and_masks`."""
-    fitted = transform or resize_to(size, size)
-    scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)  # from pixels of the file to the grid
-    corner, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
+    """Find the part that the views show of files of the size ``stored``.
+
+    The other parameters are those of :func:`find_larger_and_masks`.
+    """
+    known = transform or resize_to(size, size)
+    scale = np.array([known.scale_x, known.scale_y]) * size / np.array(stored)  # from pixels of the file to the grid
+    corner, grid = np.array([known.left, known.top]), np.array([known.width, known.height])
     reduction = np.array([cameras.width, cameras.height]) / grid  # views of unaligned scenes may be reduced again
     first = np.floor(corner / scale).astype(int)
     last = np.minimum(np.ceil((corner + grid) / scale - _ROUNDING).astype(int), stored)
@@ -127,20 +131,20 @@ def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cam
 
 
 def limit_photo_size(
-    photos: PhotoArrays, rows: int, max_side: int, *, unaligned: bool
+    photos: PhotoArrays, num_rows: int, max_side: int, *, unaligned: bool
 ) -> tuple[PhotoArrays, list[str]]:
     """Resize photos that are too large for memory to at most ``max_side`` pixels per side; return them and notes.
 
-    Photos keep their size if they fit into memory, or if the file has at least half as many ``rows`` as the photos have
-    pixels, because its Gaussians may then be these pixels. ``unaligned``: the rows are known to have no pixels, so
-    photos of any total size are resized.
+    Photos keep their size if they fit into memory. They also keep it if there are more than half as many rows as pixels
+    of photos, because the rows may then be these pixels. With ``unaligned``, the rows are known to have no pixels, so
+    photos are resized whatever memory they take.
     """
     size = photo_size(photos)
     if size is None:
         return photos, []
     pixels = len(photos) * size[0] * size[1]
-    float_pixel = 12  # bytes of a pixel as three floats
-    if not unaligned and (float_pixel * pixels <= _MAX_BYTES or 2 * rows > pixels):
+    pixel_bytes = 12  # bytes of a pixel as three floats
+    if not unaligned and (pixel_bytes * pixels <= _MAX_BYTES or 2 * num_rows > pixels):
         return photos, []
     transform, notes = _limit(size, max_side)
     return photos if transform is None else keep_photos(transform.photos(photos)), notes
@@ -149,8 +153,8 @@ def limit_photo_size(
 def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tuple[Cameras, np.ndarray, list[str]]:
     """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; return them and a note.
 
-    The size is the same as from :func:`gsmerge.measure.sizes.shrink_views`, but the pixels differ. Here photos of a
-    scene are resized as files are; there photos are resized as the renders that are compared with them.
+    The size is the same as that of :func:`gsmerge.measure.sizes.shrink_views`, but the pixels differ. Here photos are
+    resized as their files are. There they are resized as the renders that they are compared with.
     """
     transform, notes = _limit((cameras.width, cameras.height), max_side)
     if transform is not None:
@@ -161,7 +165,7 @@ def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tupl
 
 
 def _limit(size: Size, max_side: int) -> tuple[PhotoTransform | None, list[str]]:
-    """Make the transform that resizes pictures to ``max_side``, and a note; None if they are small enough."""
+    """Return how pictures are resized to ``max_side`` pixels, and a note; None and no note if they are small enough."""
     smaller = limit_size(size, max_side)
     if smaller == size:
         return None, []

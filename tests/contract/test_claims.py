@@ -161,7 +161,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"That is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views confirm at least"
         f" {percent(confirm_depths.SOUND_SHARE)} of the depth. It falls to {percent(confirm_depths.FEWEST)} if they"
         f" confirm {percent(confirm_depths.WRONG_SHARE)} or less",
-        f"tries up to {word(search.MAX_TRIED)} numbers, or {word(search.MAX_RUNS)} where no photo is left out",
+        f"tries up to {word(search.MAX_LEFT_OUT_BUILDS)} numbers, or {word(search.MAX_BUILDS)}"
+        " where no photo is left out",
         f"With {word(left_out.LEAST_VIEWS)} views or more, both leave out some views",
     ),
     PHOTOS: (

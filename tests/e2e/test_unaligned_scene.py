@@ -18,7 +18,7 @@ from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge import read_scene
-from gsmerge.compaction.search import MAX_RUNS
+from gsmerge.compaction.search import MAX_BUILDS
 from gsmerge.plan import FIDELITY_LOSS
 from gsmerge.raster.metrics import MAX_LOSS
 
@@ -129,7 +129,7 @@ def test_a_result_compacted_again_shows_the_photos_as_it_did(
     words = ("--images", images, "-o", again, "--json", "--set", "seed=2")
     document = json.loads(run("compact", small, *words, code=0).out)
     assert document["worse"] is None
-    assert len(document["choices"]["search"]["tried"]) <= MAX_RUNS
+    assert len(document["choices"]["search"]["tried"]) <= MAX_BUILDS
     assert document["output"]["num_gaussians"] < document["input"]["num_gaussians"]
     psnr = document["psnr_input_views"]
     assert psnr["after"] > psnr["before"] - MAX_LOSS

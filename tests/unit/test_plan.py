@@ -14,9 +14,9 @@ from messages import noted
 from scenes import psnr_of
 
 from gsmerge import CompactOptions, Scene, compact
-from gsmerge.compaction.candidate import score
+from gsmerge.compaction.candidate import make_candidate
 from gsmerge.compaction.estimate import estimate
-from gsmerge.compaction.search import MAX_RUNS, add_target
+from gsmerge.compaction.search import MAX_BUILDS, add_target
 from gsmerge.errors import UsageError
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.prepare import prepare
@@ -209,7 +209,7 @@ def test_photos_of_another_scene_decide_no_count(scene: Scene) -> None:
     assert add_target(plan, prepared) is plan
     report = compact(rows, threads=1).report
     assert (report.choices["fidelity"]["views"], report.worse) == (len(rows), None)
-    assert len(report.choices["search"]["tried"]) <= MAX_RUNS
+    assert len(report.choices["search"]["tried"]) <= MAX_BUILDS
 
 
 def test_photos_decide_the_count_where_rows_are_fewer_than_pixels(scene: Scene) -> None:
@@ -245,7 +245,7 @@ def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) ->
     assert plan.before is not None
     assert plan.target_psnr == plan.before.covered_psnr - FIDELITY_LOSS > plan.before.psnr
     given = prepared.frame.enter(rows.gaussians)  # without those that fill the holes
-    again = score(None, Fitted(given, prepared.scene.cameras, None), prepared, plan)
+    again = make_candidate(None, Fitted(given, prepared.scene.cameras, None), prepared, plan)
     assert again.psnr == pytest.approx(plan.before.psnr, abs=0.01)
     assert again.deciding_psnr == pytest.approx(plan.before.covered_psnr, abs=0.01)
 

@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.compaction.left_out import LEAST_VIEWS, choose_left_out, cover, leave_out, mean_seen
+from gsmerge.compaction.left_out import LEAST_VIEWS, choose_left_out, leave_out, mark_seen, mean_seen
 from gsmerge.compaction.new_views import OWN, SPREAD, NewViews, Trial, shrink_scene
 from gsmerge.facts.prepare import prepare
 from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_new_views
@@ -126,10 +126,10 @@ def test_what_only_left_out_views_show_does_not_count() -> None:
         pixels=None,
     )
     rest = subset(pictured(both), [0, 1])
-    assert cover(rest, subset(pictured(both), [2])).mean() > 0.9
+    assert mark_seen(rest, subset(pictured(both), [2])).mean() > 0.9
     turned = subset(pictured(both), [3])
     assert render(both.gaussians, turned.cameras).alphas.mean() > 0.9
-    assert cover(rest, turned).mean() == 0
+    assert mark_seen(rest, turned).mean() == 0
 
 
 def test_small_scenes_keep_places_and_what_they_show(room: Scene) -> None:

@@ -13,8 +13,8 @@ from messages import noted, refuses
 
 from gsmerge.compaction.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.compaction.left_out import LeftOut
-from gsmerge.compaction.search import MAX_RUNS, MAX_TRIED, SAME_COUNT_RATIO, CountSearch, level_counts, search_count
-from gsmerge.facts.counts import exact_count, max_allowed
+from gsmerge.compaction.search import MAX_BUILDS, MAX_LEFT_OUT_BUILDS, SAME_COUNT_RATIO, CountSearch, search_count
+from gsmerge.facts.counts import exact_count, level_counts, max_allowed
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import FitOptions
 from gsmerge.kernels import elementary
@@ -115,9 +115,9 @@ def test_rungs_rise_within_their_limits() -> None:
 
 
 def test_levels_end_where_a_view_would_have_none() -> None:
-    assert level_counts(6400, make_plan(levels=4, least=12)) == [1600, 400, 100]
-    assert level_counts(6400, make_plan(levels=4, least=200)) == [1600, 400]
-    assert level_counts(6400, make_plan(levels=1, least=12)) == []
+    assert level_counts(6400, 4, 12) == [1600, 400, 100]
+    assert level_counts(6400, 4, 200) == [1600, 400]
+    assert level_counts(6400, 1, 12) == []
 
 
 def test_count_within_is_read_off_the_curve() -> None:
@@ -178,7 +178,7 @@ def test_search_finds_the_fewest(start: int, target: float) -> None:
     assert actual.facts(actual.best).unmet is None
     assert best.psnr == rises(best.count) >= target
     assert best.count <= max(2.5 * fewest, 10)
-    assert len(actual.tried) <= MAX_RUNS
+    assert len(actual.psnrs) <= MAX_BUILDS
 
 
 def test_search_near_the_answer_ends_close_to_it() -> None:
@@ -200,8 +200,8 @@ def test_search_keeps_the_best_of_a_curve_that_falls() -> None:
 
 
 def test_search_stays_within_its_limits() -> None:
-    assert all(700 <= count <= 900 for count in search(rises, 25.0, 800, 700, 900).tried)
-    assert all(count >= 700 for count in search(rises, 1.0, 5000, 700, 9000).tried)
+    assert all(700 <= count <= 900 for count in search(rises, 25.0, 800, 700, 900).psnrs)
+    assert all(count >= 700 for count in search(rises, 1.0, 5000, 700, 9000).psnrs)
 
 
 @pytest.mark.parametrize(("default", "first"), [(500, 700), (800, 800), (100_000, 900)])
@@ -222,7 +222,7 @@ def keep(curve: Callable[[int], float], default: int, most: int, *, rendered: bo
 
 def test_the_usual_count_is_kept_where_it_is_good_enough() -> None:
     actual = keep(lambda _: 40.0, 1000, 20_000)
-    assert list(actual.tried) == [1000]  # not fewer, and no further run
+    assert list(actual.psnrs) == [1000]  # not fewer, and no further run
     assert actual.notes == []
 
 
@@ -232,7 +232,7 @@ def test_more_are_taken_until_the_input_is_kept(slope: float, needed: float) -> 
     actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 20_000)
     assert actual.best.psnr >= 32.5
     assert actual.best.count <= 1.4 * 1000 * needed
-    assert len(actual.tried) <= 5
+    assert len(actual.psnrs) <= 5
     assert noted(actual.notes, f"{actual.best.count:,} of 20,000")
 
 
@@ -248,9 +248,9 @@ def test_what_is_compact_already_is_kept() -> None:
 def test_more_are_taken_until_photos_are_shown_as_well(slope: float, needed: float) -> None:
     """Beyond the four times the usual count that a quality may take."""
     actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 40_000, rendered=False)
-    assert actual.met
+    assert actual.is_met
     assert actual.best.count <= 1000 * needed * 2 ** (FIDELITY_LOSS / slope) * SAME_COUNT_RATIO
-    assert len(actual.tried) <= 5
+    assert len(actual.psnrs) <= 5
     assert noted(actual.notes, f"{actual.best.count:,} of 40,000", "at most 0.3 dB worse than the input")
 
 
@@ -258,8 +258,8 @@ def test_more_are_taken_until_photos_are_shown_as_well(slope: float, needed: flo
 def test_photos_that_no_count_shows_end_the_search(curve: Callable[[int], float]) -> None:
     """As of another scene. The best is kept, even if it is the usual count."""
     actual = keep(curve, 1000, 20_000, rendered=False)
-    assert len(actual.tried) <= MAX_RUNS
-    assert (actual.best.count, actual.met, actual.facts(actual.best).unmet) == (1000, False, None)
+    assert len(actual.psnrs) <= MAX_BUILDS
+    assert (actual.best.count, actual.is_met, actual.facts(actual.best).unmet) == (1000, False, None)
     assert actual.notes == []
 
 
@@ -288,15 +288,15 @@ def judge_left_out(curve: Callable[[int], float], target: float, most: int | Non
 def test_photos_left_out_are_met_by_few_builds(target: float) -> None:
     """What is written is built of all views, with a count between those tried."""
     actual = judge_left_out(lambda count: 20 + log2(count / 1000), target)
-    assert actual.met
-    assert len(actual.tried) <= MAX_TRIED
-    assert min(actual.tried) <= actual.count <= max(actual.tried)
+    assert actual.is_met
+    assert len(actual.psnrs) <= MAX_LEFT_OUT_BUILDS
+    assert min(actual.psnrs) <= actual.count <= max(actual.psnrs)
     assert actual.count >= 0.9 * 1000 * 2 ** (target - 20)
 
 
 def test_photos_left_out_take_no_more_than_they_gain_from() -> None:
     actual = judge_left_out(lambda count: 20 + log2(count / 1000), 30.0, most=1600)
-    assert max(actual.tried) == actual.count == 1600
+    assert max(actual.psnrs) == actual.count == 1600
     facts, reached = actual.facts(actual.best), "photos left out reach 20.68 dB with 1,600 Gaussians"
     assert facts.unmet == f"quality: 30 dB was asked for; {reached}, the best that was tried"
     assert facts.choices["search"]["left_out"] == 2

@@ -11,7 +11,7 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
-from gsmerge.compaction.methods import stands_alone
+from gsmerge.compaction.methods import is_without_views
 from gsmerge.facts.place_cameras import HELD_OUT, place_viewpoints
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.fit import FitOptions, fit_scene
@@ -107,10 +107,12 @@ def test_one_note(bare: Scene) -> None:
 
 def test_networks_and_other_methods_ask_for_views(bare: Scene) -> None:
     options = CompactOptions()
-    assert stands_alone(bare, options)
-    assert not stands_alone(bare, options.with_settings({"checkpoint": "shipped"}))
-    assert not stands_alone(bare, options.with_settings({"method": "random"}))
-    assert not stands_alone(unaligned_scenes.without_order(scenes.make_scene(scenes.room(), scenes.arc(2))), options)
+    assert is_without_views(bare, options)
+    assert not is_without_views(bare, options.with_settings({"checkpoint": "shipped"}))
+    assert not is_without_views(bare, options.with_settings({"method": "random"}))
+    assert not is_without_views(
+        unaligned_scenes.without_order(scenes.make_scene(scenes.room(), scenes.arc(2))), options
+    )
 
 
 def test_nothing_is_left_out(bare: Scene) -> None:
