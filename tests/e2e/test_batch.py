@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from batches import FAST, InlinePool, records, results, statuses
 from messages import names
+from scene_folders import write_scene
+from shared import make_once
 
 import gsmerge
 from gsmerge.batch.records import record
@@ -26,15 +28,18 @@ REPORT: dict[str, Any] = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two folders with small scenes, and one with a damaged one. Read only."""
-    folder = tmp_path_factory.mktemp("batch") / "rooms"
+def write_rooms(folder: Path) -> None:
+    """Write two folders with small scenes, and one with a damaged one."""
     for number in range(2):
-        make_scene(folder / f"room{number}", num_views=3, width=24, height=16, seed=number)
+        write_scene(folder / f"room{number}", num_views=3, width=24, height=16, seed=number)
     bad = Path(shutil.copytree(folder / "room0", folder / "bad"))
     (bad / "scene.ply").write_bytes((bad / "scene.ply").read_bytes()[:3000])
-    return folder
+
+
+@pytest.fixture(scope="module")
+def rooms() -> Path:
+    """The folder of :func:`write_rooms`. Read only."""
+    return make_once("bad-room", write_rooms)
 
 
 def batch(run: Run, rooms: Path, out: Path, *options: object) -> Outcome:
@@ -49,22 +54,19 @@ def _in_this_process() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def first(rooms: Path) -> tuple[int, Path]:
-    """Exit code and folder of a run over all three. Read only."""
-    out = rooms.parent / "out"
-    return main(["batch", str(rooms), "--output", str(out), *FAST, "-q", "--jobs", "2"]), out
+def compact_rooms(out: Path) -> None:
+    """Run a batch over all three rooms, one of which fails."""
+    rooms = make_once("bad-room", write_rooms)
+    assert main(["batch", str(rooms), "--output", str(out), *FAST, "-q", "--jobs", "2"]) == 5
 
 
 @pytest.fixture
-def out(first: tuple[int, Path], tmp_path: Path) -> Path:
-    """A copy of that folder."""
-    return Path(shutil.copytree(first[1], tmp_path / "out"))
+def out(tmp_path: Path) -> Path:
+    """A copy of what :func:`compact_rooms` leaves behind."""
+    return Path(shutil.copytree(make_once("bad-room-out", compact_rooms), tmp_path / "out"))
 
 
-def test_one_bad_scene_stops_no_other(first: tuple[int, Path], rooms: Path, run: Run, tmp_path: Path) -> None:
-    code, out = first
-    assert code == 5
+def test_one_bad_scene_stops_no_other(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
     names = [f"room{number}.ply" for number in range(2)]
     assert sorted(results(out)) == names
     assert statuses(out) == {"bad.ply": ["failed"], **{name: ["done"] for name in names}}

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
+from scene_folders import write_small
+from shared import make_once
 
 import gsmerge
 from gsmerge.measure.evaluate import near_plane
@@ -53,19 +55,20 @@ class Quiet(SimpleHTTPRequestHandler):
         pass
 
 
-@pytest.fixture(scope="module")
-def site(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def make_site(folder: Path) -> None:
+    """Write ``one.html`` of the small scene, and the Gaussians that it shows."""
     from gsmerge.cli import main
 
-    folder = tmp_path_factory.mktemp("made")
-    assert main(["compact", str(small_scene), "-o", str(folder / "scene.sog"), "--effort", "draft", "-q"]) == 0
+    folder.mkdir()
+    small = make_once("small", write_small)
+    assert main(["compact", str(small), "-o", str(folder / "scene.sog"), "--effort", "draft", "-q"]) == 0
     assert main(["convert", str(folder / "scene.sog"), str(folder / "one.html"), "-q"]) == 0
-    return folder
 
 
 @pytest.fixture(scope="module")
-def served(site: Path) -> Iterator[str]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
+def served() -> Iterator[str]:
+    handler = partial(Quiet, directory=str(make_once("site", make_site)))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_port}/one.html"
     server.shutdown()
@@ -81,9 +84,7 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @needs_browser()
-def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
-    tab: Browser, served: str, site: Path, small_scene: Path
-) -> None:
+def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(tab: Browser, served: str, small_scene: Path) -> None:
     tab.open(served)
     tab.wait(SETTLED)
     host = served.removesuffix("one.html")
@@ -96,7 +97,7 @@ def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
     scene = gsmerge.read_scene(small_scene)
     middle = tab.run("data.views[data.start].viewmat")
     view = int(np.abs(scene.cameras.viewmats.reshape(-1, 16) - middle).sum(1).argmin())
-    gaussians = gsmerge.read_gaussians(site / "scene.sog").gaussians
+    gaussians = gsmerge.read_gaussians(make_once("site", make_site) / "scene.sog").gaussians
     drawn = gsmerge.render(gaussians, scene.cameras[[view]], near=near_plane(scene)).images[0].clip(0, 1)
     tab.wait(SETTLED)
     box = tab.box("stage")
@@ -149,7 +150,8 @@ def test_on_a_phone_one_finger_turns_and_two_come_nearer(tab: Browser, served: s
 
 
 @needs_browser()
-def test_one_file_opens_from_disk(tab: Browser, site: Path) -> None:
+def test_one_file_opens_from_disk(tab: Browser) -> None:
+    site = make_once("site", make_site)
     before = len(tab.requests())
     tab.open(site / "one.html")
     assert tab.run("[id('canvas').hidden, id('poster').naturalWidth > 0]") == [True, True]

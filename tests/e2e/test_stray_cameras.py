@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from batches import InlinePool
 from messages import ERROR, names
+from scene_folders import write_smallest
 
 from .conftest import Run, assert_refused
 
@@ -25,11 +26,10 @@ def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def stray(tmp_path: Path, smallest_scene: Path) -> Path:
+def stray(tmp_path: Path) -> Path:
     """A scene beside a damaged camera file."""
-    folder = tmp_path / "room"
-    folder.mkdir()
-    shutil.copy(smallest_scene / "scene.ply", folder)
+    folder = write_smallest(tmp_path / "room")
+    shutil.rmtree(folder / "images")
     (folder / "transforms.json").write_text('{"frames": [')
     return folder
 

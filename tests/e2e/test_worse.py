@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from batches import InlinePool, records
 from messages import names
+from scene_folders import write_scene
 from scenes import psnr_of
 from sweeps import sweep
 
@@ -25,9 +26,9 @@ SAID = "worse"
 
 
 @pytest.fixture(scope="module")
-def one_photo(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def one_photo(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """The second of three views alone."""
-    folder = make_scene(tmp_path_factory.mktemp("three") / "scene", num_views=3, width=60, height=40)
+    folder = write_scene(tmp_path_factory.mktemp("three") / "scene", num_views=3, width=60, height=40)
     return subset(gsmerge.read_scene(folder), [1])
 
 

@@ -6,9 +6,12 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+PLACE: list[Path] = []  # the folder that all processes of a run share; conftest.py puts it here
 
-def make_once(place: Path, make: Callable[[Path], object]) -> Path:
-    """A folder that ``make`` fills under another name, so that whoever finds it finds it whole."""
+
+def make_once(name: str, make: Callable[[Path], object]) -> Path:
+    """Return a folder that ``make`` fills under another name, so that whoever finds it finds it whole."""
+    place = PLACE[0] / name
     if place.exists():
         return place
     place.parent.mkdir(exist_ok=True)

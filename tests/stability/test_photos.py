@@ -23,14 +23,18 @@ VIEWS, WIDTH, HEIGHT = 6, 48, 36
 FIT = {"budget": 150, "fit_steps": 40, "checkpoint": "none", "poses": "fixed"}
 
 
-@pytest.fixture(scope="module")
-def room() -> Scene:
+def make_room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(VIEWS, WIDTH, HEIGHT), noise=0.005)
 
 
 @pytest.fixture(scope="module")
-def sound(room: Scene) -> CompactResult:
-    return compact(room, **FIT)
+def room() -> Scene:
+    return make_room()
+
+
+@pytest.fixture(scope="module")
+def sound() -> CompactResult:
+    return compact(make_room(), **FIT)
 
 
 def over_seeds(scene: Scene, *, aligned: bool = False, **settings: Any) -> float:
@@ -40,8 +44,8 @@ def over_seeds(scene: Scene, *, aligned: bool = False, **settings: Any) -> float
 
 
 @pytest.fixture(scope="module")
-def usual(room: Scene) -> float:
-    return over_seeds(room)
+def usual() -> float:
+    return over_seeds(make_room())
 
 
 def novel_psnr(gaussians: Gaussians, *, aligned: bool = False) -> float:

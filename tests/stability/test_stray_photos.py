@@ -74,14 +74,18 @@ SPOILT = [
 ]
 
 
-@pytest.fixture(scope="module")
-def room() -> Scene:
+def make_room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(VIEWS, WIDTH, HEIGHT), noise=0.005)
 
 
 @pytest.fixture(scope="module")
-def unspoilt(room: Scene) -> CompactResult:
-    return compact(room, **FIT)
+def room() -> Scene:
+    return make_room()
+
+
+@pytest.fixture(scope="module")
+def unspoilt() -> CompactResult:
+    return compact(make_room(), **FIT)
 
 
 def with_photos(room: Scene, change: Callable[[Photos], Photos], *, aligned: bool = True) -> Any:

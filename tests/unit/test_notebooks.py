@@ -6,27 +6,32 @@ import gc
 import html
 import pickle
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from scene_folders import write_scene
+from shared import make_once
 
 import gsmerge
 
 
-@pytest.fixture(scope="module")
-def tiny_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_scene(tmp_path_factory.mktemp("tiny") / "scene", num_views=3, width=32, height=24)
+def write_tiny(folder: Path) -> None:
+    write_scene(folder, num_views=3, width=32, height=24)
 
 
 @pytest.fixture(scope="module")
-def scene(tiny_scene: Path) -> gsmerge.Scene:
-    return gsmerge.read_scene(tiny_scene)
+def tiny_scene() -> Path:
+    return make_once("notebooks", write_tiny)
 
 
 @pytest.fixture(scope="module")
-def result(scene: gsmerge.Scene) -> gsmerge.CompactResult:
-    return gsmerge.compact(scene, effort="draft", budget=100, levels=2)
+def scene() -> gsmerge.Scene:
+    return gsmerge.read_scene(make_once("notebooks", write_tiny))
+
+
+@pytest.fixture(scope="module")
+def result() -> gsmerge.CompactResult:
+    return gsmerge.compact(make_once("notebooks", write_tiny), effort="draft", budget=100, levels=2)
 
 
 @pytest.mark.slow

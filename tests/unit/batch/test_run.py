@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ import pytest
 from batches import QUICK, InlinePool, one_job, records, results, statuses
 from messages import names, refuses, says
 from network_fixtures import noisy, untrained, written
+from scene_folders import write_scene
 
 from gsmerge.batch import jobs as calls
 from gsmerge.batch import run as runs
@@ -87,15 +88,10 @@ def run(scene: Path, out: Path, options: Any = QUICK) -> dict[str, Any]:
     return actual
 
 
-@pytest.fixture(scope="module")
-def tiny(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two views of 24 x 16. Read only."""
-    return make_scene(tmp_path_factory.mktemp("tiny") / "room", num_views=2, width=24, height=16)
-
-
 @pytest.fixture
-def scene(tiny: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(tiny, tmp_path / "room"))
+def scene(tmp_path: Path) -> Path:
+    """Two views of 24 x 16."""
+    return write_scene(tmp_path / "room", num_views=2, width=24, height=16)
 
 
 @pytest.fixture
@@ -104,10 +100,10 @@ def out(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What the scene comes to."""
-    out = tmp_path_factory.mktemp("undisturbed")
-    run(tiny, out)
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    run(write_scene(out.with_name("room"), num_views=2, width=24, height=16), out)
     return results(out)
 
 

@@ -33,19 +33,24 @@ def held_out(span: float = 2.0) -> Views:
     return Views(made.cameras, made.images, ("a", "b"))
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
+def make_scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.01)
 
 
 @pytest.fixture(scope="module")
-def half(scene: Scene) -> Gaussians:
-    return scene.gaussians[::2]
+def scene() -> Scene:
+    return make_scene()
 
 
 @pytest.fixture(scope="module")
-def actual(scene: Scene, half: Gaussians) -> Evaluation:
-    return evaluate(scene, {"half": half}, held_out(), PLAIN)
+def half() -> Gaussians:
+    return make_scene().gaussians[::2]
+
+
+@pytest.fixture(scope="module")
+def actual() -> Evaluation:
+    scene = make_scene()
+    return evaluate(scene, {"half": scene.gaussians[::2]}, held_out(), PLAIN)
 
 
 def test_figures_are_scikit_image_s(actual: Evaluation, half: Gaussians) -> None:

@@ -22,8 +22,8 @@ def views() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def photos(views: np.ndarray) -> list[np.ndarray]:
-    return list(take_photos(views))
+def photos() -> list[np.ndarray]:
+    return list(take_photos(cut_views(VIEWS)))
 
 
 def assign(

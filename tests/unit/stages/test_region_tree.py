@@ -215,19 +215,24 @@ def test_knee_of_nothing() -> None:
 # ---------------------------------------------------------------- splitting groups
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
+def make_scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18))
 
 
 @pytest.fixture(scope="module")
-def members(scene: Scene) -> Members:
-    return scene_members(scene)
+def scene() -> Scene:
+    return make_scene()
 
 
 @pytest.fixture(scope="module")
-def features(scene: Scene, members: Members) -> FeatureGaussians:
-    return encode(scene, members, cut(scene.images, 12))
+def members() -> Members:
+    return scene_members(make_scene())
+
+
+@pytest.fixture(scope="module")
+def features() -> FeatureGaussians:
+    scene = make_scene()
+    return encode(scene, scene_members(scene), cut(scene.images, 12))
 
 
 def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, members: Members) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import refuses
+from shared import make_once
 
 import gsmerge
 from gsmerge.errors import SceneError, UsageError
@@ -26,18 +27,20 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+def make_two() -> Path:
+    """Return a folder with two scenes, which take a second together. Read only."""
+    return make_once("generated", lambda out: generate(out, NUM_SCENES, TINY, seed=0, threads=2))
+
+
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes, which take a second together. Read only."""
-    out = tmp_path_factory.mktemp("generated")
-    generate(out, NUM_SCENES, TINY, seed=0, threads=2)
-    return out
+def folder() -> Path:
+    return make_two()
 
 
 @pytest.fixture
-def first(folder: Path, tmp_path: Path) -> Path:
+def first(tmp_path: Path) -> Path:
     """A folder with the first scene alone, which a test may change."""
-    shutil.copytree(folder / "scene_0000", tmp_path / "scene_0000")
+    shutil.copytree(make_two() / "scene_0000", tmp_path / "scene_0000")
     return tmp_path
 
 

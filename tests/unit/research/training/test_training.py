@@ -14,7 +14,7 @@ from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.networks.corrections import LOGIT_COLUMN
 from gsmerge.networks.options import Bounds
-from gsmerge.research.training import Example, Shard, TrainOptions, make_example, preset_options, train
+from gsmerge.research.training import Shard, TrainOptions, make_example, preset_options, train
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 from gsmerge.settings.setting import change_settings
 from gsmerge.types import Scene
@@ -33,12 +33,8 @@ def training_scene() -> TrainingScene:
 
 
 @pytest.fixture(scope="module")
-def example() -> Example:
-    return make_example(training_scene(), OPTIONS, 0.1, "room")
-
-
-@pytest.fixture(scope="module")
-def shard(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Shard:
+def shard(tmp_path_factory: pytest.TempPathFactory) -> Shard:
+    example = make_example(training_scene(), OPTIONS, 0.1, "room")
     return written(example, tmp_path_factory.mktemp("shards"))
 
 
