@@ -14,7 +14,7 @@ import pytest
 import shared
 from browser import NO_BROWSER
 from floors import at_least_the_floor
-from scene_folders import write_made, write_small
+from shared import write_made, write_small
 
 ROOT = Path(__file__).resolve().parent.parent
 MAX_PROCESSES = 8  # a process takes about 1 GB
@@ -121,13 +121,13 @@ def floor(request: pytest.FixtureRequest) -> Callable[..., None]:
 
 @pytest.fixture(scope="session")
 def made_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene of :func:`scene_folders.write_made`. Read only."""
+    """The scene of :func:`shared.write_made`. Read only."""
     return write_made(tmp_path_factory.mktemp("made") / "scene")
 
 
 @pytest.fixture(scope="session")
 def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene of :func:`scene_folders.write_small`. Read only."""
+    """The scene of :func:`shared.write_small`. Read only."""
     return write_small(tmp_path_factory.mktemp("small") / "scene")
 
 

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from comfyui import Bar, CancelError, Splat, modules
-from scene_folders import write_small
-from shared import make_once
+from shared import make_once, write_small
 
 import gsmerge
 from gsmerge.kernels.elementary import arctan2

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from messages import ERROR
-from scene_folders import write_scene
+from shared import write_scene
 from sweeps import sweep
 
 HEAVY = ("torch", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")

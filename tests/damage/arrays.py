@@ -75,10 +75,6 @@ def put_objects(name: str) -> Change:
     return change
 
 
-def write_pickle(path: Path) -> None:
-    path.write_bytes(pickle.dumps(Payload(path.parent / MARKER)))
-
-
 def write_pickles(path: Path) -> None:
     """An archive of pickles by the arrays' names."""
     data = pickle.dumps(Payload(path.parent / MARKER))
@@ -100,7 +96,8 @@ def of_cameras(poses: str, Ks: str, images: str) -> dict[str, Damage]:
     damages = {
         "the same arrays packed again": accept(edit_bytes(lambda data: pack_members(read_members(data)))),
         "poses as objects that would run code": refuse(put_objects(poses)),
-        "a pickle that would run code": refuse(write_pickle),
+        "a pickle that would run code": refuse(
+            lambda path: write_file(path, pickle.dumps(Payload(path.parent / MARKER)))),
         "an archive of pickles that would run code": refuse(write_pickles),
         "a type of poses of 9,000 nested brackets": refuse(put_array(poses, brackets(9000))),
         "20,000 poses": refuse(put_array(poses, np.tile(np.eye(4), (20_000, 1, 1))), slow=True),

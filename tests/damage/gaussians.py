@@ -135,13 +135,6 @@ def of_spz4() -> dict[str, Damage]:
     }
 
 
-def of_splat() -> dict[str, Damage]:
-    return {
-        "33 zero bytes in its place": refuse(write(bytes(33)), "33 bytes"),
-        "a row of NaN in its place": refuse(write(np.full(8, np.nan, "<f4").tobytes()), "NaN"),
-    }
-
-
 # .glb
 
 
@@ -231,5 +224,11 @@ def of_glb() -> dict[str, Damage]:
 
 
 DAMAGES = {
-    "spz": of_spz(), "spz of version 4": of_spz4(), "splat": of_splat(), "glb": of_glb(),
-}  # fmt: skip
+    "spz": of_spz(),
+    "spz of version 4": of_spz4(),
+    "splat": {
+        "33 zero bytes in its place": refuse(write(bytes(33)), "33 bytes"),
+        "a row of NaN in its place": refuse(write(np.full(8, np.nan, "<f4").tobytes()), "NaN"),
+    },
+    "glb": of_glb(),
+}

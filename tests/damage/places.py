@@ -20,13 +20,9 @@ OF_PHOTOS = {"spaces": "a b  %d", "Unicode": "\u00e4\u6f22 %d", "many digits": "
 FEW = ("line breaks", "bytes that are no UTF-8")  # forms of names that are tried in every run
 
 
-def rename(name: str) -> Change:
-    """The folder under another name."""
-    return lambda folder: [folder.rename(folder.parent / name)]
-
-
-def rename_ply(name: str) -> Change:
-    return lambda folder: [(folder / "scene.ply").rename(folder / name)]
+def rename(name: str, part: str = "") -> Change:
+    """The folder, or a file in it, under another name."""
+    return lambda folder: [(folder / part).rename((folder / part).parent / name)]
 
 
 def rename_photos(form: str) -> Change:
@@ -123,7 +119,9 @@ def add_images(folder: Path) -> None:
 
 def of_names() -> dict[str, Damage]:
     folders = {word: accept(rename(name), slow=word not in FEW) for word, name in FORMS.items()}
-    plys = {word: accept(rename_ply(FORMS[word][:240] + ".ply"), slow=word not in FEW) for word in list(FORMS)[:5]}
+    plys = {
+        word: accept(rename(FORMS[word][:240] + ".ply", "scene.ply"), slow=word not in FEW) for word in list(FORMS)[:5]
+    }
     photos = {word: accept(rename_photos(form)) for word, form in OF_PHOTOS.items()}
     return {
         **{f"a folder named with {word}": damage for word, damage in folders.items()},

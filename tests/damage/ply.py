@@ -112,10 +112,6 @@ def write_huge_header(count: int | str, form: str = "binary_little_endian", *mor
     return change
 
 
-def cut_header(path: Path) -> None:
-    fill_with_zeros(2**33, path.read_bytes().partition(b"property")[0])(path)
-
-
 # Compressed files: as many chunks of noise between two values
 
 
@@ -219,7 +215,9 @@ def _huge() -> dict[str, Damage]:
     lists = ("element face 100000000", "property list uchar uchar vertex_index")
     return {
         "8 GB of zeros after the first line": refuse(fill_with_zeros(2**33, b"ply\n"), "1 MiB"),
-        "8 GB of zeros in the header": refuse(cut_header, slow=True),
+        "8 GB of zeros in the header": refuse(
+            lambda path: fill_with_zeros(2**33, path.read_bytes().partition(b"property")[0])(path), slow=True
+        ),
         "8 GB of zeros as text rows": refuse(write_huge_header(2**26, "ascii"), slow=True),
         "8 GB of zeros as lists": refuse(write_huge_header(COUNT, "binary_little_endian", *lists), slow=True),
     }

@@ -287,14 +287,6 @@ def long_lrm(c2w: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> dict[str,
     return {"frames": [{"file_path": name, "w2c": pose.tolist(), **common} for name, pose in poses]}
 
 
-def write_long_lrm(folder: Path) -> None:
-    save_json(folder / "cameras.json", long_lrm(TINY.c2w, TINY.K, (TINY.width, TINY.height)))
-
-
-def write_world_mirror(folder: Path) -> None:
-    save_json(folder / "camera_params.json", world_mirror(TINY.c2w, TINY.K))
-
-
 def frames() -> list[dict[str, Any]]:
     lens = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 8, "w": 24, "h": 16, "k1": 0.1, "camera_model": "OPENCV"}
     return [{"file_path": f"{i}.png", "transform_matrix": m.tolist(), **lens} for i, m in enumerate(TINY.c2w)]
@@ -303,10 +295,6 @@ def frames() -> list[dict[str, Any]]:
 def write_frames(folder: Path) -> None:
     """Write frames with a lens each."""
     save_json(folder / "transforms.json", {"frames": frames(), "applied_transform": np.eye(4)[:3].tolist()})
-
-
-def write_bare_frames(folder: Path) -> None:
-    save_json(folder / "transforms.json", frames())
 
 
 def write_blender(folder: Path) -> None:
@@ -420,8 +408,13 @@ SOUNDS: dict[str, Sound] = {
                         check_cameras, scene=OF_CAMERAS),
     "INRIA": Sound("cameras.json", lambda folder: write_inria(folder / "cameras.json", TINY), check_cameras,
                    scene=OF_CAMERAS),
-    "Long-LRM": Sound("cameras.json", write_long_lrm, check_cameras, scene=OF_CAMERAS),
-    "WorldMirror": Sound("camera_params.json", write_world_mirror, check_cameras, scene=OF_CAMERAS),
+    "Long-LRM": Sound(
+        "cameras.json",
+        lambda folder: save_json(folder / "cameras.json", long_lrm(TINY.c2w, TINY.K, (TINY.width, TINY.height))),
+        check_cameras, scene=OF_CAMERAS),
+    "WorldMirror": Sound("camera_params.json",
+                         lambda folder: save_json(folder / "camera_params.json", world_mirror(TINY.c2w, TINY.K)),
+                         check_cameras, scene=OF_CAMERAS),
     "COLMAP text": Sound("sparse/images.txt", lambda folder: write_colmap_text(folder / "sparse", TINY),
                          check_colmap, scene=OF_CAMERAS, named="sparse", packed=True),
     "COLMAP binary": Sound("sparse/images.bin", lambda folder: write_colmap_binary(folder / "sparse", TINY),
@@ -432,7 +425,8 @@ SOUNDS: dict[str, Sound] = {
                          scene=OF_CAMERAS),
     # Cameras alone
     "frames with a lens each": Sound("transforms.json", write_frames, check_cameras, INSPECT, rare=True),
-    "a list of frames": Sound("transforms.json", write_bare_frames, check_cameras, INSPECT, rare=True),
+    "a list of frames": Sound("transforms.json", lambda folder: save_json(folder / "transforms.json", frames()),
+                              check_cameras, INSPECT, rare=True),
     "Blender": Sound("transforms.json", write_blender, check_cameras, INSPECT, rare=True),
     "GlobalSplat": Sound("cameras.json", FORMATS["GlobalSplat cameras.json"].write, check_cameras, INSPECT),
     "OpenSfM": Sound("reconstruction.json", FORMATS["OpenSfM"].write, check_cameras, INSPECT),

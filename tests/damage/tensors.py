@@ -227,16 +227,11 @@ def of_checkpoint() -> dict[str, Damage]:
     return {name: refuse(d.change, *(d.says or ("expected",)), slow=d.slow) for name, d in damages.items()}
 
 
-def of_batches() -> dict[str, Damage]:
-    """What ``extend`` alone reads."""
-    return {
+DAMAGES = {
+    "gsm to extend": {  # what ``extend`` alone reads
         "a number instead of batches": refuse(set_about(batches=5), "batches"),
         "numbers instead of the batches": refuse(set_about(batches=[5]), "batches"),
-    }
-
-
-DAMAGES = {
-    "gsm to extend": of_batches(),
+    },
     "gsm": of_any() | of_results(),
     "gsm of features": of_features(),
     "checkpoint": of_checkpoint(),

@@ -11,8 +11,7 @@ import pytest
 from batches import FAST, NAMES, finish, results
 from forked_commands import CommandServer
 from messages import ERROR, says
-from scene_folders import write_made, write_scene, write_small, write_smallest
-from shared import make_once
+from shared import make_once, write_made, write_scene, write_small, write_smallest
 
 from gsmerge.cli import main
 
@@ -31,7 +30,7 @@ Run = Callable[..., Outcome]
 
 @pytest.fixture(scope="session")
 def smallest_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene of :func:`scene_folders.write_smallest`. Read only."""
+    """The scene of :func:`shared.write_smallest`. Read only."""
     return write_smallest(tmp_path_factory.mktemp("smallest") / "scene")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import unaligned_scenes
 from messages import noted
-from scene_folders import write_smallest
+from shared import write_smallest
 from sweeps import sweep
 
 import gsmerge

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 from batches import FAST, InlinePool, records, results, statuses
 from messages import names
-from scene_folders import write_scene
-from shared import make_once
+from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.batch.records import record

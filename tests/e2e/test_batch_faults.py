@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from batches import FAST, NAMES, PATIENCE, finish, holders, records, results, start, statuses, until
 from messages import names
-from scene_folders import write_scene
+from shared import write_scene
 
 from .conftest import Run
 

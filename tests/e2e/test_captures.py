@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scene_folders import write_scene
 from scripts import load_script
-from shared import make_once
+from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.scene.read import load_scene

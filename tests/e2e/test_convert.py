@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from messages import noted, refuses
 from plyfile import PlyData, PlyElement
-from scene_folders import write_small
-from shared import make_once
+from shared import make_once, write_small
 from splat_transform_programs import put_stand_in, run_here
 from sweeps import sweep
 

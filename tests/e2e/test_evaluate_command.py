@@ -10,9 +10,8 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
-from scene_folders import write_scene
 from scripts import target_psnr
-from shared import make_once
+from shared import make_once, write_scene
 
 from gsmerge.cli import main
 

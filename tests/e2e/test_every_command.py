@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import names
-from scene_folders import write_scene
+from shared import write_scene
 from sweeps import sweep
 
 import gsmerge

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from scene_folders import write_made
 from scripts import target_psnr
+from shared import write_made
 from sweeps import sweep
 
 import gsmerge

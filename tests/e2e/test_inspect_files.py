@@ -14,7 +14,7 @@ import pytest
 from damage.tensors import negate
 from former_formats import compressed_bytes
 from messages import ERROR, says
-from scene_folders import write_smallest
+from shared import write_smallest
 from sweeps import sweep
 
 import gsmerge

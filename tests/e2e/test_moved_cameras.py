@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from messages import names, noted
-from scene_folders import write_small
+from shared import write_small
 from tiny_scene import edited_json
 
 from gsmerge.kernels import elementary

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
-from scene_folders import write_smallest
+from shared import write_smallest
 
 from e2e.conftest import Run
 from gsmerge.cli import main

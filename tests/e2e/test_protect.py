@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scene_folders import write_scene
+from shared import write_scene
 
 import gsmerge
 from e2e.conftest import Run

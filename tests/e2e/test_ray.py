@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from batches import FAST, NAMES, results, start, statuses
 from messages import names
-from scene_folders import write_scene
+from shared import write_scene
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs gsmerge[ray]")
 CLUSTER = """

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scene_folders import write_smallest
+from shared import write_smallest
 
 import gsmerge
 from gsmerge.photos.views import subset

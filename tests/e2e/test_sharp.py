@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import noted
-from scene_folders import write_scene
+from shared import write_scene
 from sharp_files import split_views, write_sharp
 
 from gsmerge import read_cameras, read_scene

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from scene_folders import write_scene
 from scripts import target_psnr
+from shared import write_scene
 from sweeps import sweep
 
 import gsmerge

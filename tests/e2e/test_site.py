@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
-from scene_folders import write_small
-from shared import make_once
+from shared import make_once, write_small
 
 import gsmerge
 from gsmerge.measure.evaluate import near_plane
@@ -25,10 +24,6 @@ SETTLED = "typeof site !== 'undefined' && site !== null && stage.getAttribute('a
 PLACE = "column(site.camera.matrix, 3).toArray()"
 
 
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
-
-
 QUICK = ("--effort", "draft", "--fit", "none")
 
 
@@ -37,7 +32,7 @@ def test_compact_writes_one_file_to_send(run: Run, smallest_copy: Path) -> None:
     assert_refused(run("compact", smallest_copy, "-o", page, "--levels", "2"), 2, page)
     assert not page.parent.exists()  # levels have none
     document = json.loads(run("compact", smallest_copy, "-o", page, *QUICK, "--json", code=0).out)
-    assert names(page.parent) == ["small.html"]
+    assert [path.name for path in page.parent.iterdir()] == ["small.html"]
     assert document["output"]["bytes"] == page.stat().st_size < 1_100_000
 
 

@@ -16,8 +16,7 @@ import pytest
 from damage.case import Change
 from damage.changes import cut
 from damage.tensors import negate
-from scene_folders import write_scene
-from shared import make_once
+from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.cli import main

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from batches import InlinePool
 from messages import ERROR, names
-from scene_folders import write_smallest
+from shared import write_smallest
 
 from .conftest import Run, assert_refused
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import scenes
 from messages import noted
-from scene_folders import write_scene
+from shared import write_scene
 
 from gsmerge import Scene, compact, read_ply
 from gsmerge.errors import UsageError

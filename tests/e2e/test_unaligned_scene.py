@@ -13,8 +13,8 @@ import pytest
 import unaligned_scenes
 from messages import names, noted
 from PIL import Image
-from scene_folders import write_made
 from scripts import target_psnr
+from shared import write_made
 from sweeps import sweep
 from tiny_scene import edited_json
 

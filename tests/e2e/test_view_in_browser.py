@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
-from scene_folders import write_scene
-from shared import make_once
+from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.cli import main

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from scene_folders import write_smallest
 from scripts import target_psnr
+from shared import write_smallest
 from sweeps import sweep
 
 import gsmerge

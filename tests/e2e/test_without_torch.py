@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scene_folders import write_small
-from shared import make_once
+from shared import make_once, write_small
 
 from gsmerge.cli import main
 from gsmerge.errors import TORCH_INSTALL

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from batches import InlinePool, records
 from messages import names
-from scene_folders import write_scene
 from scenes import psnr_of
+from shared import write_scene
 from sweeps import sweep
 
 import gsmerge

@@ -12,7 +12,7 @@ import motions
 import numpy as np
 import pytest
 from saved_cameras import write_transforms
-from scene_folders import write_scene
+from shared import write_scene
 from tiny_scene import edited_json
 
 from gsmerge import to_cameras

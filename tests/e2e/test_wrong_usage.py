@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from bare_files import write_without_grid
 from PIL import Image
-from scene_folders import write_small
+from shared import write_small
 
 from gsmerge.cli import app, main
 

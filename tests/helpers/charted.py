@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 from batches import InlinePool
-from scene_folders import write_scene
-from shared import make_once
+from shared import make_once, write_scene
 
 from gsmerge.cli import main
 

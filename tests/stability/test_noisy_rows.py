@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scene_folders import write_scene
+from shared import write_scene
 from sweeps import sweep
 
 from gsmerge.facts.prepare import prepare

@@ -9,8 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
-from scene_folders import write_scene
-from shared import make_once
+from shared import make_once, write_scene
 
 import gsmerge
 

@@ -47,10 +47,6 @@ def test_seeds_follow_the_density_to_the_exact_count(count: int) -> None:
     assert len({(y, x) for y, x in places.tolist()}) == count
 
 
-def random_image(height: int, width: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).random((height, width, 3), dtype=np.float32)
-
-
 def test_density_is_at_most_one_and_sums_to_the_count() -> None:
     response = np.zeros((10, 10), np.float32)
     response[3:5] = 100

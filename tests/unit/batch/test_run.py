@@ -18,7 +18,7 @@ import pytest
 from batches import QUICK, InlinePool, one_job, records, results, statuses
 from messages import names, refuses, says
 from network_fixtures import noisy, untrained, written
-from scene_folders import write_scene
+from shared import write_scene
 
 from gsmerge.batch import jobs as calls
 from gsmerge.batch import run as runs

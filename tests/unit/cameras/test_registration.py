@@ -173,14 +173,10 @@ def test_a_moved_scene_looks_the_same(degree: int) -> None:
     K = np.array([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, :3, 3] = (0.2, -0.1, 0.3)
-    scene = Scene(gaussians, pinholes(poses, K), None, None, ("a", "b"))
+    scene = Scene(gaussians, Cameras(poses, np.tile(K, (2, 1, 1)), 32, 24), None, None, ("a", "b"))
     moved = move_scene(scene, Similarity(rotation(0.5, -1.0, 2.2), 1.6, np.array([4.0, -3, 2])))
     before, after = (render(one.gaussians, one.cameras).images for one in (scene, moved))
     assert np.abs(before - after).max() < 2e-4
     if num:
         plain = render(replace(moved.gaussians, shN=gaussians.shN), moved.cameras).images
         assert np.abs(before - plain).max() > 0.02
-
-
-def pinholes(poses: np.ndarray, K: np.ndarray) -> Cameras:
-    return Cameras(poses, np.tile(K, (2, 1, 1)), 32, 24)

@@ -22,8 +22,3 @@ def truth() -> Gaussians:
 @pytest.fixture(scope="session")
 def photos() -> tuple[Photos, Photos]:
     return scenes.pair_of(scenes.self_made(0)[0])
-
-
-@pytest.fixture(scope="session")
-def noise() -> tuple[Photos, Photos]:
-    return scenes.noise_for(scenes.pair_of(scenes.self_made(0)[0]))

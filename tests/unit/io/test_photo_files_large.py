@@ -32,11 +32,6 @@ def made_once() -> Path:
     return make_once("large", lambda folder: generate_scene(folder, options, seed=2))
 
 
-@pytest.fixture(scope="module")
-def made() -> Path:
-    return made_once()
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A copy that a test may change."""
@@ -74,8 +69,8 @@ def shift_between(scene: Scene, scale: float) -> tuple[float, float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.5, 3])
-def test_larger_photos_show_what_the_grid_shows(made: Path, scale: float) -> None:
-    scene = gsmerge.read_scene(made)
+def test_larger_photos_show_what_the_grid_shows(scale: float) -> None:
+    scene = gsmerge.read_scene(made_once())
     assert scene.has_own_pixels
     assert largest_scale(scene) == pytest.approx(SCALE)
     assert shift_between(scene, scale) == (0, 0)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from messages import refuses
-from scene_folders import write_small
-from shared import make_once
+from shared import make_once, write_small
 from sweeps import sweep
 
 from gsmerge.errors import SceneError

@@ -13,7 +13,7 @@ import pytest
 from messages import names
 from PIL import Image
 from plyfile import PlyData, PlyElement
-from scene_folders import write_scene
+from shared import write_scene
 
 from gsmerge.errors import SceneError
 from gsmerge.scene.read import Loaded, load_scene

@@ -15,26 +15,17 @@ from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.networks.corrections import LOGIT_COLUMN
 from gsmerge.networks.options import Bounds
 from gsmerge.research.training import Shard, TrainOptions, make_example, preset_options, train
-from gsmerge.research.training.scenes import TrainingScene, make_training_scene
+from gsmerge.research.training.scenes import make_training_scene
 from gsmerge.settings.setting import change_settings
-from gsmerge.types import Scene
 
 
 class StoppedError(Exception):
     """What a test interrupts a run with."""
 
 
-def scene(views: int = 3) -> Scene:
-    return make_scene(room(), arc(views, 32, 24))
-
-
-def training_scene() -> TrainingScene:
-    return make_training_scene(scene(), range(3))
-
-
 @pytest.fixture(scope="module")
 def shard(tmp_path_factory: pytest.TempPathFactory) -> Shard:
-    example = make_example(training_scene(), OPTIONS, 0.1, "room")
+    example = make_example(make_training_scene(make_scene(room(), arc(3, 32, 24)), range(3)), OPTIONS, 0.1, "room")
     return written(example, tmp_path_factory.mktemp("shards"))
 
 
