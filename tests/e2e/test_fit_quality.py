@@ -37,7 +37,7 @@ def compacted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[C
 @sweep(
     ("superpixels", "settings"),
     [(256, {}), (256, {"fit_steps": 300}), (256, {"k": 2}), (64, {})],
-    ids=["default", "best", "K2", "1%"],
+    ids=["defaults", "fit_steps=300", "k=2", "a quarter of the superpixels"],
 )
 def test_full_fit_reaches_the_floor_with_no_more_than_the_count(
     superpixels: int,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -16,3 +16,10 @@ def sweep(names: str | Sequence[str], values: Iterable[Any], *, often: int = 1, 
         for i, value in enumerate(values)
     ]
     return pytest.mark.parametrize(names, cases, **options)
+
+
+def in_words(value: Any) -> str:
+    """Name a case by what a user sets: ``k=2 fit=none`` of settings, words of a function's name."""
+    if isinstance(value, Mapping):
+        return " ".join(f"{name}={one}" for name, one in value.items()) or "defaults"
+    return value.__name__.replace("_", " ") if callable(value) else str(value)

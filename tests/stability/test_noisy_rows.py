@@ -29,7 +29,12 @@ def shuffle_rows(ply: Path) -> None:
     ply.write_bytes(head + end + np.random.default_rng(0).permutation(rows).tobytes())
 
 
-@sweep(("size", "seed"), [(size, seed) for size in SIZES for seed in SEEDS], ids=str, often=3)
+@sweep(
+    ("size", "seed"),
+    [(size, seed) for size in SIZES for seed in SEEDS],
+    ids=[f"{width} x {height} seed {seed}" for width, height in SIZES for seed in SEEDS],
+    often=3,
+)
 def test_every_photo_stays_as_it_is(tmp_path: Path, size: Any, seed: int) -> None:
     folder = write_scene(tmp_path / "room", num_views=VIEWS, width=size[0], height=size[1], seed=seed)
     shuffle_rows(folder / "scene.ply")
