@@ -15,6 +15,7 @@ import shared
 from browser import NO_BROWSER
 from floors import at_least_the_floor
 from shared import write_made, write_small
+from sweeps import in_words
 
 ROOT = Path(__file__).resolve().parent.parent
 MAX_PROCESSES = 8  # a process takes about 1 GB
@@ -51,6 +52,11 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, p
     if isinstance(collector, pytest.Directory) and WORKER[-1:] in tuple("13579"):
         report.result = report.result[::-1]
     return report
+
+
+def pytest_make_parametrize_id(val: object) -> str | None:
+    """Name cases by their values also where pytest would count them: ``options0`` says nothing."""
+    return in_words(val)
 
 
 def pytest_collection_finish() -> None:

@@ -91,7 +91,8 @@ def test_streamed_levels_have_a_quarter_of_the_gaussians_each(
         PlacementOptions(up="y"), PlacementOptions(up="-z"), PlacementOptions(scale=3.0),
         PlacementOptions(rotate="20,-50,110"), PlacementOptions(translate="1,2,-3"),
         PlacementOptions(up="z", scale=0.5, rotate="0,0,90", translate="5,0,0"),
-    ], often=2)  # fmt: skip
+    ],
+    ids=["up=y", "up=-z", "scale=3", "rotate=20,-50,110", "translate=1,2,-3", "all of them"], often=2)  # fmt: skip
 def test_a_moved_scene_looks_the_same_from_its_moved_cameras(
     result: Path, tmp_path: Path, options: PlacementOptions
 ) -> None:

@@ -135,7 +135,7 @@ def test_names_that_are_not_utf_8(command: str, small_copy: Path, run: Run) -> N
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
-@pytest.mark.parametrize("command", ["compact", "compact a state", "extend", *WRITERS])
+@pytest.mark.parametrize("command", ["compact a state", "extend", *WRITERS])
 def test_rights(command: str, small_copy: Path, run: Run) -> None:
     """Outputs that hold photos are as private as these, and what replaces a file takes its mode."""
     for path in (small_copy / "images").iterdir():

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from shared import write_smallest
-from sweeps import in_words
 
 import gsmerge
 from gsmerge.photos.views import subset
@@ -28,9 +27,7 @@ def one_photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("scene", ["smallest_scene", "one_photo"])
-@pytest.mark.parametrize(
-    "settings", [{}, {"budget": "auto"}, {"budget": "mobile"}, {"levels": 2}, {"k": 2}], ids=in_words
-)
+@pytest.mark.parametrize("settings", [{}, {"budget": "auto"}, {"budget": "mobile"}, {"levels": 2}, {"k": 2}])
 def test_a_file_holds_what_python_returns(
     scene: str, settings: dict[str, str], tmp_path: Path, run: Run, request: pytest.FixtureRequest
 ) -> None:

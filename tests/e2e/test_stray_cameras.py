@@ -73,7 +73,7 @@ def test_photos_that_do_not_show_the_scene_are_a_doubt_too(smallest_copy: Path, 
     assert run(*words, "--strict", code=4).err.endswith("1 of 1 result is doubtful\n")
 
 
-@pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")], ids=str)
+@pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")])
 def test_commands_that_take_cameras_run_beside_them(words: tuple[str, ...], stray: Path, run: Run) -> None:
     small = stray / "small.ply"
     shutil.copy(stray / "scene.ply", small)

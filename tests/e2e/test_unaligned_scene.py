@@ -15,7 +15,7 @@ from messages import names, noted
 from PIL import Image
 from scripts import target_psnr
 from shared import write_made
-from sweeps import in_words, sweep
+from sweeps import sweep
 from tiny_scene import edited_json
 
 import gsmerge
@@ -38,7 +38,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@sweep("settings", [{}, {"budget": "2%"}, {"k": 2}], ids=in_words)
+@sweep("settings", [{}, {"budget": "2%"}, {"k": 2}])
 def test_floor(settings: dict, made: Path, tmp_path: Path, floor: Callable[..., None]) -> None:
     """300 steps, as users' fits have."""
     scene = read_scene(made, order="none")

@@ -103,7 +103,9 @@ def picture(tab: Browser) -> np.ndarray:
     raise AssertionError("the picture changes all the time")
 
 
-@pytest.mark.parametrize("views", [slice(1), pytest.param(slice(1, None), marks=pytest.mark.slow)], ids=str)
+@pytest.mark.parametrize(
+    "views", [slice(1), pytest.param(slice(1, None), marks=pytest.mark.slow)], ids=["the first view", "all other views"]
+)
 def test_3d_is_what_we_render_at_every_input_view(views: slice, page: tuple[Browser, Any]) -> None:
     """The browser draws without a GPU."""
     tab, (scene, small, _) = refreshed(page)

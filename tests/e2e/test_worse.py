@@ -12,7 +12,7 @@ from batches import InlinePool, records
 from messages import names
 from scenes import psnr_of
 from shared import write_scene
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 import gsmerge
 from gsmerge import Scene
@@ -55,7 +55,7 @@ def test_one_photo_is_fitted_though_no_other_shows_what_is_held_out(one_photo: S
     assert report.worse is None
 
 
-@pytest.mark.parametrize("settings", [{"effort": "fast"}, {"fit": "none"}], ids=in_words)
+@pytest.mark.parametrize("settings", [{"effort": "fast"}, {"fit": "none"}])
 def test_one_photo_without_a_long_fit_gets_more_gaussians(one_photo: Scene, settings: dict[str, Any]) -> None:
     actual = gsmerge.compact(one_photo, threads=1, **settings)
     assert actual.report.options["k"] == 4

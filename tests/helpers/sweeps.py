@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import pytest
@@ -18,8 +19,17 @@ def sweep(names: str | Sequence[str], values: Iterable[Any], *, often: int = 1, 
     return pytest.mark.parametrize(names, cases, **options)
 
 
-def in_words(value: Any) -> str:
-    """Name a case by what a user sets: ``k=2 fit=none`` of settings, words of a function's name."""
-    if isinstance(value, Mapping):
-        return " ".join(f"{name}={one}" for name, one in value.items()) or "defaults"
-    return value.__name__.replace("_", " ") if callable(value) else str(value)
+def in_words(value: object) -> str | None:
+    """Name a case by its value: settings as ``k=2 fit=none``, words of a list, and of the name of a function.
+
+    None of what has no short text, which pytest names by the argument and a number.
+    """
+    if callable(value):
+        return value.__name__.replace("_", " ") if value.__name__ != "<lambda>" else None
+    if not isinstance(value, dict | list | tuple | set):
+        return None
+    text = repr(sorted(value) if isinstance(value, set) else value)
+    if len(text) > 100 or " at 0x" in text or "array(" in text:
+        return None
+    words = re.sub(r"[\[\](){}'\",]", "", text).replace(": ", "=")
+    return words or ("defaults" if isinstance(value, dict) else "none")

@@ -8,7 +8,7 @@ import numpy as np
 import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 from gsmerge import Scene
 
@@ -40,7 +40,7 @@ CASES = [
 ]  # fmt: skip
 
 
-@sweep("settings", CASES, ids=in_words)
+@sweep("settings", CASES)
 def test_threads_change_no_bit(settings: dict) -> None:
     actual = [scenes.compacted(ROOM, threads=threads, **settings).gaussians for threads in (1, 3)]
     assert scenes.identical(*actual)

@@ -11,7 +11,7 @@ import unaligned_scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 from gsmerge import Scene, compact
 from gsmerge.facts.pixels import with_pixels
@@ -74,7 +74,7 @@ def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
     assert abs(scenes.psnr_of(one, ROOM) - scenes.psnr_of(other, ROOM)) < 0.1
 
 
-@sweep("options", [{"fit_steps": 12, "budget": 150}, {"budget": "auto"}], ids=in_words)
+@sweep("options", [{"fit_steps": 12, "budget": 150}, {"budget": "auto"}])
 def test_threads_change_no_bit(options: dict) -> None:
     scene = unaligned_scenes.voxels(ROOM, 0.06)
     actual = [compact(scene, superpixels="10%", threads=threads, **options).gaussians for threads in (1, 3)]

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
-from sweeps import in_words
 
 from gsmerge import Scene, compact
 from gsmerge.geometry.pooling import scene_members
@@ -25,7 +24,6 @@ def scene() -> Scene:
         {"fit": "none", "checkpoint": "none"},
         {"budget": "8%", "fit_steps": 30, "effort": "best"},  # grows
     ],
-    ids=in_words,
 )
 def test_one_view_at_a_time_or_all(scene: Scene, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]) -> None:
     actual = []

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 from gsmerge import Scene
 from gsmerge.geometry.frame import scene_frame
@@ -24,7 +24,7 @@ def room() -> Scene:
 # 13: flyaways
 
 
-@sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "match": "aabb"}], ids=in_words)
+@sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "match": "aabb"}])
 def test_flyaways_do_not_disturb_the_rest(room: Scene, settings: dict) -> None:
     """Means of three draws: one fit of so few Gaussians differs from another by half a decibel."""
     scores = []
@@ -46,7 +46,7 @@ def test_flyaways_do_not_disturb_the_rest(room: Scene, settings: dict) -> None:
 # 37: coordinates of maps
 
 
-@sweep("settings", [{"fit": "none"}, {"fit": "none", "checkpoint": "none", "k": 2}], ids=in_words)
+@sweep("settings", [{"fit": "none"}, {"fit": "none", "checkpoint": "none", "k": 2}])
 def test_map_coordinates(room: Scene, settings: dict) -> None:
     far = scenes.move(room, np.eye(3), 1.0, UTM)
     one, other = (scenes.compacted(scene, **settings) for scene in (room, far))

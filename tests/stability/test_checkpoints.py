@@ -9,7 +9,7 @@ import pytest
 from network_fixtures import noisy, scaled, untrained, written
 from safetensors.numpy import load_file, save_file
 from scenes import arc, assert_invariants, identical, make_scene, room
-from sweeps import in_words, sweep
+from sweeps import sweep
 from unaligned_scenes import shuffled
 
 import gsmerge
@@ -31,7 +31,6 @@ PLAIN = {"fit": "none", "match": "none", "superpixels": 100, "poses": "fixed"}
         {"fit": "full", "fit_steps": 4},
         {"budget": 150},
     ],
-    ids=in_words,
 )
 def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(2, 32, 24))
@@ -60,7 +59,7 @@ def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
     assert identical(one.gaussians, gsmerge.compact(unaligned, **chosen, checkpoint=str(path), threads=3).gaussians)
 
 
-@sweep("settings", [{"levels": 2}, {}, {"quality": "15dB"}], ids=in_words)
+@sweep("settings", [{"levels": 2}, {}, {"quality": "15dB"}])
 def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(2))
     path = written(tmp_path / "a.safetensors", noisy())
@@ -88,7 +87,7 @@ def test_networks_of_the_package_that_cannot_be_used_are_noted(
     assert "networks" not in fallen.report.choices
 
 
-@sweep("options", [{}, {"method": "random", "budget": 40}], ids=in_words)
+@sweep("options", [{}, {"method": "random", "budget": 40}])
 def test_a_file_that_is_named_must_be_usable(tmp_path: Path, options: dict[str, object]) -> None:
     with pytest.raises(gsmerge.SceneError, match="nosuch: expected a checkpoint, found no such file"):
         gsmerge.compact(make_scene(room(), arc(2)), **PLAIN | options, checkpoint=str(tmp_path / "nosuch"))

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import scenes
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene, render
 from gsmerge.types import SH_C0
@@ -76,7 +76,7 @@ def shiny(scene: Scene, strength: float) -> Scene:
     return replace(made, images=images.astype(np.float32))
 
 
-@sweep("settings", [{"fit_steps": 10}, {}, {"fit": "none"}, {"k": 2}], ids=in_words)
+@sweep("settings", [{"fit_steps": 10}, {}, {"fit": "none"}, {"k": 2}])
 def test_harmonics_survive(room: Scene, settings: dict) -> None:
     scene = shiny(room, 0.3)
     actual = compacted(scene, **settings).gaussians

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import scenes
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene, compact
 
@@ -43,7 +43,7 @@ def coverage(gaussians: Gaussians, scene: Scene) -> tuple[float, float]:
 # 47: more children, more detail
 
 
-@sweep("settings", [{"fit": "none", "checkpoint": "none"}, {}], ids=in_words)
+@sweep("settings", [{"fit": "none", "checkpoint": "none"}, {}])
 def test_more_children_show_more(scene: Scene, settings: dict) -> None:
     actual = [compacted(scene, superpixels="4.4%", k=k, **settings).gaussians for k in (1, 2, 4, 8)]
     assert (np.diff([len(g) for g in actual]) > 0).all()
@@ -51,7 +51,7 @@ def test_more_children_show_more(scene: Scene, settings: dict) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [{"fit": "none", "checkpoint": "none"}, {}], ids=in_words)
+@pytest.mark.parametrize("settings", [{"fit": "none", "checkpoint": "none"}, {}])
 def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
     actual = [compacted(scene, superpixels=share, **settings).gaussians for share in ("1%", "3%", "10%")]
     assert (np.diff([len(g) for g in actual]) > 0).all()
@@ -61,7 +61,7 @@ def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
 # 48: coverage and brightness
 
 
-@sweep("settings", [{}, {"k": 4}, {"match": "none"}], ids=in_words)
+@sweep("settings", [{}, {"k": 4}, {"match": "none"}])
 def test_photos_keep_coverage_and_brightness(scene: Scene, settings: dict) -> None:
     """What is not merged across views loses 1.1 % over four seeds, the rest half of that."""
     before = coverage(scene.gaussians, scene)
@@ -87,7 +87,7 @@ def test_plain_merging_loses_a_known_part_of_coverage(clean: Scene, views: int, 
 # 55: glass
 
 
-@sweep("settings", [{"fit": "none"}, {}, {"match": "none"}], ids=in_words)
+@sweep("settings", [{"fit": "none"}, {}, {"match": "none"}])
 def test_faint_scenes_are_not_pruned(scene: Scene, settings: dict) -> None:
     opacities = np.full_like(scene.gaussians.opacities, 0.05)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import scenes
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry.pooling import feature_to_gaussians, scene_members
@@ -42,7 +42,7 @@ def one_group_per_view(scene: Scene) -> FeatureGaussians:
 # 1: coincident Gaussians
 
 
-@sweep("settings", [{"fit_steps": 10}, {}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=in_words)
+@sweep("settings", [{"fit_steps": 10}, {}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}])
 def test_all_gaussians_in_one_place(room: Scene, settings: dict) -> None:
     columns = {name: getattr(room.gaussians, name) for name in scenes.FIELDS}
     first = {name: np.broadcast_to(column[:1], column.shape) for name, column in columns.items()}
@@ -98,7 +98,7 @@ def test_needle_in_a_group(small: Scene, size: int) -> None:
     assert float(actual.scales.max()) <= 3 * extent
 
 
-@sweep("settings", [{"fit_steps": 10}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=in_words)
+@sweep("settings", [{"fit_steps": 10}, {"fit": "none"}, {"fit": "none", "k": 4}])
 def test_scales_at_the_ends_of_the_range(room: Scene, settings: dict) -> None:
     scales = room.gaussians.scales.copy()
     scales[::30] = 2e17  # exp(40)
@@ -185,7 +185,7 @@ def test_huge_gaussian_in_front_of_one_camera(room: Scene) -> None:
 
 
 @sweep("where", ["at", "behind"])
-@sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=in_words)
+@sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "k": 4}])
 def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: dict) -> None:
     means = room.gaussians.means.copy().reshape(3, 36, 48, 3)
     eyes = room.cameras.centres[:, None, None]
@@ -199,7 +199,7 @@ def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: d
 # 15, 16: depth edges
 
 
-@sweep("settings", [{"fit_steps": 40}, {}, {"fit": "none"}, {"k": 2}], ids=in_words)
+@sweep("settings", [{"fit_steps": 40}, {}, {"fit": "none"}, {"k": 2}])
 def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     sky = [scenes.plane(2.0, scenes.waves(1), right=0.0), scenes.plane(8e5, scenes.flat(0.1, 0.2, 1.0))]
     scene = scenes.make_scene(sky, scenes.arc(3))
@@ -229,7 +229,7 @@ def test_no_curtain_across_a_depth_edge_of_one_colour() -> None:
 # 17: thin things
 
 
-@sweep("settings", [{"fit_steps": 40}, {}, {"k": 2}, {"fit": "none"}], ids=in_words)
+@sweep("settings", [{"fit_steps": 40}, {}, {"k": 2}, {"fit": "none"}])
 def test_thin_pole_stays_visible_from_a_new_view(settings: dict) -> None:
     """Two pixels wide; contrast against the wall beside it."""
     scene = scenes.make_scene(scenes.pole(), scenes.arc(3))

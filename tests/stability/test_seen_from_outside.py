@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
 from gsmerge.measure.fog import HAZE, measure_fog
@@ -95,7 +95,7 @@ def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
     assert (result.gaussians.opacities >= 1 / 255).all()
 
 
-@sweep("settings", [{"effort": "draft"}, {"effort": "fast"}, {"k": 4}, {"budget": "20%"}], ids=in_words)
+@sweep("settings", [{"effort": "draft"}, {"effort": "fast"}, {"k": 4}, {"budget": "20%"}])
 def test_every_effort_and_size(settings: dict[str, object]) -> None:
     scene = room()
     result = scenes.compacted(scene, **settings)

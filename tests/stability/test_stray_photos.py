@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from messages import noted
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.geometry.frame import canonicalise
@@ -105,12 +105,12 @@ def novel_psnr(gaussians: Gaussians) -> float:
     return scenes.psnr_of(gaussians, scenes.make_scene(scenes.room(), scenes.arc(1, WIDTH, HEIGHT, start=-0.2)))
 
 
-@sweep("change", SPOILT, ids=in_words, often=4)
+@sweep("change", SPOILT, often=4)
 def test_odd_photos_are_recognised_in_drawings(room: Scene, change: Callable[[Photos], Photos]) -> None:
     assert odd_photos(room, change) == SPOILT[change]
 
 
-@sweep("change", [change for change, odd in SPOILT.items() if len(odd) < VIEWS], ids=in_words)
+@sweep("change", [change for change, odd in SPOILT.items() if len(odd) < VIEWS])
 def test_rows_take_the_place_of_other_pictures(room: Scene, change: Callable[[Photos], Photos]) -> None:
     """Where the photo is that of another view, what both show alike stays."""
     compared, views = compare_photos(PicturedScene.with_pictures(canonicalise(room)[0], change(room.images), None))
@@ -155,7 +155,7 @@ def test_photos_of_a_few_pixels_stay() -> None:
     assert odd_photos(scenes.make_scene(scenes.room(), scenes.arc(3, 24, 16)), np.copy) == []
 
 
-@sweep("change", [one_black, one_of_noise, one_of_another_scene], ids=in_words)
+@sweep("change", [one_black, one_of_noise, one_of_another_scene])
 def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change: Callable[[Photos], Photos]) -> None:
     """Nearly as good as with all photos, and as the input; the note and the report name them."""
     odd = SPOILT[change]
@@ -168,8 +168,8 @@ def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change:
     assert result.report.psnr_after == pytest.approx(unspoilt.report.psnr_after, abs=1)
 
 
-@sweep("change", [all_black, all_noise, all_of_another_scene], ids=in_words)
-@sweep("settings", [{}, {"budget": 125}, {"budget": "auto"}], ids=in_words)
+@sweep("change", [all_black, all_noise, all_of_another_scene])
+@sweep("settings", [{}, {"budget": 125}, {"budget": "auto"}])
 def test_none_is_used_where_most_are_wrong(
     room: Scene, change: Callable[[Photos], Photos], settings: dict[str, Any]
 ) -> None:

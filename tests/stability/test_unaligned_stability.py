@@ -11,7 +11,7 @@ import pytest
 import scenes
 import unaligned_scenes
 from messages import noted, refuses
-from sweeps import in_words, sweep
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.result import CompactResult
@@ -38,7 +38,7 @@ SETTINGS = [
 ]  # fmt: skip
 
 
-@sweep("settings", SETTINGS, ids=in_words, often=2)
+@sweep("settings", SETTINGS, often=2)
 def test_every_setting(room: Scene, settings: dict, floor: Callable[..., None]) -> None:
     result = compacted(unaligned_scenes.shuffled(room), **settings)
     if settings.get("budget") == 150:

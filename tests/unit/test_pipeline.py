@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from sweeps import in_words
 
 from gsmerge import Scene, compact
 from gsmerge.kernels import elementary
@@ -69,9 +68,7 @@ def test_a_result_that_loses_what_the_input_covers_is_worse(scene: Scene) -> Non
     assert report.worse is not None
 
 
-@pytest.mark.parametrize(
-    ("settings", "scored_all", "near"), [({}, False, 1.5), ({"budget": 9}, True, 1e-4)], ids=in_words
-)
+@pytest.mark.parametrize(("settings", "scored_all", "near"), [({}, False, 1.5), ({"budget": 9}, True, 1e-4)])
 def test_a_sample_is_scored_unless_the_result_may_be_worse(settings: Any, scored_all: bool, near: float) -> None:
     """Then all photos decide, and the report is exact."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(5, 240, 224), noise=0.3)

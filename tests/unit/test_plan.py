@@ -12,7 +12,6 @@ import scenes
 import unaligned_scenes
 from messages import noted
 from scenes import psnr_of
-from sweeps import in_words
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.candidate import score
@@ -142,7 +141,7 @@ def test_missing_networks_of_the_package_are_noted(scene: Scene, monkeypatch: py
     assert "networks" in record.notes[0]
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"effort": "draft"}, {"quality": "20dB"}], ids=in_words)
+@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"effort": "draft"}, {"quality": "20dB"}])
 def test_without_photos_a_plan_is_the_same_where_pixels_are_known(settings: dict[str, Any], scene: Scene) -> None:
     """Their colours stand in; the estimate, which looks at no colour, knows that."""
     blind, options = replace(scene, images=None), options_of(**settings)
@@ -180,9 +179,7 @@ def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason:
         plan_of(unaligned_scenes.without_order(replace(scene, images=None)), **settings)
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"budget": "auto"}, {"effort": "draft"}, {"crop": "sphere:0,0,0,1e4"}], ids=in_words
-)
+@pytest.mark.parametrize("settings", [{}, {"budget": "auto"}, {"effort": "draft"}, {"crop": "sphere:0,0,0,1e4"}])
 def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     kept = plan_of(rows, **settings)
@@ -192,9 +189,7 @@ def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings:
     assert estimate(rows, options_of(**settings))["fit"] == "full"  # to the renders, as the run does
 
 
-@pytest.mark.parametrize(
-    "settings", [{"budget": 100}, {"k": 2}, {"superpixels": "5%"}, {"quality": "20dB"}], ids=in_words
-)
+@pytest.mark.parametrize("settings", [{"budget": 100}, {"k": 2}, {"superpixels": "5%"}, {"quality": "20dB"}])
 def test_what_asks_for_a_count_decides_it(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     assert plan_of(rows, **settings).target_psnr == (20 if "quality" in settings else None)
@@ -300,7 +295,7 @@ OPEN = [  # merging across views, and what photos show, decide how many there ar
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("settings", SETTLED + OPEN, ids=in_words)
+@pytest.mark.parametrize("settings", SETTLED + OPEN)
 def test_the_estimate_is_what_the_run_does(
     settings: dict[str, Any], scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from sweeps import in_words
 
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.left_out import LEAST_VIEWS, choose_left_out, cover, leave_out, mean_seen
@@ -62,7 +61,7 @@ def test_four_views_say_what_new_ones_gain(room: Scene) -> None:
     assert report.seconds["new views"] > 0
 
 
-@pytest.mark.parametrize("settings", [{"effort": "draft"}, {"new_views": False}], ids=in_words)
+@pytest.mark.parametrize("settings", [{"effort": "draft"}, {"new_views": False}])
 def test_drafts_and_who_asks_for_none_get_none(settings: dict[str, object], room: Scene) -> None:
     report = compact(room, **QUICK, **settings).report
     assert report.new_views is None

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene
 from messages import names, noted, refuses
-from sweeps import in_words, sweep
+from sweeps import sweep
 from tiny_scene import Tiny, rotation, write_colmap_binary, write_images, write_inria, write_npz, write_transforms
 
 from gsmerge.errors import SceneError
@@ -171,7 +171,7 @@ def test_masks_that_nothing_names(tmp_path: Path) -> None:
     assert actual.scene.images is not None
 
 
-@pytest.mark.parametrize("hints", [{"order": "view-major"}, {"order": "view-fastest"}], ids=in_words)
+@pytest.mark.parametrize("hints", [{"order": "view-major"}, {"order": "view-fastest"}])
 def test_hints_on_pixels_for_rows_that_have_none(tmp_path: Path, hints: dict[str, str]) -> None:
     ((name, value),) = hints.items()
     for cameras in (False, True):
