@@ -160,24 +160,15 @@ def chain_nodes(parsed: dict[str, Any]) -> None:
     parsed["nodes"] = [{"children": [i + 1], "scale": [2, 2, 2]} for i in range(DEEP)] + parsed["nodes"]
 
 
-def copy_nodes(parsed: dict[str, Any]) -> None:
-    """As many nodes that show the same Gaussians."""
-    parsed["nodes"] = [{"children": list(range(1, DEEP))}, *([{"mesh": 0}] * DEEP)]
-
-
-def add_empty_nodes(parsed: dict[str, Any]) -> None:
-    """Nodes of a few bytes, each of which takes longer to place than they allow."""
-    parsed["nodes"] = [{"children": list(range(1, 200_000))}, *([{}] * 200_000)]
+def put_nodes(count: int, node: dict[str, int]) -> Change:
+    """Put as many equal nodes into one; even empty ones take longer to place than their few bytes allow."""
+    return set_json("nodes", value=[{"children": list(range(1, count + 1))}, *([node] * count)])
 
 
 def share_positions(parsed: dict[str, Any]) -> None:
     """All harmonics are the positions."""
     names = [f"{SPLATTING}:SH_DEGREE_{d}_COEF_{i}" for d in (1, 2, 3) for i in range(2 * d + 1)]
     parsed["meshes"][0]["primitives"][0]["attributes"] |= dict.fromkeys(names, 0)
-
-
-def show_twice(parsed: dict[str, Any]) -> None:
-    parsed["nodes"] = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0}]
 
 
 def of_glb() -> dict[str, Damage]:
@@ -215,10 +206,10 @@ def of_glb() -> dict[str, Damage]:
         "a node that holds itself": refuse(set_json("nodes", 0, "children", value=[0]), "node 0"),
         "a node that stretches the Gaussians": refuse(set_json("nodes", 0, "scale", value=[1, 2, 1]), "stretches"),
         "a node that mirrors the Gaussians": refuse(set_json("nodes", 0, "scale", value=[-1, -1, -1]), "mirrors"),
-        "two nodes with the same Gaussians": refuse(edit_json(show_twice), "same values"),
+        "two nodes with the same Gaussians": refuse(put_nodes(2, {"mesh": 0}), "same values"),
         "100,000 nodes in one another": refuse(edit_json(chain_nodes), slow=True),
-        "100,000 nodes with the same Gaussians": refuse(edit_json(copy_nodes), slow=True),
-        "200,000 empty nodes": refuse(edit_json(add_empty_nodes), slow=True),
+        "100,000 nodes with the same Gaussians": refuse(put_nodes(DEEP, {"mesh": 0}), slow=True),
+        "200,000 empty nodes": refuse(put_nodes(200_000, {}), slow=True),
         "positions as the values of all harmonics": refuse(edit_json(share_positions), "same values"),
     }
 

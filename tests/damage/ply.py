@@ -226,13 +226,13 @@ def _huge() -> dict[str, Damage]:
 # Of a compressed file
 
 
-def drop_element(name: str) -> Callable[[bytes], bytes]:
-    return lambda data: re.sub(rb"element %b \d+\n(property \w+ \w+\n)+" % name.encode(), b"", data, count=1)
-
-
 def of_compressed() -> dict[str, Damage]:
     return {
-        "no chunks": refuse(edit_bytes(drop_element("chunk")), "lacks", "'chunk'"),
+        "no chunks": refuse(
+            edit_bytes(lambda data: re.sub(rb"element chunk \d+\n(property \w+ \w+\n)+", b"", data, count=1)),
+            "lacks",
+            "'chunk'",
+        ),
         "fewer rows of harmonics than Gaussians": refuse(swap("element sh 6\n", "element sh 5\n"), 6, "'sh'"),
         "a column of ranges under another name": refuse(
             swap("property float min_y", "property float middle_y"), "min_y", "'chunk'", "f4"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from safetensors.numpy import load_file, save_file
 from gsmerge.io.formats import gsm
 
 from .case import Change, Damage, refuse
-from .changes import edit_bytes, fill_with_zeros, pack_at, pack_members, write_file
+from .changes import edit_bytes, fill_with_zeros, pack_at, pack_members, write
 
 RESULTS = ("means", "quats", "scales", "opacities", "sh0", "shN", "viewmats", "Ks")
 FEATURES = ("merged.means", "refined.latents", "views", "group", "samples.means", "saliency", "origin")
@@ -200,14 +199,9 @@ def of_features() -> dict[str, Damage]:
     }
 
 
-def write_torch_file(path: Path) -> None:
-    """As torch saves its files."""
-    write_file(path, pack_members({"archive/data.pkl": pickle.dumps({"a": 1})}, zipfile.ZIP_STORED))
-
-
 def of_checkpoint() -> dict[str, Damage]:
     changes = {
-        "a file of torch in its place": write_torch_file,
+        "a file of torch in its place": write(pack_members({"archive/data.pkl": pickle.dumps({"a": 1})})),
         "a header of another program": write_header("{}", "networks"),
         "schema 1": set_header(schema=1),
         "no version": set_header(gsmerge=None),

@@ -190,13 +190,15 @@ def test_cameras_of_views_that_the_file_lacks_are_drawn(small_copy: Path, tmp_pa
     assert list(listing(tmp_path / "all")) == [f"view_{i:03d}.png" for i in range(5)]
 
 
-def test_even_sides_of_videos_are_said(small_scene: Path, tmp_path: Path, run: Run) -> None:
-    for name, size in (("a.mp4", (50, 34)), ("a.gif", (49, 33))):
-        call = ("render", small_scene, "--size", "49x33", "--frames", 2, "-o", tmp_path / name, "--json")
-        document = json.loads(run(*call, code=0).out)
-        assert read(tmp_path / name)[0].shape[1::-1] == size == (document["width"], document["height"])
-        said = [note for note in document["notes"] if names(note, "49 x 33", "50 x 34", "even")]
-        assert len(said) == (name == "a.mp4")
+@pytest.mark.parametrize(("name", "size"), [("a.mp4", (50, 34)), ("a.gif", (49, 33))])
+def test_even_sides_of_videos_are_said(
+    name: str, size: tuple[int, int], small_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    call = ("render", small_scene, "--size", "49x33", "--frames", 2, "-o", tmp_path / name, "--json")
+    document = json.loads(run(*call, code=0).out)
+    assert read(tmp_path / name)[0].shape[1::-1] == size == (document["width"], document["height"])
+    said = [note for note in document["notes"] if names(note, "49 x 33", "50 x 34", "even")]
+    assert len(said) == (name == "a.mp4")
 
 
 @pytest.mark.parametrize(

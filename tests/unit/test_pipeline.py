@@ -201,12 +201,12 @@ def test_input_is_left_alone(scene: Scene) -> None:
     assert np.array_equal(scene.images, images)
 
 
-def test_networks_correct_what_no_fit_corrects(scene: Scene) -> None:
-    for settings, learned in (({"fit": "none"}, True), ({"fit_steps": 12}, False)):
-        actual = scenes.compacted(scene, **settings)
-        assert ("networks" in actual.report.choices) == learned
-        alone = scenes.compacted(scene, **settings, checkpoint="shipped" if learned else "none")
-        assert scenes.identical(actual.gaussians, alone.gaussians)
+@pytest.mark.parametrize(("settings", "learned"), [({"fit": "none"}, True), ({"fit_steps": 12}, False)])
+def test_networks_correct_what_no_fit_corrects(settings: dict[str, Any], learned: bool, scene: Scene) -> None:
+    actual = scenes.compacted(scene, **settings)
+    assert ("networks" in actual.report.choices) == learned
+    alone = scenes.compacted(scene, **settings, checkpoint="shipped" if learned else "none")
+    assert scenes.identical(actual.gaussians, alone.gaussians)
 
 
 @pytest.mark.parametrize("k", [1, 8])

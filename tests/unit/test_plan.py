@@ -121,16 +121,21 @@ def test_networks_are_loaded_where_they_help(
     assert choose_networks(options_of(**settings), size) == name
 
 
-def test_quick_efforts_run_the_heads_alone(scene: Scene) -> None:
-    """Unless the networks are named: the refiner takes ten times as long."""
-    for settings, refines in (
-        ({}, True), ({"effort": "fast"}, False), ({"effort": "draft"}, False),
+@pytest.mark.parametrize(
+    ("settings", "refines"),
+    [
+        ({}, True),
+        ({"effort": "fast"}, False),
+        ({"effort": "draft"}, False),
         ({"effort": "draft", "checkpoint": "shipped"}, True),
-    ):  # fmt: skip
-        networks = plan_of(scene, fit="none", **settings).networks
-        assert networks.options.refiner is refines
-        assert any(name.startswith("heads.4") for name in networks.arrays)
-        assert any(name.startswith("refiner") for name in networks.arrays) is refines
+    ],
+)
+def test_quick_efforts_run_the_heads_alone(settings: dict[str, Any], refines: bool, scene: Scene) -> None:
+    """Unless the networks are named: the refiner takes ten times as long."""
+    networks = plan_of(scene, fit="none", **settings).networks
+    assert networks.options.refiner is refines
+    assert any(name.startswith("heads.4") for name in networks.arrays)
+    assert any(name.startswith("refiner") for name in networks.arrays) is refines
 
 
 def test_missing_networks_of_the_package_are_noted(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,13 +229,13 @@ def test_photos_decide_the_count_where_rows_are_fewer_than_pixels(scene: Scene) 
     assert not plan_of(unaligned_scenes.without_order(scene)).keeps_fidelity  # a share is enough of as many as pixels
 
 
-def test_few_rows_are_noted_with_the_option_that_gives_more(scene: Scene) -> None:
+@pytest.mark.parametrize(("step", "is_few"), [(3, True), (1, False)])
+def test_few_rows_are_noted_with_the_option_that_gives_more(step: int, is_few: bool, scene: Scene) -> None:
     """As a state has, whose result keeps what it shows, and could show the photos better."""
-    for step, is_few in ((3, True), (1, False)):
-        rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), step))
-        with record_run(None) as record:
-            plan_of(rows)
-        assert noted(record.notes, f"{len(rows.gaussians):,} Gaussians", "--budget") == is_few
+    rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), step))
+    with record_run(None) as record:
+        plan_of(rows)
+    assert noted(record.notes, f"{len(rows.gaussians):,} Gaussians", "--budget") == is_few
 
 
 def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) -> None:

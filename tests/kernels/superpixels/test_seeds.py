@@ -57,13 +57,13 @@ def test_density_is_at_most_one_and_sums_to_the_count() -> None:
         assert density.sum() == pytest.approx(count)
 
 
-def test_hexagonal_seeds_are_distinct_pixels() -> None:
-    for height, width in ((1, 9), (9, 1), (3, 3), (7, 12), (30, 8)):
-        for count in {1, 2, height * width // 3, height * width - 1, height * width}:
-            seeds = hexagonal_seeds(height, width, count)
-            assert len({(y, x) for y, x in seeds.tolist()}) == count
-            assert (seeds >= 0).all()
-            assert (seeds < [height, width]).all()
+@pytest.mark.parametrize(("height", "width"), [(1, 9), (9, 1), (3, 3), (7, 12), (30, 8)])
+def test_hexagonal_seeds_are_distinct_pixels(height: int, width: int) -> None:
+    for count in {1, 2, height * width // 3, height * width - 1, height * width}:
+        seeds = hexagonal_seeds(height, width, count)
+        assert len({(y, x) for y, x in seeds.tolist()}) == count
+        assert (seeds >= 0).all()
+        assert (seeds < [height, width]).all()
 
 
 def test_hexagonal_rows_are_shifted() -> None:

@@ -59,16 +59,16 @@ def test_folders_of_photos_have_an_end(tmp_path: Path, monkeypatch: pytest.Monke
             read(tmp_path / "images")
 
 
-def test_a_budget_grows_with_the_file() -> None:
-    for size, memory, steps in ((0, 64_000_000, 250_000), (10**6, 84_000_000, 350_000)):
-        budget = ReadBudget("a", size)
-        budget.check_memory(memory, "rows")
-        budget.check_steps(steps, "rows")
-        for needed in (memory + 1, float("nan")):
-            with refuses(SceneError, "a", f"{memory // 10**6} MB", "rows"):
-                budget.check_memory(needed, "rows")
-        with refuses(SceneError, "a", f"{steps:,}", f"{steps + 1:,}", "rows"):
-            budget.check_steps(steps + 1, "rows")
+@pytest.mark.parametrize(("size", "memory", "steps"), [(0, 64_000_000, 250_000), (10**6, 84_000_000, 350_000)])
+def test_a_budget_grows_with_the_file(size: int, memory: int, steps: int) -> None:
+    budget = ReadBudget("a", size)
+    budget.check_memory(memory, "rows")
+    budget.check_steps(steps, "rows")
+    for needed in (memory + 1, float("nan")):
+        with refuses(SceneError, "a", f"{memory // 10**6} MB", "rows"):
+            budget.check_memory(needed, "rows")
+    with refuses(SceneError, "a", f"{steps:,}", f"{steps + 1:,}", "rows"):
+        budget.check_steps(steps + 1, "rows")
 
 
 @pytest.mark.parametrize(

@@ -277,7 +277,7 @@ def test_children_stand_in_the_order_of_their_groups(features: FeatureGaussians,
     np.testing.assert_array_equal(children.means[np.repeat(whole, counts)], one.means[whole])
 
 
-def test_decode_refuses_strange_counts(features: FeatureGaussians, members: Members) -> None:
-    for counts in (np.ones(3, int), np.zeros(24, int)):
-        with refuses(ValueError, "counts", 24):
-            decode(features, members, DecodeOptions(), counts)
+@pytest.mark.parametrize("counts", [np.ones(3, int), np.zeros(24, int)])
+def test_decode_refuses_strange_counts(counts: np.ndarray, features: FeatureGaussians, members: Members) -> None:
+    with refuses(ValueError, "counts", 24):
+        decode(features, members, DecodeOptions(), counts)

@@ -124,7 +124,7 @@ def test_what_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_counts_and_seeds_are_checked(tmp_path: Path) -> None:
-    for count, seed in ((0, 0), (1, -1)):
-        with refuses(ValueError, "", "1 scene", "seed"):
-            generate(tmp_path, count, TINY, seed=seed)
+@pytest.mark.parametrize(("count", "seed"), [(0, 0), (1, -1)])
+def test_counts_and_seeds_are_checked(count: int, seed: int, tmp_path: Path) -> None:
+    with refuses(ValueError, "", "1 scene", "seed"):
+        generate(tmp_path, count, TINY, seed=seed)

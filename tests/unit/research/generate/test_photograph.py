@@ -19,7 +19,7 @@ from gsmerge.research.generate.photograph import (
     screen_boxes,
     trace,
 )
-from gsmerge.research.generate.shapes import LYING, Material, Shape, blob, box, pack_shapes, place_shapes, quad
+from gsmerge.research.generate.shapes import LYING, Material, blob, box, pack_shapes, place_shapes, quad
 from gsmerge.research.generate.synthetic_scene import draw_path, is_usable, look_at
 from gsmerge.research.generate.textures import KINDS, Palette
 
@@ -27,10 +27,6 @@ LOOK = Material(0)
 LENS = Pinhole(40, 30, 40.0)
 WHITE = np.ones((32, 32, 3), np.float32)
 DOWN = Light(np.array([0.0, -1.0, 0.0]), np.array([0.0, -5.0, 0.0]), np.ones(3), 0.2 * np.ones(3), 0.01)
-
-
-def stage(*shapes: Shape) -> Stage:
-    return Stage(shapes, (WHITE,), DOWN, np.zeros(3), (1, 2))
 
 
 def test_no_rectangle_cuts_off_what_is_seen() -> None:
@@ -51,7 +47,8 @@ def test_no_rectangle_cuts_off_what_is_seen() -> None:
 
 def test_a_thing_throws_shade_on_the_ground() -> None:
     ground = replace(quad((0, 0, 0), (4, 4), LOOK, LYING), shell=True)
-    view = light_stage(stage(ground, box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK)))
+    shapes = (ground, box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK))
+    view = light_stage(Stage(shapes, (WHITE,), DOWN, np.zeros(3), (1, 2)))
     from_side = look_at(np.array([0.0, -0.45, -3.0]), np.array([0.0, 0.0, 0.0]))
     lens = Pinhole(60, 60, 60.0)
     image, hits = radiance(view, from_side, lens, 1), trace(view.shapes, from_side, lens, 1)

@@ -81,15 +81,15 @@ def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(shard
     assert (again.resumed, again.step) == (12, 12)
 
 
-def test_settings_are_checked(tmp_path: Path) -> None:
-    for wrong in (
+@pytest.mark.parametrize("wrong", [
         {"steps": 0}, {"rate": -1.0}, {"levels": (3,)}, {"levels": ()}, {"densities": ()}, {"densities": (2,)},
         {"match": "all"}, {"seed": 1.5}, {"views": ()}, {"views": (-1,)}, {"novel": -0.1}, {"photo_scale": 0},
         {"window": 5}, {"photo_loss": "l2"}, {"lpips_weight": -1}, {"teacher_steps": 0}, {"buffer": 0},
         {"segmentation": "slice"}, {"overlap": 2}, {"iou": -0.1}, {"photo_side": -1}, {"random_views": (3, 2)},
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            replace(OPTIONS, **wrong)
+])  # fmt: skip
+def test_settings_are_checked(wrong: dict[str, object], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        replace(OPTIONS, **wrong)
 
 
 @pytest.mark.slow
