@@ -145,13 +145,13 @@ def test_clips_too_large_for_the_memory_are_refused(small_scene: Path, tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("kind", "count"), [("spline,back:0.5", 12), ("orbit", 6)])
 def test_frames_grow_with_the_views_of_a_spline(
-    smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    kind: str, count: int, smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.measure.drawings.SECONDS", 0.2)
-    for kind, count in (("spline,back:0.5", 12), ("orbit", 6)):
-        outcome = run("render", smallest_scene, "--path", kind, "-o", tmp_path / kind[:5], "--json", code=0)
-        assert json.loads(outcome.out)["frames"] == count
+    outcome = run("render", smallest_scene, "--path", kind, "-o", tmp_path / kind[:5], "--json", code=0)
+    assert json.loads(outcome.out)["frames"] == count
 
 
 @sweep("kind", ["orbit", "spline"])

@@ -32,12 +32,12 @@ def chain(count: int, apart: float) -> FeatureGaussians:
 
 
 @sweep("apart", [0.5, 0.2, 1.0, 1.5], ids="{} deviations apart".format)
-def test_chain_of_a_thousand_does_not_collapse(apart: float) -> None:
+@pytest.mark.parametrize(("size", "most"), [(None, 7), (4, 4)])
+def test_chain_of_a_thousand_does_not_collapse(size: int | None, most: int, apart: float) -> None:
     features = chain(1000, apart)
-    for size, most in ((None, 7), (4, 4)):  # one of each of the seven views, unless told
-        actual = diameters(features, cluster_size=size)
-        assert actual.max() <= 2 * np.sqrt(-8 * np.log(0.7))  # two leaders' reaches: exp(-d^2 / 8) = 0.7
-        assert len(actual) >= 1000 / most
+    actual = diameters(features, cluster_size=size)
+    assert actual.max() <= 2 * np.sqrt(-8 * np.log(0.7))  # two leaders' reaches: exp(-d^2 / 8) = 0.7
+    assert len(actual) >= 1000 / most
 
 
 def test_chain_of_boxes_does_not_collapse() -> None:

@@ -47,14 +47,14 @@ def test_seeds_follow_the_density_to_the_exact_count(count: int) -> None:
     assert len({(y, x) for y, x in places.tolist()}) == count
 
 
-def test_density_is_at_most_one_and_sums_to_the_count() -> None:
+@pytest.mark.parametrize("count", [1, 20, 50, 99, 100])
+def test_density_is_at_most_one_and_sums_to_the_count(count: int) -> None:
     response = np.zeros((10, 10), np.float32)
     response[3:5] = 100
-    for count in (1, 20, 50, 99, 100):
-        density = seed_density(response, count)
-        assert density.max() <= 1
-        assert density.min() >= 0
-        assert density.sum() == pytest.approx(count)
+    density = seed_density(response, count)
+    assert density.max() <= 1
+    assert density.min() >= 0
+    assert density.sum() == pytest.approx(count)
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 9), (9, 1), (3, 3), (7, 12), (30, 8)])

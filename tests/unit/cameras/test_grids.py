@@ -65,17 +65,17 @@ def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
     assert loaded.notes == ("cameras of 96 x 54 are resized and centre-cropped to 48 x 36, the images' size",)
 
 
-def test_mappings_move_a_point_and_its_photo_alike() -> None:
+@pytest.mark.parametrize("mapping", [resize_to((100, 60), (50, 24)), resize_and_crop((100, 60), (30, 30))])
+def test_mappings_move_a_point_and_its_photo_alike(mapping: PhotoTransform) -> None:
     photo = np.zeros((60, 100, 3), np.uint8)
     photo[24:36, 64:72] = 255
-    for mapping in (resize_to((100, 60), (50, 24)), resize_and_crop((100, 60), (30, 30))):
-        (small,) = mapping.photos([photo])
-        assert small.shape == (mapping.height, mapping.width, 3)
-        y, x = (np.average(np.arange(n) + 0.5, weights=small[..., 0].sum(axis)) for n, axis in
-                ((mapping.height, 1), (mapping.width, 0)))  # fmt: skip
-        K = np.array([[[1.0, 0, 68], [0, 1, 30], [0, 0, 1]]], np.float64)
-        (moved,) = mapping.cameras(Cameras(np.eye(4)[None], K, 100, 60)).Ks
-        assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)
+    (small,) = mapping.photos([photo])
+    assert small.shape == (mapping.height, mapping.width, 3)
+    y, x = (np.average(np.arange(n) + 0.5, weights=small[..., 0].sum(axis)) for n, axis in
+            ((mapping.height, 1), (mapping.width, 0)))  # fmt: skip
+    K = np.array([[[1.0, 0, 68], [0, 1, 30], [0, 0, 1]]], np.float64)
+    (moved,) = mapping.cameras(Cameras(np.eye(4)[None], K, 100, 60)).Ks
+    assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)
 
 
 def test_sizes_that_are_twice_a_principal_point(tmp_path: Path, tiny: Tiny) -> None:

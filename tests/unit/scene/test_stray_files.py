@@ -172,12 +172,12 @@ def test_masks_that_nothing_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("hints", [{"order": "view-major"}, {"order": "view-fastest"}])
-def test_hints_on_pixels_for_rows_that_have_none(tmp_path: Path, hints: dict[str, str]) -> None:
+@pytest.mark.parametrize("cameras", [False, True])
+def test_hints_on_pixels_for_rows_that_have_none(cameras: bool, tmp_path: Path, hints: dict[str, str]) -> None:
     ((name, value),) = hints.items()
-    for cameras in (False, True):
-        folder = save(tmp_path / str(cameras), "voxels", cameras=cameras)
-        with refuses(SceneError, "scene.ply", f"--hint {name}={value}"):
-            load_scene(folder, **hints)
+    folder = save(tmp_path / str(cameras), "voxels", cameras=cameras)
+    with refuses(SceneError, "scene.ply", f"--hint {name}={value}"):
+        load_scene(folder, **hints)
 
 
 @pytest.mark.parametrize(

@@ -195,16 +195,16 @@ def test_knee_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
     assert count(texture) == knee(texture.counts, texture.distortions) > wall.min_regions
 
 
-def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("floor", [1e-3, 1e-4])
+def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(floor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """D = 0.1 / N without a floor: 10 / ln 10 = 4.3 dB per relative increase everywhere; with one it falls."""
     counts = np.arange(1, 2000)
     monkeypatch.setattr(module, "REGION_KNEE_SLOPE", 2.0)
-    for floor in (1e-3, 1e-4):
-        monkeypatch.setattr(module, "KNEE_FLOOR", floor)
-        actual = knee(counts, 0.1 / counts)
-        middle = actual / 1.25**0.5  # the slope is measured over a factor of 1.25
-        share = (0.1 / middle) / (floor + 0.1 / middle)
-        assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
+    monkeypatch.setattr(module, "KNEE_FLOOR", floor)
+    actual = knee(counts, 0.1 / counts)
+    middle = actual / 1.25**0.5  # the slope is measured over a factor of 1.25
+    share = (0.1 / middle) / (floor + 0.1 / middle)
+    assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
 
 
 def test_knee_of_nothing() -> None:
