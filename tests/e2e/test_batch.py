@@ -109,13 +109,18 @@ def test_a_mended_scene_is_done_and_json_is_a_line_each(rooms: Path, out: Path, 
     assert [actual.count("done") for actual in statuses(out).values()] == [2] * 3
 
 
-def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path, run: Run) -> None:
+def test_a_dry_run_tells_what_is_left(rooms: Path, out: Path, run: Run) -> None:
     before = listing(out)
     outcome = batch(run, rooms, out, "--dry-run")
     assert outcome.code == 0
     assert f"{rooms / 'bad'} -> {out / 'bad.ply'}" in outcome.out
     assert "note: " not in outcome.out
     assert "1 of 3 scenes" in outcome.out
+    assert listing(out) == before
+
+
+def test_a_dry_run_tells_what_the_run_would_refuse(rooms: Path, out: Path, run: Run) -> None:
+    before = listing(out)
     refused = batch(run, rooms, out, "--dry-run", "--json", "--seed", 1, "--jobs", 3)
     assert refused.code == 5
     assert names(refused.err, "2 of 3 scenes", "in the run")
@@ -124,9 +129,11 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path,
     assert [scene["num_gaussians"] for scene in plan["scenes"]] == [0, 3 * 24 * 16, 3 * 24 * 16]  # one is cut
     assert ["settings" in str(scene["error"]) for scene in plan["scenes"]] == [False, True, True]
     assert listing(out) == before
-    new = batch(run, rooms, out.parent / "new", "--dry-run")
-    assert "3 of 3 scenes" in new.out
-    assert not (out.parent / "new").exists()
+
+
+def test_a_dry_run_makes_no_folder(rooms: Path, tmp_path: Path, run: Run) -> None:
+    assert "3 of 3 scenes" in batch(run, rooms, tmp_path / "new", "--dry-run").out
+    assert not (tmp_path / "new").exists()
 
 
 def test_scenes_of_one_name_fail_and_no_other(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:

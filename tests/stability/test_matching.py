@@ -32,7 +32,8 @@ def chain(count: int, apart: float) -> FeatureGaussians:
 
 
 @sweep("apart", [0.5, 0.2, 1.0, 1.5], ids="{} deviations apart".format)
-@pytest.mark.parametrize(("size", "most"), [(None, 7), (4, 4)])
+# One of each of the seven views is in a cluster, unless told
+@pytest.mark.parametrize(("size", "most"), [(None, 7), (4, 4)], ids=["one of each view", "cluster_size=4"])
 def test_chain_of_a_thousand_does_not_collapse(size: int | None, most: int, apart: float) -> None:
     features = chain(1000, apart)
     actual = diameters(features, cluster_size=size)

@@ -107,7 +107,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return results(out)
 
 
-def test_what_is_done_is_skipped_and_what_changed_is_not(scene: Path, out: Path) -> None:
+def test_what_is_done_is_skipped(scene: Path, out: Path) -> None:
     first = run(scene, out)
     assert (first["status"], first["error"]) == (DONE, None)
     assert first["report"]["options"]["effort"] == "draft"
@@ -117,6 +117,10 @@ def test_what_is_done_is_skipped_and_what_changed_is_not(scene: Path, out: Path)
     assert (again["status"], again["key"], again["files"]) == (SKIPPED, first["key"], first["files"])
     assert run(scene, out, replace(QUICK, jobs=3))["status"] == SKIPPED
     assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
+
+
+def test_other_settings_are_refused_unless_they_may_overwrite(scene: Path, out: Path) -> None:
+    run(scene, out)
     seed = replace(QUICK, settings=QUICK.settings.with_settings({"seed": 1}))
     before = results(out)
     for _ in range(2):  # the first refusal is no claim
@@ -127,6 +131,10 @@ def test_what_is_done_is_skipped_and_what_changed_is_not(scene: Path, out: Path)
     assert says(
         run(scene, out)["error"], out / "room.ply", "settings"
     )  # back to the first settings: the file is of the others
+
+
+def test_what_changed_is_made_again(scene: Path, out: Path) -> None:
+    run(scene, out)
     (out / "room.ply").unlink()
     assert run(scene, out)["status"] == DONE
     (out / "room.ply").write_bytes(b"spoiled")
@@ -250,7 +258,7 @@ def test_what_is_done_is_skipped_in_a_folder_that_cannot_be_written(
     assert run(scene, out)["status"] == SKIPPED
 
 
-def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> None:
+def test_a_result_that_no_batch_wrote_is_not_replaced(scene: Path, out: Path) -> None:
     out.mkdir()
     (out / "room.ply").write_bytes(b"mine")
     for _ in range(2):  # the first refusal is no claim
@@ -265,7 +273,10 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
     (out / "room.ply").mkdir()
     assert says(run(scene, out)["error"], out / "room.ply", "rename it")
     assert "--overwrite" not in run(scene, out)["error"]
-    (out / "room.ply").rmdir()
+
+
+def test_cameras_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> None:
+    out.mkdir()
     (out / "room.cameras.json").write_bytes(b"mine")  # or those of a result in another format
     assert [file["path"] for file in run(scene, out)["files"]] == ["room.ply"]
     assert (out / "room.cameras.json").read_bytes() == b"mine"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -33,16 +34,22 @@ def test_only_files_are_read(tmp_path: Path) -> None:
     for path, found in ((tmp_path, "folder"), (tmp_path / "none", "no such file")):
         with refuses(SceneError, path, found):
             check_file(path)
+
+
+def test_text_is_read_up_to_a_size(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"\xef\xbb\xbfab")
     assert check_file(tmp_path / "a") == 5
     assert read_text(tmp_path / "a") == "ab"
     assert list(read_lines(tmp_path / "a")) == ["ab"]
     with refuses(SceneError, "a", "0 MiB"):
         list(read_lines(tmp_path / "a", 4))
+
+
+@pytest.mark.parametrize("read", [read_text, lambda path: list(read_lines(path))], ids=["whole", "line by line"])
+def test_bytes_that_are_no_text_are_refused(read: Callable[[Path], object], tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"a\n\xff")
-    for read in (read_text, lambda path: list(read_lines(path))):
-        with refuses(SceneError, "a", "text"):
-            read(tmp_path / "a")
+    with refuses(SceneError, "a", "text"):
+        read(tmp_path / "a")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
