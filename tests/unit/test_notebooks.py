@@ -6,6 +6,7 @@ import gc
 import html
 import pickle
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,12 @@ def write_tiny(folder: Path) -> None:
     write_scene(folder, num_views=3, width=32, height=24)
 
 
+@cache
+def read_tiny() -> gsmerge.Scene:
+    """Return the scene, one object for all tests: a result shows its scene as long as that is there."""
+    return gsmerge.read_scene(make_once("notebooks", write_tiny))
+
+
 @pytest.fixture(scope="module")
 def tiny_scene() -> Path:
     return make_once("notebooks", write_tiny)
@@ -25,12 +32,12 @@ def tiny_scene() -> Path:
 
 @pytest.fixture(scope="module")
 def scene() -> gsmerge.Scene:
-    return gsmerge.read_scene(make_once("notebooks", write_tiny))
+    return read_tiny()
 
 
 @pytest.fixture(scope="module")
 def result() -> gsmerge.CompactResult:
-    return gsmerge.compact(make_once("notebooks", write_tiny), effort="draft", budget=100, levels=2)
+    return gsmerge.compact(read_tiny(), effort="draft", budget=100, levels=2)
 
 
 @pytest.mark.slow
