@@ -160,7 +160,7 @@ def test_one_file_opens_from_disk(tab: Browser) -> None:
 @pytest.mark.slow
 @needs_browser()
 @pytest.mark.parametrize("supported", [True, False])
-def test_vr_is_offered_where_the_browser_has_it(supported: bool, tab: Browser, site: Path) -> None:
+def test_vr_is_offered_where_the_browser_has_it(supported: bool, tab: Browser) -> None:
     target = tab.call("Target.createTarget", url="about:blank")["targetId"]
     tab.session = tab.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
     session = "requestSession: async () => { throw Error('off'); }"
@@ -168,7 +168,7 @@ def test_vr_is_offered_where_the_browser_has_it(supported: bool, tab: Browser, s
     script = f"Object.defineProperty(navigator, 'xr', {{ value: {{ {xr} }} }});"
     tab.call("Page.enable")
     tab.call("Page.addScriptToEvaluateOnNewDocument", source=script)
-    tab.call("Page.navigate", url=(site / "one.html").as_uri())
+    tab.call("Page.navigate", url=(make_once("site", make_site) / "one.html").as_uri())
     tab.wait("location.protocol === 'file:' && document.readyState === 'complete'")
     tab.wait(SETTLED)
     assert tab.run("new Promise((end) => setTimeout(() => end(id('headset').hidden)))") is not supported
