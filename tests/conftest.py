@@ -1,10 +1,9 @@
-"""Fixtures for the whole suite: a scene that the project makes itself; and how the suite runs in several processes."""
+"""Fixtures for the whole suite: scenes that the project makes itself; and how the suite runs in several processes."""
 
 from __future__ import annotations
 
 import gc
 import os
-import shutil
 import signal
 import sys
 from collections.abc import Callable, Generator, Iterator
@@ -12,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import shared
 from browser import NO_BROWSER
-from floors import NUDGE, at_least_the_floor, nudged
-from scripts import load_script
-from shared import make_once
+from floors import at_least_the_floor
+from shared import write_made, write_small
+from sweeps import in_words
 
 ROOT = Path(__file__).resolve().parent.parent
 MAX_PROCESSES = 8  # a process takes about 1 GB
@@ -52,6 +52,11 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, p
     if isinstance(collector, pytest.Directory) and WORKER[-1:] in tuple("13579"):
         report.result = report.result[::-1]
     return report
+
+
+def pytest_make_parametrize_id(val: object) -> str | None:
+    """Name cases by their values also where pytest would count them: ``options0`` says nothing."""
+    return in_words(val)
 
 
 def pytest_collection_finish() -> None:
@@ -95,36 +100,11 @@ def root() -> Path:
     return ROOT
 
 
-@pytest.fixture(scope="session")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that all processes of a run share; :func:`make_once` fills it."""
+@pytest.fixture(scope="session", autouse=True)
+def _shared_folder(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Tell :mod:`shared` which folder all processes of a run share."""
     base = tmp_path_factory.getbasetemp()
-    return (base.parent if WORKER else base) / "shared"
-
-
-@pytest.fixture(scope="session")
-def make_scene(shared: Path) -> Callable[..., Path]:
-    """``make_scene(out, num_views=, width=, height=, seed=)`` of the first example, as other programs write files.
-
-    That is without the comment by which the project's own files name the encoding of their opacities. Each scene is
-    made once in a run.
-    """
-    example = load_script(ROOT / "examples" / "01_make_scene.py").make_scene
-
-    def write(out: Path, **sizes: int) -> None:
-        ply = example(out, **sizes) / "scene.ply"
-        if NUDGE in os.environ:
-            import gsmerge
-
-            gsmerge.write_ply(ply, nudged(gsmerge.read_ply(ply).gaussians), overwrite=True)
-        head, rows = ply.read_bytes().split(b"end_header\n", 1)
-        ply.write_bytes(head.replace(b"comment opacity: logit\n", b"") + b"end_header\n" + rows)
-
-    def make(out: Path, **sizes: int) -> Path:
-        name = "-".join(f"{key}-{value}" for key, value in sorted(sizes.items()))
-        return Path(shutil.copytree(make_once(shared / name, lambda place: write(place, **sizes)), out))
-
-    return make
+    shared.PLACE[:] = [(base.parent if WORKER else base) / "shared"]
 
 
 @pytest.fixture
@@ -146,24 +126,18 @@ def floor(request: pytest.FixtureRequest) -> Callable[..., None]:
 
 
 @pytest.fixture(scope="session")
-def target_psnr() -> Callable[[Path, Path], float]:
-    """``target_psnr(targets, ply)`` of the measuring example, dB."""
-    return load_script(ROOT / "examples" / "03_measure_targets.py").target_psnr
+def made_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene of :func:`shared.write_made`. Read only."""
+    return write_made(tmp_path_factory.mktemp("made") / "scene")
 
 
 @pytest.fixture(scope="session")
-def made_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with scene.ply, transforms.json, images/ and targets/: 5 views of 96 x 64. Read only."""
-    return make_scene(tmp_path_factory.mktemp("made") / "scene", num_views=5, width=96, height=64)
-
-
-@pytest.fixture(scope="session")
-def small_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same in a quarter of the pixels, 5 views of 48 x 32, where size does not matter. Read only."""
-    return make_scene(tmp_path_factory.mktemp("small") / "scene", num_views=5, width=48, height=32)
+def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene of :func:`shared.write_small`. Read only."""
+    return write_small(tmp_path_factory.mktemp("small") / "scene")
 
 
 @pytest.fixture
-def scene_copy(made_scene: Path, tmp_path: Path) -> Path:
-    """A copy of the made scene that a test may change."""
-    return Path(shutil.copytree(made_scene, tmp_path / "scene"))
+def scene_copy(tmp_path: Path) -> Path:
+    """A made scene that a test may change."""
+    return write_made(tmp_path / "scene")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from comfyui import Bar, CancelError, Splat, modules
+from shared import make_once, write_small
 
 import gsmerge
 from gsmerge.kernels.elementary import arctan2
@@ -23,26 +24,22 @@ FLIP = np.diag([1.0, -1, -1])  # between three.js' axes and OpenCV's
 
 
 @pytest.fixture
-def cancel() -> list[bool]:
-    return []
-
-
-@pytest.fixture
-def nodes(root: Path, tmp_path: Path, cancel: list[bool], monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    for name, module in modules(tmp_path, cancel).items():
+def nodes(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    for name, module in modules(tmp_path).items():
         monkeypatch.setitem(sys.modules, name, module)
     spec = importlib.util.spec_from_file_location("gsmerge_nodes", root / "examples" / "comfyui" / "__init__.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    monkeypatch.setattr(Bar, "seen", [])
+    for name in ("seen", "cancelled"):
+        monkeypatch.setattr(Bar, name, [])
     return module
 
 
 @pytest.fixture
-def scene(small_scene: Path) -> gsmerge.Scene:
-    return gsmerge.read_scene(small_scene)
+def scene() -> gsmerge.Scene:
+    return gsmerge.read_scene(make_once("small", write_small))
 
 
 def make_splat(*items: gsmerge.Gaussians) -> Splat:
@@ -125,8 +122,8 @@ def test_batches_are_compacted_one_by_one(nodes: ModuleType, scene: gsmerge.Scen
     assert len(reports) == 3
 
 
-def test_a_run_ends_when_it_is_cancelled(nodes: ModuleType, scene: gsmerge.Scene, cancel: list[bool]) -> None:
-    cancel.append(True)
+def test_a_run_ends_when_it_is_cancelled(nodes: ModuleType, scene: gsmerge.Scene) -> None:
+    Bar.cancelled.append(True)
     with pytest.raises(CancelError):
         nodes.CompactGaussians.execute([make_splat(scene.gaussians)], ["300"], ["draft"])
 

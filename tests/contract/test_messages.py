@@ -6,7 +6,11 @@ import pytest
 from messages import names, refuses, says
 
 
-@pytest.mark.parametrize(("text", "value"), [("got 15", 5), ("got 5.1", 5), ("got -5", 5), ("k_low", "k"), ("a", "b")])
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("got 15", 5), ("got 5.1", 5), ("got -5", 5), ("k_low", "k"), ("a", "b")],
+    ids=["5 is not in 15", "5 is not in 5.1", "5 is not in -5", "k is not in k_low", "b is not in a"],
+)
 def test_values_are_whole_words(text: str, value: object) -> None:
     assert not names(text, value)
     assert names(f"{text}, got {value}; more", value)
@@ -18,7 +22,11 @@ def test_places_are_whole() -> None:
     assert all(says(text, place, 5) for place in ("scene.ply", "a/scene.ply", "/b/a/scene.ply", ""))
 
 
-@pytest.mark.parametrize(("kind", "place", "value"), [(KeyError, "k", 9), (ValueError, "kk", 9), (ValueError, "k", 7)])
+@pytest.mark.parametrize(
+    ("kind", "place", "value"),
+    [(KeyError, "k", 9), (ValueError, "kk", 9), (ValueError, "k", 7)],
+    ids=["another kind", "another place", "another value"],
+)
 def test_what_differs_is_refused(kind: type[Exception], place: str, value: int) -> None:
     with pytest.raises((AssertionError, ValueError)), refuses(kind, place, value):
         raise ValueError("k: expected 1 to 8, got 9")

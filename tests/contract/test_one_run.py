@@ -9,18 +9,18 @@ from typing import Any
 import pytest
 from scripts import load_script
 
-ROOT = Path(__file__).parents[2]
+PROGRAM = Path(__file__).parents[2] / "docs" / "one_run.py"
 
 
 @pytest.fixture(scope="module")
 def script() -> Any:
-    return load_script(ROOT / "docs" / "one_run.py")
+    return load_script(PROGRAM)
 
 
 @pytest.fixture(scope="module")
-def run(script: Any) -> Any:
+def run() -> Any:
     """The scene, compacted once for all tests."""
-    return script.watch_run()
+    return load_script(PROGRAM).watch_run()
 
 
 def test_the_page_fits_the_program(script: Any, run: Any) -> None:

@@ -8,11 +8,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from messages import ERROR
+from shared import write_scene
 from sweeps import sweep
 
 HEAVY = ("torch", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")
@@ -55,11 +55,9 @@ for words in (one, loaded, kinds):
 
 
 @sweep("settings", [["--set", "fit_steps=5"], [], ["--fit", "none"], ["--set", "recipe=paper"]], ids=" ".join)
-def test_compacting_loads_and_needs_neither_torch_nor_scipy_nor_matplotlib(
-    settings: list[str], make_scene: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_compacting_loads_and_needs_neither_torch_nor_scipy_nor_matplotlib(settings: list[str], tmp_path: Path) -> None:
     """Which take longer to load than a small scene takes to merge; without them the result is the same bytes."""
-    scene = make_scene(tmp_path / "scene", num_views=2, width=24, height=16)
+    scene = write_scene(tmp_path / "scene", num_views=2, width=24, height=16)
     outputs = [tmp_path / "with.ply", tmp_path / "without.ply"]
     arguments = [["compact", str(scene), "-o", str(output), *settings] for output in outputs]
     code = f"""

@@ -75,10 +75,6 @@ def put_objects(name: str) -> Change:
     return change
 
 
-def write_pickle(path: Path) -> None:
-    path.write_bytes(pickle.dumps(Payload(path.parent / MARKER)))
-
-
 def write_pickles(path: Path) -> None:
     """An archive of pickles by the arrays' names."""
     data = pickle.dumps(Payload(path.parent / MARKER))
@@ -98,28 +94,30 @@ def brackets(depth: int) -> bytes:
 def of_cameras(poses: str, Ks: str, images: str) -> dict[str, Damage]:
     """Damages of a file of these arrays, which has the cameras of a scene."""
     damages = {
-        "the same arrays": accept(edit_bytes(lambda data: pack_members(read_members(data)))),
-        "poses as objects": refuse(put_objects(poses)),
-        "a pickle": refuse(write_pickle),
-        "pickles in an archive": refuse(write_pickles),
-        "poses of nested brackets": refuse(put_array(poses, brackets(9000))),
+        "the same arrays packed again": accept(edit_bytes(lambda data: pack_members(read_members(data)))),
+        "poses as objects that would run code": refuse(put_objects(poses)),
+        "a pickle that would run code": refuse(
+            lambda path: write_file(path, pickle.dumps(Payload(path.parent / MARKER)))),
+        "an archive of pickles that would run code": refuse(write_pickles),
+        "a type of poses of 9,000 nested brackets": refuse(put_array(poses, brackets(9000))),
         "20,000 poses": refuse(put_array(poses, np.tile(np.eye(4), (20_000, 1, 1))), slow=True),
-        "a bomb of poses": refuse(put_array(poses, bomb_of(2**27, (2**27,))), slow=True),
-        "a bomb of images": refuse(put_array(images, bomb_of(2**27, (VIEWS, 3800, 3800, 3))), slow=True),
-        "a bomb of floats": refuse(put_array(images, np.zeros((VIEWS, 1400, 1400, 3), "<f4")), slow=True),
-        "a header of 60 MB": refuse(put_array(images, b"\x93NUMPY\2\0" + struct.pack("<I", 60 << 20) + bytes(60 << 20)),
-                                     slow=True),
-        "poses that promise less": allow(add_bomb(f"{poses}.npy", zipfile.ZIP_DEFLATED, npy(np.zeros((VIEWS, 4, 4)))),
-                                          slow=True),
+        "128 MB of zeros as poses": refuse(put_array(poses, bomb_of(2**27, (2**27,))), slow=True),
+        "zeros as photos of 3800 x 3800": refuse(put_array(images, bomb_of(2**27, (VIEWS, 3800, 3800, 3))), slow=True),
+        "zeros as photos of 1400 x 1400 floats": refuse(put_array(images, np.zeros((VIEWS, 1400, 1400, 3), "<f4")),
+                                                        slow=True),
+        "photos with a header of 60 MB": refuse(
+            put_array(images, b"\x93NUMPY\2\0" + struct.pack("<I", 60 << 20) + bytes(60 << 20)), slow=True),
+        "poses that unpack to more than they claim": allow(
+            add_bomb(f"{poses}.npy", zipfile.ZIP_DEFLATED, npy(np.zeros((VIEWS, 4, 4)))), slow=True),
     }  # fmt: skip
     start = npy(np.zeros((VIEWS, 4, 4)))
     for name, method, number in ((poses, "BZIP2", 12), (poses, "LZMA", 14), ("more", "BZIP2", 12)):
         change = add_bomb(f"{name}.npy", getattr(zipfile, f"ZIP_{method}"), start)
-        damages[f"{name} of {method}"] = refuse(change, f"{name}.npy", f"method {number}", slow=True)
+        damages[f"{name} packed by {method}"] = refuse(change, f"{name}.npy", f"method {number}", slow=True)
     for shape in ((2**40, 2**40), (VIEWS, 2**31, 2**31), (2**62,), (-1, 3)):
-        damages[f"poses said to be {shape}"] = refuse(edit_member(f"{poses}.npy", relabel(shape=shape)))
+        damages[f"poses that claim the shape {shape}"] = refuse(edit_member(f"{poses}.npy", relabel(shape=shape)))
     for dtype in ("|O", "<U1000000000", "|V1000000000"):
-        damages[f"poses said to be of {dtype}"] = allow(edit_member(f"{poses}.npy", relabel(dtype=dtype)))
+        damages[f"poses that claim the type {dtype}"] = allow(edit_member(f"{poses}.npy", relabel(dtype=dtype)))
     return damages
 
 
@@ -130,9 +128,9 @@ def relabel(**said: Any) -> Callable[[bytes], bytes]:
 DAMAGES = {
     "views.npz": {
         **of_cameras("c2w", "K", "images"),
-        "an order of objects": refuse(put_objects("order")),
-        "another order": refuse(put_array("order", np.array("magic")), "'order'", "magic"),
-        "intrinsics of another shape": refuse(put_array("K", np.ones((4, 3, 3, 1))), "(4, 3, 3, 1)"),
+        "an order as objects that would run code": refuse(put_objects("order")),
+        "an unknown order": refuse(put_array("order", np.array("magic")), "'order'", "magic"),
+        "intrinsics of four dimensions": refuse(put_array("K", np.ones((4, 3, 3, 1))), "(4, 3, 3, 1)"),
     },
     "results.npz": {
         **of_cameras("extrinsics", "intrinsics", "image"),

@@ -23,44 +23,44 @@ def of_binary() -> dict[str, Damage]:
     many = (2**63, 2**64 - 1)
     huge = fill_with_zeros(2**33)
     return {
-        **{f"cameras.bin, count {n}": allow(change_beside("cameras.bin", pack_at(0, "<Q", n))) for n in many},
+        **{f"a count of {n} cameras": allow(change_beside("cameras.bin", pack_at(0, "<Q", n))) for n in many},
         **{
-            f"cameras.bin, width {n}": allow(change_beside("cameras.bin", pack_at(16, "<Q", n)))
+            f"a camera {n} pixels wide": allow(change_beside("cameras.bin", pack_at(16, "<Q", n)))
             for n in (60_000, 2**63)
         },
-        **{f"count {n}": allow(pack_at(0, "<Q", n)) for n in many},
-        **{f"{n} points": allow(pack_at(POINTS_IN_IMAGES, "<Q", n)) for n in (2**40, 2**61, 2**64 - 1)},
+        **{f"a count of {n} images": allow(pack_at(0, "<Q", n)) for n in many},
+        **{f"an image with {n} points": allow(pack_at(POINTS_IN_IMAGES, "<Q", n)) for n in (2**40, 2**61, 2**64 - 1)},
         "a million images": allow(edit_bytes(lambda d: struct.pack("<Q", 10**6) + d[8:] * 330_000), slow=True),
-        "a name of 1 MB": allow(edit_bytes(lambda d: d[:NAME_IN_IMAGES] + b"x" * 2**20 + d[NAME_IN_IMAGES:])),
-        "a name that is not UTF-8": allow(pack_at(NAME_IN_IMAGES, "<2B", 255, 254)),
-        "a name with line breaks": allow(pack_at(NAME_IN_IMAGES, "<3B", 10, 13, 27)),
-        "cameras.bin of 8 GB of zeros": refuse(change_beside("cameras.bin", huge)),
+        "a photo's name of 1 MB": allow(edit_bytes(lambda d: d[:NAME_IN_IMAGES] + b"x" * 2**20 + d[NAME_IN_IMAGES:])),
+        "a photo's name that is not UTF-8": allow(pack_at(NAME_IN_IMAGES, "<2B", 255, 254)),
+        "a photo's name with line breaks": allow(pack_at(NAME_IN_IMAGES, "<3B", 10, 13, 27)),
+        "8 GB of zeros as cameras.bin": refuse(change_beside("cameras.bin", huge)),
     }
 
 
 def of_text() -> dict[str, Damage]:
     many = b"".join(b"%d SIMPLE_PINHOLE 1 1 1 1 1\n" % i for i in range(20_000))
     contents = {
-        "a size of 5000 digits": b"1 PINHOLE " + b"9" * 5000 + b" 16 20 20 12 8", "bytes": bytes(range(256)),
-        "20,000 cameras": many,
+        "a size of 5,000 digits": b"1 PINHOLE " + b"9" * 5000 + b" 16 20 20 12 8",
+        "bytes of all values": bytes(range(256)), "20,000 cameras": many,
     }  # fmt: skip
     return {
         **{
-            f"cameras.txt with {word}": refuse(change_beside("cameras.txt", write(data)))
+            f"{word} in cameras.txt": refuse(change_beside("cameras.txt", write(data)))
             for word, data in contents.items()
         },
         "a million images": refuse(write(b"0 1 0 0 0 0 0 0 1 a\n" * 1_000_000), slow=True),
-        "cameras.txt of 8 GB of zeros": refuse(change_beside("cameras.txt", fill_with_zeros(2**33))),
+        "8 GB of zeros as cameras.txt": refuse(change_beside("cameras.txt", fill_with_zeros(2**33))),
     }
 
 
 def of_pose_list() -> dict[str, Damage]:
     changes: dict[str, Callable[[list[str]], list[str]]] = {
-        "a line of 1 MB": lambda _: ["1 " * 2**19], "50,000 lines": lambda x: [x[1]] * 50_000,
-        "a zero byte": lambda x: [x[0] + " \0", *x[1:]],
+        "a line of 1 MB": lambda _: ["1 " * 2**19], "50,000 equal poses": lambda x: [x[1]] * 50_000,
+        "a zero byte in the first line": lambda x: [x[0] + " \0", *x[1:]],
         "4,000,000 lines of one number": lambda x: [x[0], "1\n" * 4_000_000],
-        "15,000,000 blank lines": lambda x: [*x, " \n" * 15_000_000],
-        "15,000,000 comments": lambda x: [*x, "#\n" * 15_000_000],
+        "15,000,000 blank lines at the end": lambda x: [*x, " \n" * 15_000_000],
+        "15,000,000 comments at the end": lambda x: [*x, "#\n" * 15_000_000],
     }  # fmt: skip
     return {word: allow(edit_lines(change), slow=word[0].isdigit()) for word, change in changes.items()}
 
@@ -91,13 +91,15 @@ def of_metashape() -> dict[str, Damage]:
     address = "u" * 1_000_000
     names = "".join(f"<a:b{i}/>" for i in range(3000))
     return {
-        "nested sensors": allow(nest_sensors, slow=True),
+        "400 sensors in one another": allow(nest_sensors, slow=True),
         "a million attributes": allow(add_attributes, slow=True),
-        "a namespace of 1 MB": allow(add_element(f"<x xmlns:a='{address}'>{'<a:b/>' * 100_000}</x>"), slow=True),
-        "names in a namespace of 1 MB": allow(add_element(f"<x xmlns:a='{address}'>{names}</x>"), slow=True),
-        "depth": allow(add_element("<a>" * 400_000 + "</a>" * 400_000), slow=True),
-        "a component named by a quote": allow(swap('<camera id="0"', '<camera component_id="a\'b" id="0"')),
-        "an entity": allow(swap("<document>", "<!DOCTYPE x [<!ENTITY a 'aaaa'>]><document>")),
+        "100,000 elements in a namespace of 1 MB": allow(
+            add_element(f"<x xmlns:a='{address}'>{'<a:b/>' * 100_000}</x>"), slow=True
+        ),
+        "3,000 names in a namespace of 1 MB": allow(add_element(f"<x xmlns:a='{address}'>{names}</x>"), slow=True),
+        "400,000 elements in one another": allow(add_element("<a>" * 400_000 + "</a>" * 400_000), slow=True),
+        "a component's number with a quote": allow(swap('<camera id="0"', '<camera component_id="a\'b" id="0"')),
+        "a declared entity": allow(swap("<document>", "<!DOCTYPE x [<!ENTITY a 'aaaa'>]><document>")),
     }
 
 

@@ -76,29 +76,31 @@ def put_record(more: bytes) -> Change:
 
 
 RECORDS = {
-    "unknown axes": refuse(put_record(axes_record(17)), "SPZ_ADOBE_coordinate_system", 17),
-    "axes of two bytes": refuse(put_record(axes_record(4, 2)), "SPZ_ADOBE_coordinate_system", "damaged"),
-    "axes that are cut": refuse(put_record(axes_record(4, cut=1)), "SPZ_ADOBE_coordinate_system", "damaged"),
+    "axes of an unknown number": refuse(put_record(axes_record(17)), "SPZ_ADOBE_coordinate_system", 17),
+    "axes in two bytes instead of four": refuse(
+        put_record(axes_record(4, 2)), "SPZ_ADOBE_coordinate_system", "damaged"
+    ),
+    "axes cut off": refuse(put_record(axes_record(4, cut=1)), "SPZ_ADOBE_coordinate_system", "damaged"),
 }
 
 
 def of_spz() -> dict[str, Damage]:
     return RECORDS | {
-        "40 bytes": refuse(edit_bytes(lambda data: data[:40]), 174, 9),
-        "a stream of a byte less": refuse(edit_stream(lambda data: data[:-1]), 174, 173),
-        "another magic": refuse(edit_header(magic=1), "another file"),
-        "the start of version 4": refuse(write(b"NGSP\4\0\0\0"), "end of file"),
+        "the first 40 bytes alone": refuse(edit_bytes(lambda data: data[:40]), 174, 9),
+        "a byte less inside the gzip": refuse(edit_stream(lambda data: data[:-1]), 174, 173),
+        "another magic number": refuse(edit_header(magic=1), "another file"),
+        "the start of version 4 alone": refuse(write(b"NGSP\4\0\0\0"), "end of file"),
         "version 9": refuse(edit_header(version=9), "version 9"),
-        "version 1 of version 3": allow(edit_header(version=1)),
-        "another degree": refuse(edit_header(degree=4), 552, 174),
+        "version 1 in the header of version 3": allow(edit_header(version=1)),
+        "degree 4 in the header": refuse(edit_header(degree=4), 552, 174),
         "a fraction of 200 bits": refuse(edit_header(fraction=200), "version 1 to 4"),
-        "none": refuse(edit_header(count=0), "a count of 0"),
-        "2^32 - 1": refuse(edit_header(count=2**32 - 1), "64 MB"),
-        "one more": refuse(edit_header(count=len(SOME) + 1), 203, 174),
-        "1,000,001 equal ones": refuse(write(equal_bytes(1_000_001)), "1,000,001"),
-        "1,000,001 equal ones in version 4": refuse(write(equal_4(1_000_001)), "1,000,001"),
-        "half a million of degree 4": refuse(write(equal_bytes(500_000, 4)), "500,000"),
-        "the first bytes of a stream": refuse(write(gzip.compress(bytes(9), 1))),
+        "a count of 0": refuse(edit_header(count=0), "a count of 0"),
+        "a count of 2^32 - 1": refuse(edit_header(count=2**32 - 1), "64 MB"),
+        "a count of one too many": refuse(edit_header(count=len(SOME) + 1), 203, 174),
+        "1,000,001 equal Gaussians": refuse(write(equal_bytes(1_000_001)), "1,000,001"),
+        "1,000,001 equal Gaussians in version 4": refuse(write(equal_4(1_000_001)), "1,000,001"),
+        "500,000 equal Gaussians of degree 4": refuse(write(equal_bytes(500_000, 4)), "500,000"),
+        "nine zero bytes inside the gzip": refuse(write(gzip.compress(bytes(9), 1))),
     }
 
 
@@ -117,26 +119,19 @@ def lengthen_stream(data: bytes) -> bytes:
 def of_spz4() -> dict[str, Damage]:
     frame = b"\x28\xb5\x2f\xfd\xe0" + b"\xff" * 7 + b"\0"
     return RECORDS | {
-        "15 bytes": refuse(edit_bytes(lambda data: data[:15]), "end of file"),
-        "60 bytes": refuse(edit_bytes(lambda data: data[:60]), "end of file"),
-        "three bytes less": refuse(edit_bytes(lambda data: data[:-3]), "truncated"),
-        "none": refuse(pack_at(PLACE_OF_COUNT, "<I", 0), "a count of 0"),
-        "2^32 - 1": refuse(pack_at(PLACE_OF_COUNT, "<I", 2**32 - 1), "64 MB"),
-        "degree 5": refuse(pack_at(12, "B", 5), "degree 5"),
-        "three streams": refuse(pack_at(15, "B", 3), "columns"),
-        "a table far away": refuse(pack_at(16, "<I", 2**31 - 1), "end of file"),
-        "a stream of 2^63": refuse(pack_at(SIZES.start, "<Q", 2**63), "truncated"),
-        "a stream that unpacks to 2^40": refuse(pack_at(SIZES.start + 8, "<Q", 2**40), "columns"),
-        "no stream": refuse(pack_at(SIZES.stop, "4s", b"none"), "Zstandard"),
-        "a frame of another size": refuse(pack_at(SIZES.stop, f"{len(frame)}s", frame), "Zstandard"),
-        "a longer stream": refuse(edit_bytes(lengthen_stream), "sizes of its table"),
-    }
-
-
-def of_splat() -> dict[str, Damage]:
-    return {
-        "33 bytes": refuse(write(bytes(33)), "33 bytes"),
-        "NaN": refuse(write(np.full(8, np.nan, "<f4").tobytes()), "NaN"),
+        "the first 15 bytes alone": refuse(edit_bytes(lambda data: data[:15]), "end of file"),
+        "the first 60 bytes alone": refuse(edit_bytes(lambda data: data[:60]), "end of file"),
+        "the last three bytes cut off": refuse(edit_bytes(lambda data: data[:-3]), "truncated"),
+        "a count of 0": refuse(pack_at(PLACE_OF_COUNT, "<I", 0), "a count of 0"),
+        "a count of 2^32 - 1": refuse(pack_at(PLACE_OF_COUNT, "<I", 2**32 - 1), "64 MB"),
+        "degree 5 in the header": refuse(pack_at(12, "B", 5), "degree 5"),
+        "three streams in the header": refuse(pack_at(15, "B", 3), "columns"),
+        "a table that starts at 2 GB": refuse(pack_at(16, "<I", 2**31 - 1), "end of file"),
+        "a stream of 2^63 bytes": refuse(pack_at(SIZES.start, "<Q", 2**63), "truncated"),
+        "a stream that claims to unpack to 2^40 bytes": refuse(pack_at(SIZES.start + 8, "<Q", 2**40), "columns"),
+        "bytes that are no Zstandard as a stream": refuse(pack_at(SIZES.stop, "4s", b"none"), "Zstandard"),
+        "a stream whose frame claims another size": refuse(pack_at(SIZES.stop, f"{len(frame)}s", frame), "Zstandard"),
+        "a stream that unpacks to 1 MB": refuse(edit_bytes(lengthen_stream), "sizes of its table"),
     }
 
 
@@ -165,14 +160,9 @@ def chain_nodes(parsed: dict[str, Any]) -> None:
     parsed["nodes"] = [{"children": [i + 1], "scale": [2, 2, 2]} for i in range(DEEP)] + parsed["nodes"]
 
 
-def copy_nodes(parsed: dict[str, Any]) -> None:
-    """As many nodes that show the same Gaussians."""
-    parsed["nodes"] = [{"children": list(range(1, DEEP))}, *([{"mesh": 0}] * DEEP)]
-
-
-def add_empty_nodes(parsed: dict[str, Any]) -> None:
-    """Nodes of a few bytes, each of which takes longer to place than they allow."""
-    parsed["nodes"] = [{"children": list(range(1, 200_000))}, *([{}] * 200_000)]
+def put_nodes(count: int, node: dict[str, int]) -> Change:
+    """Put as many equal nodes into one; even empty ones take longer to place than their few bytes allow."""
+    return set_json("nodes", value=[{"children": list(range(1, count + 1))}, *([node] * count)])
 
 
 def share_positions(parsed: dict[str, Any]) -> None:
@@ -181,46 +171,55 @@ def share_positions(parsed: dict[str, Any]) -> None:
     parsed["meshes"][0]["primitives"][0]["attributes"] |= dict.fromkeys(names, 0)
 
 
-def show_twice(parsed: dict[str, Any]) -> None:
-    parsed["nodes"] = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0}]
-
-
 def of_glb() -> dict[str, Damage]:
-    damages = {f"JSON of {value} bytes": refuse(pack_at(12, "<I", value)) for value in (0, 2**31, 2**32 - 1)}
+    damages = {
+        f"a document that claims {value} bytes": refuse(pack_at(12, "<I", value)) for value in (0, 2**31, 2**32 - 1)
+    }
     for value in (float("nan"), 1e300):
         for part in ("translation", "scale"):
-            damages[f"{part} of {value}"] = allow(set_json("nodes", 0, part, value=[value] * 3))
+            damages[f"a node's {part} of {value}"] = allow(set_json("nodes", 0, part, value=[value] * 3))
     accessor, view = ("accessors", 2), ("bufferViews", 0)
     return damages | {
-        "another length in the header": refuse(pack_at(8, "<I", 2**32 - 1), "truncated"),
-        "the same document": accept(edit_bytes(lambda data: document(data)[1](document(data)[0]))),
-        "no splats": refuse(edit_primitive(lambda p: p["extensions"].clear()), SPLATTING, "mesh"),
+        "a header that claims 4 GB": refuse(pack_at(8, "<I", 2**32 - 1), "truncated"),
+        "the same document written again": accept(edit_bytes(lambda data: document(data)[1](document(data)[0]))),
+        "a mesh without Gaussians": refuse(edit_primitive(lambda p: p["extensions"].clear()), SPLATTING, "mesh"),
         "linear colours": refuse(edit_splats(colorSpace="lin_rec709_display"), "lin_rec709_display"),
-        "another kernel": refuse(edit_splats(kernel="customShape"), "customShape"),
-        "an unknown compression": refuse(edit_splats(extensions={f"{SPLATTING}_spz_2": {}}), f"{SPLATTING}_spz_2"),
-        **{f"no {name}": lack_attribute(name) for name in ("SCALE", "SH_DEGREE_1_COEF_2", "SH_DEGREE_0_COEF_0")},
-        "an extension of others": refuse(
+        "an unknown kernel": refuse(edit_splats(kernel="customShape"), "customShape"),
+        "Gaussians of an unknown compression": refuse(
+            edit_splats(extensions={f"{SPLATTING}_spz_2": {}}), f"{SPLATTING}_spz_2"
+        ),
+        **{
+            f"no attribute {name}": lack_attribute(name)
+            for name in ("SCALE", "SH_DEGREE_1_COEF_2", "SH_DEGREE_0_COEF_0")
+        },
+        "an unknown extension required": refuse(
             set_json("extensionsRequired", value=["EXT_meshopt_compression"]), "EXT_meshopt_compression"
         ),
-        "another file": refuse(set_json("buffers", 0, "uri", value="b.bin"), "another file"),
+        "values in another file": refuse(set_json("buffers", 0, "uri", value="b.bin"), "another file"),
         "sparse values": refuse(set_json(*accessor, "sparse", value={}), "sparse"),
-        "a count of 10^12": refuse(set_json(*accessor, "count", value=10**12), "truncated"),
-        "a count of 400 digits": refuse(set_json("accessors", 0, "count", value=10**400), "count"),
-        "a count of 10^9": refuse(set_json("accessors", 0, "count", value=10**9), "truncated"),
-        "fewer of one attribute": refuse(set_json(*accessor, "count", value=5), "one per Gaussian"),
-        "a length of 2^62": allow(set_json(*view, "byteLength", value=2**62)),
-        "a stride of 2^62": allow(set_json(*view, "byteStride", value=2**62)),
-        "a node in itself": refuse(set_json("nodes", 0, "children", value=[0]), "node 0"),
-        "a node that stretches": refuse(set_json("nodes", 0, "scale", value=[1, 2, 1]), "stretches"),
-        "a node that mirrors": refuse(set_json("nodes", 0, "scale", value=[-1, -1, -1]), "mirrors"),
-        "the same values twice": refuse(edit_json(show_twice), "same values"),
-        "nodes in one another": refuse(edit_json(chain_nodes), slow=True),
-        "copies without end": refuse(edit_json(copy_nodes), slow=True),
-        "200,000 empty nodes": refuse(edit_json(add_empty_nodes), slow=True),
-        "values for many attributes": refuse(edit_json(share_positions), "same values"),
+        "10^12 values of one attribute": refuse(set_json(*accessor, "count", value=10**12), "truncated"),
+        "a number of positions of 400 digits": refuse(set_json("accessors", 0, "count", value=10**400), "count"),
+        "10^9 positions": refuse(set_json("accessors", 0, "count", value=10**9), "truncated"),
+        "fewer values of one attribute": refuse(set_json(*accessor, "count", value=5), "one per Gaussian"),
+        "values of 2^62 bytes": allow(set_json(*view, "byteLength", value=2**62)),
+        "values 2^62 bytes apart": allow(set_json(*view, "byteStride", value=2**62)),
+        "a node that holds itself": refuse(set_json("nodes", 0, "children", value=[0]), "node 0"),
+        "a node that stretches the Gaussians": refuse(set_json("nodes", 0, "scale", value=[1, 2, 1]), "stretches"),
+        "a node that mirrors the Gaussians": refuse(set_json("nodes", 0, "scale", value=[-1, -1, -1]), "mirrors"),
+        "two nodes with the same Gaussians": refuse(put_nodes(2, {"mesh": 0}), "same values"),
+        "100,000 nodes in one another": refuse(edit_json(chain_nodes), slow=True),
+        "100,000 nodes with the same Gaussians": refuse(put_nodes(DEEP, {"mesh": 0}), slow=True),
+        "200,000 empty nodes": refuse(put_nodes(200_000, {}), slow=True),
+        "positions as the values of all harmonics": refuse(edit_json(share_positions), "same values"),
     }
 
 
 DAMAGES = {
-    "spz": of_spz(), "spz 4": of_spz4(), "splat": of_splat(), "glb": of_glb(),
-}  # fmt: skip
+    "spz": of_spz(),
+    "spz of version 4": of_spz4(),
+    "splat": {
+        "33 zero bytes in its place": refuse(write(bytes(33)), "33 bytes"),
+        "a row of NaN in its place": refuse(write(np.full(8, np.nan, "<f4").tobytes()), "NaN"),
+    },
+    "glb": of_glb(),
+}

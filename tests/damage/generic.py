@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import json
 import pickle
 import tarfile
 from pathlib import Path, PurePath
@@ -23,7 +22,7 @@ WITH_JSON, ZIPPED, TEXTS = (".json", ".sog", ".glb"), (".sog", ".npz"), (".txt",
 SCENES = (".ply", ".spz", ".splat", ".sog", ".npz", ".glb", ".gsm", ".safetensors")
 PARTS_MAY_BE_SOUND = (*TEXTS, ".splat")  # rows that are read one by one
 ASKED = ("SHARP", "dataparser")  # readers that are asked whether a file has what they know
-LINES = ("list", "set")  # whose lines are damaged at random alone
+LINES = ("list of scenes", "values of --set")  # whose lines are damaged at random alone
 FILES = [kind for kind, sound in SOUNDS.items() if PurePath(sound.name).suffix and kind not in LINES]
 
 
@@ -38,10 +37,10 @@ def _archive(add: str) -> bytes:
 
 # What stands in the place of files that were copied or downloaded, and what the line says of it
 OTHER_CONTENT: dict[str, tuple[bytes, tuple[str, ...]]] = {
-    "a pointer of LFS": (LFS, ("LFS", "git lfs pull")),
+    "a pointer of Git LFS": (LFS, ("LFS", "git lfs pull")),
     "a web page": (PAGE, ("web page", "'Virus scan warning'", "download")),
-    "an error as JSON": (b'{"error": "Not found"}', ("text", "Not found", "download")),
-    "an error as text": (b"404: Not Found", ("text", "404: Not Found")),
+    "a server's error as JSON": (b'{"error": "Not found"}', ("text", "Not found", "download")),
+    "a server's error as text": (b"404: Not Found", ("text", "404: Not Found")),
     "a zip": (_archive("zip"), ("zip", "unpack")),
     "a gzip": (gzip.compress(b"ply\n", mtime=0), ("gzip", "unpack")),
     "a tar": (_archive("tar"), ("tar", "unpack")),
@@ -55,20 +54,20 @@ OWN = {"a zip": (".sog", ".npz"), "a gzip": (".spz",), "a PLY file": (".ply", ".
 
 def _pieces(kind: str) -> dict[str, Damage]:
     """Damages of a file as bytes."""
-    outcome = allow if kind == "ply, text" or PurePath(SOUNDS[kind].name).suffix in PARTS_MAY_BE_SOUND else refuse
+    outcome = allow if kind == "ply as text" or PurePath(SOUNDS[kind].name).suffix in PARTS_MAY_BE_SOUND else refuse
     shares = {share: outcome(cut(share)) for share in (0.3, 0.9)}
     shares |= leave_to_sweep({share: outcome(cut(share)) for share in (0.0001, 0.05, 0.5)})
     return {
-        **{f"the first {share:.2%}": damage for share, damage in shares.items()},
-        "all but the end": allow(cut(0.999)),
-        "empty": refuse(write(b"")),
-        **({} if SOUNDS[kind].scene else {"missing": refuse(Path.unlink, "no such file")}),
-        "zeros": refuse(write(bytes(5000))),
-        "a pickle": refuse(write(pickle.dumps({"a": 1}) * 9)),
-        "bytes that are no text": outcome(write(bytes(range(256)))),
-        "a byte too many": allow(edit_bytes(lambda data: data + b"x")),
-        "1 TB of zeros": refuse(fill_with_zeros(TERABYTE)),
-        "1 TB of zeros behind it": allow(fill_with_zeros(TERABYTE, None)),
+        **{f"cut off after {100 * share:g}%": damage for share, damage in shares.items()},
+        "the last thousandth cut off": allow(cut(0.999)),
+        "an empty file": refuse(write(b"")),
+        **({} if SOUNDS[kind].scene else {"no such file": refuse(Path.unlink, "no such file")}),
+        "5,000 zero bytes in its place": refuse(write(bytes(5000))),
+        "a pickle in its place": refuse(write(pickle.dumps({"a": 1}) * 9)),
+        "bytes of all values in its place": outcome(write(bytes(range(256)))),
+        "a byte more at the end": allow(edit_bytes(lambda data: data + b"x")),
+        "1 TB of zeros in its place": refuse(fill_with_zeros(TERABYTE)),
+        "1 TB of zeros at the end": allow(fill_with_zeros(TERABYTE, None)),
     }
 
 
@@ -77,33 +76,33 @@ def _other_content(kind: str, suffix: str) -> dict[str, Damage]:
     if suffix in SCENES:
         names = list(OTHER_CONTENT)
     else:
-        names = ["a pointer of LFS", "a web page"] if suffix in (".json", ".png") else []
+        names = ["a pointer of Git LFS", "a web page"] if suffix in (".json", ".png") else []
     damages = {}
     for name in names:
         data, said = OTHER_CONTENT[name]
         own = kind == "photos" or suffix in OWN.get(name, ())  # of several photos, one is left out in fewer words
-        damages[name] = refuse(write(data), *(() if own else said))
+        damages[f"{name} in its place"] = refuse(write(data), *(() if own else said))
     return damages
 
 
 def _json() -> dict[str, Damage]:
     """Damages of a document of JSON."""
     return {
-        "JSON of brackets": refuse(write_json(b"[" * BRACKETS)),
-        "JSON of nested objects": refuse(write_json(b'{"a":' * BRACKETS)),
-        "JSON of many digits": refuse(write_json(b"9" * 10_000)),
-        "JSON of a huge number": refuse(write_json(b"1e999")),
-        "JSON that ends": refuse(write_json(b"{")),
-        **{f"JSON {value}": refuse(write_json(json.dumps(value).encode())) for value in ([], [1], {}, 7, "a", None)},
+        "100,000 open brackets as JSON": refuse(write_json(b"[" * BRACKETS)),
+        "100,000 objects in one another as JSON": refuse(write_json(b'{"a":' * BRACKETS)),
+        "a number of 10,000 digits as JSON": refuse(write_json(b"9" * 10_000)),
+        "the number 1e999 as JSON": refuse(write_json(b"1e999")),
+        "an open brace as JSON": refuse(write_json(b"{")),
+        **{f"{text} as JSON": refuse(write_json(text.encode())) for text in ("[]", "[1]", "{}", "7", '"a"', "null")},
     }
 
 
 def _archives() -> dict[str, Damage]:
     """Damages of a zip that holds the file's parts."""
     return {
-        "encrypted": allow(edit_entries(6, 8, lambda flags: flags | 1)),
-        "an unknown compression": refuse(edit_entries(8, 10, lambda _: 99), "method 99"),
-        "the directory alone": refuse(edit_bytes(lambda data: data[data.index(b"PK\x01\x02") :])),
+        "an encrypted archive": allow(edit_entries(6, 8, lambda flags: flags | 1)),
+        "an archive of an unknown compression": refuse(edit_entries(8, 10, lambda _: 99), "method 99"),
+        "an archive without its members": refuse(edit_bytes(lambda data: data[data.index(b"PK\x01\x02") :])),
     }
 
 

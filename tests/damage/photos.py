@@ -120,19 +120,19 @@ def of_png() -> dict[str, Damage]:
     bits = png(WIDTH, HEIGHT, zlib.compress(b"\0\xaa" * HEIGHT), depth=1, color=0)
     return {
         **{f"a PNG that claims {w} x {h}": allow(edit_bytes(claim_size(w, h))) for w, h in sizes},
-        "all PNG claim 60000 x 60000": refuse(edit_all(claim_size(60_000, 60_000)), place=ALL),
-        "8 GB of zeros": refuse(fill_with_zeros(2**33)),
-        "three bombs": refuse(edit_all(lambda _: black(9000, 9000)), place=ALL, slow=True),
-        "solid of 8190 x 8190": refuse(edit_all(lambda _: black(8190, 8190)), place=ALL, slow=True),
-        "300 frames of one photo": refuse(
+        "all PNGs claim 60000 x 60000": refuse(edit_all(claim_size(60_000, 60_000)), place=ALL),
+        "8 GB of zeros in its place": refuse(fill_with_zeros(2**33)),
+        "all photos black, of 9000 x 9000": refuse(edit_all(lambda _: black(9000, 9000)), place=ALL, slow=True),
+        "all photos black, of 8190 x 8190": refuse(edit_all(lambda _: black(8190, 8190)), place=ALL, slow=True),
+        "300 frames with one photo of 2000 x 2000": refuse(
             name_one_photo, "300 of 2000 x 2000", place="scene", compacts=True, slow=True
         ),
-        "60 texts of 1 MB": accept(edit_all(add_chunks(texts())), slow=True),
-        "a million chunks without data": allow(edit_all(add_chunks(chunk(b"IDAT", b"") * 1_000_000)), slow=True),
-        "a script": refuse(edit_bytes(lambda data: b"#!/bin/sh\ntouch executed\n")),
-        "a chunk of 4 GB": refuse(edit_bytes(put_numbers(33, ">I", 2**32 - 1))),
-        "JPEG of four channels": allow(edit_all(cmyk)),
-        "a PNG of 1 bit": accept(edit_all(lambda _: bits)),
+        "60 packed texts of 1 MB in every PNG": accept(edit_all(add_chunks(texts())), slow=True),
+        "a million empty chunks in every PNG": allow(edit_all(add_chunks(chunk(b"IDAT", b"") * 1_000_000)), slow=True),
+        "a shell script in its place": refuse(edit_bytes(lambda data: b"#!/bin/sh\ntouch executed\n")),
+        "a chunk that claims 4 GB": refuse(edit_bytes(put_numbers(33, ">I", 2**32 - 1))),
+        "all photos as JPEG of four channels without pixels": allow(edit_all(cmyk)),
+        "all photos as PNG of 1 bit": accept(edit_all(lambda _: bits)),
     }
 
 
@@ -143,11 +143,13 @@ def of_other_formats() -> dict[str, Damage]:
     }  # fmt: skip
     return {
         **{
-            f"{suffix} that lies": (allow if suffix == ".webp" else refuse)(recode(suffix, lie), place=ALL)
+            f"all photos as {suffix} that claim a huge size": (allow if suffix == ".webp" else refuse)(
+                recode(suffix, lie), place=ALL
+            )
             for suffix, lie in lies.items()
         },
-        ".bmp upside down": accept(recode(".bmp", put_numbers(22, "<i", -HEIGHT))),
-        ".bmp of least height": refuse(recode(".bmp", put_numbers(22, "<i", -(2**31))), place=ALL),
+        "all photos as .bmp upside down": accept(recode(".bmp", put_numbers(22, "<i", -HEIGHT))),
+        "all photos as .bmp of a height of -2^31": refuse(recode(".bmp", put_numbers(22, "<i", -(2**31))), place=ALL),
     }
 
 
@@ -165,15 +167,15 @@ def write_progressive(scans: int) -> Change:
 DAMAGES: dict[str, dict[str, Damage]] = {
     "photos": of_png() | of_other_formats(),
     "photo.png": {
-        **{f"byte {place} changed": refuse(flip(place)) for place in (10, 20, 30, 40, -20)},
+        **{f"bits of byte {place} flipped": refuse(flip(place)) for place in (10, 20, 30, 40, -20)},
         "an unknown critical chunk": refuse(edit_bytes(add_chunks(chunk(b"ABCD", b"")))),
-        "no picture": refuse(write(b"\0no image"), "decoded"),
-        "text": refuse(write(b"no image"), "text"),
-        "no bytes": refuse(write(b""), "empty"),
-        "half of it": refuse(cut(0.5), "decoded"),
+        "bytes that are no picture in its place": refuse(write(b"\0no image"), "decoded"),
+        "text in its place": refuse(write(b"no image"), "text"),
+        "an empty file": refuse(write(b""), "empty"),
+        "cut off after 50%": refuse(cut(0.5), "decoded"),
     },
     "photo.jpg": {
-        "a few scans": accept(write_progressive(1)),
-        "5,006 scans": refuse(write_progressive(5001), "5,006 scans"),
+        "a progressive JPEG of a few scans": accept(write_progressive(1)),
+        "a progressive JPEG of 5,006 scans": refuse(write_progressive(5001), "5,006 scans"),
     },
 }

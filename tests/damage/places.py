@@ -11,22 +11,18 @@ from pathlib import Path
 from .case import READ, REFUSED, USAGE, Change, Damage, accept, allow, leave_to_sweep, refuse
 
 FORMS = {
-    "spaces": " a scene  of mine ", "Unicode": "Szene \u00e4\u6f22\u0440 \U0001f600", "a dash": "-scene",
+    "spaces": " a scene  of mine ", "Unicode": "Szene \u00e4\u6f22\u0440 \U0001f600", "a leading dash": "-scene",
     "line breaks": "a\nb\rc", "an escape sequence": "a\x1b[2Jb", "quotes": "a'b\"c", "percent signs": "%s%n{0}",
-    "brackets": "[red]*?", "255 letters": "x" * 255, "no UTF-8": "a\udcff\udcfeb",
-    "right to left": "a\u202eb", "dots": "..scene..", "a ply's suffix": "scene.ply",
+    "brackets": "[red]*?", "255 letters": "x" * 255, "bytes that are no UTF-8": "a\udcff\udcfeb",
+    "a mark of right-to-left text": "a\u202eb", "dots": "..scene..", "the suffix .ply": "scene.ply",
 }  # fmt: skip
 OF_PHOTOS = {"spaces": "a b  %d", "Unicode": "\u00e4\u6f22 %d", "many digits": "1" * 200 + "%d"}
-FEW = ("line breaks", "no UTF-8")  # forms of names that are tried in every run
+FEW = ("line breaks", "bytes that are no UTF-8")  # forms of names that are tried in every run
 
 
-def rename(name: str) -> Change:
-    """The folder under another name."""
-    return lambda folder: [folder.rename(folder.parent / name)]
-
-
-def rename_ply(name: str) -> Change:
-    return lambda folder: [(folder / "scene.ply").rename(folder / name)]
+def rename(name: str, part: str = "") -> Change:
+    """The folder, or a file in it, under another name."""
+    return lambda folder: [(folder / part).rename((folder / part).parent / name)]
 
 
 def rename_photos(form: str) -> Change:
@@ -123,24 +119,28 @@ def add_images(folder: Path) -> None:
 
 def of_names() -> dict[str, Damage]:
     folders = {word: accept(rename(name), slow=word not in FEW) for word, name in FORMS.items()}
-    plys = {word: accept(rename_ply(FORMS[word][:240] + ".ply"), slow=word not in FEW) for word in list(FORMS)[:5]}
+    plys = {
+        word: accept(rename(FORMS[word][:240] + ".ply", "scene.ply"), slow=word not in FEW) for word in list(FORMS)[:5]
+    }
     photos = {word: accept(rename_photos(form)) for word, form in OF_PHOTOS.items()}
     return {
-        **{f"a folder with {word}": damage for word, damage in folders.items()},
-        **{f"a ply with {word}": damage for word, damage in plys.items()},
-        **{f"photos with {word}": damage for word, damage in photos.items()},
+        **{f"a folder named with {word}": damage for word, damage in folders.items()},
+        **{f"a .ply named with {word}": damage for word, damage in plys.items()},
+        **{f"photos named with {word}": damage for word, damage in photos.items()},
     }
 
 
 def of_things() -> dict[str, Damage]:
     """A pipe, a link to itself, a ring of links and a folder in the place of each file."""
     damages = {}
-    for thing, make in {"loop": link_to_itself, "pipe": make_pipe}.items():
+    for thing, make in {"link to itself": link_to_itself, "pipe": make_pipe}.items():
         damages |= {
             f"scene.ply as a {thing}": refuse(replace_with("scene.ply", make), place="scene.ply"),
-            f"transforms.json as a {thing}": allow(replace_with("transforms.json", make), slow=thing == "loop"),
+            f"transforms.json as a {thing}": allow(replace_with("transforms.json", make), slow=make is link_to_itself),
             f"images as a {thing}": allow(replace_with("images", make)),
-            f"an image as a {thing}": refuse(replace_with("images/view_000.png", make), place="view_000.png"),
+            f"images/view_000.png as a {thing}": refuse(
+                replace_with("images/view_000.png", make), place="view_000.png"
+            ),
         }
         for option, name in (
             ("--cameras", "c.json"), ("--cameras", "c.npz"), ("--cameras", "c.txt"), ("--images", "i"),
@@ -148,37 +148,37 @@ def of_things() -> dict[str, Damage]:
             change = add_arguments(
                 option, f"{{}}/{name}", make=lambda folder, make=make, name=name: make(folder / name)
             )
-            damages[f"{option} {name}, a {thing}"] = refuse(change, place=name)
+            damages[f"{option} {name} as a {thing}"] = refuse(change, place=name)
         change = add_arguments("-o", "{}/out.ply", make=lambda folder, make=make: make(folder / "out.ply"))
-        damages[f"the output a {thing}"] = Damage(change, (READ, USAGE, REFUSED))
+        damages[f"the output as a {thing}"] = Damage(change, (READ, USAGE, REFUSED))
     for name in ("scene.ply", "transforms.json", "images", "images/view_000.png"):
-        damages[f"{name} as a ring"] = allow(replace_with(name, link_in_ring), slow=name == "transforms.json")
+        damages[f"{name} as a ring of links"] = allow(replace_with(name, link_in_ring), slow=name == "transforms.json")
         damages[f"{name} as a folder"] = allow(replace_with(name, os.mkdir), slow=name == "transforms.json")
     return damages
 
 
 def of_arguments() -> dict[str, Damage]:
     return {
-        "parts": accept(split_in_parts(lambda path: None)),
-        "a part as a pipe": refuse(split_in_parts(make_pipe), place="view_002.ply"),
-        "links to all files": accept(add_arguments(make=link_all)),
-        "images in an endless folder": allow(replace_with("images", make_endless)),
-        "an endless folder beside the images": accept(
+        "views as files of their own": accept(split_in_parts(lambda path: None)),
+        "one of the views' files as a pipe": refuse(split_in_parts(make_pipe), place="view_002.ply"),
+        "all files as links": accept(add_arguments(make=link_all)),
+        "images as a folder that holds itself": allow(replace_with("images", make_endless)),
+        "a folder that holds itself among the images": accept(
             add_arguments(make=lambda folder: make_endless(folder / "images" / "more"))
         ),
-        "a path of 2000 letters": accept(move_deep),
-        "500 empty images": accept(add_arguments(make=add_images), slow=True),
-        "nothing where the scene was": refuse(
+        "a path of 2,000 letters": accept(move_deep),
+        "500 empty images beside the photos": accept(add_arguments(make=add_images), slow=True),
+        "no scene.ply in the folder": refuse(
             add_arguments(make=lambda folder: remove(folder / "scene.ply")), place="scene", other_kind=True
         ),
-        "output in a file": refuse(add_arguments("-o", "{}/scene.ply/a.ply"), place="a.ply"),
-        "output below a file": refuse(add_arguments("-o", "{}/transforms.json/a.ply"), place="a.ply"),
-        "a device as the scene": refuse(lambda folder: ["/dev/zero"], place="/dev/zero"),
-        "nothing as the scene": refuse(lambda folder: ["/dev/null"], place="/dev/null"),
-        "a device as cameras": refuse(add_arguments("--cameras", "/dev/zero"), place="/dev/zero"),
-        "a device as images": refuse(add_arguments("--images", "/dev/zero"), place="/dev/zero"),
-        "the ply as cameras": refuse(add_arguments("--cameras", "{}/scene.ply"), place="scene.ply", other_kind=True),
-        "a name of 5000 letters": refuse(lambda folder: [folder / ("x" * 5000) / "a.ply"], place="a.ply"),
+        "an output inside scene.ply": refuse(add_arguments("-o", "{}/scene.ply/a.ply"), place="a.ply"),
+        "an output inside transforms.json": refuse(add_arguments("-o", "{}/transforms.json/a.ply"), place="a.ply"),
+        "the device /dev/zero as the scene": refuse(lambda folder: ["/dev/zero"], place="/dev/zero"),
+        "/dev/null as the scene": refuse(lambda folder: ["/dev/null"], place="/dev/null"),
+        "the device /dev/zero as cameras": refuse(add_arguments("--cameras", "/dev/zero"), place="/dev/zero"),
+        "the device /dev/zero as images": refuse(add_arguments("--images", "/dev/zero"), place="/dev/zero"),
+        "scene.ply as cameras": refuse(add_arguments("--cameras", "{}/scene.ply"), place="scene.ply", other_kind=True),
+        "a folder's name of 5,000 letters": refuse(lambda folder: [folder / ("x" * 5000) / "a.ply"], place="a.ply"),
     }
 
 

@@ -119,12 +119,7 @@ def change_ply(data: bytes, random: Random, leaf: Change) -> bytes:
     head, mark, rows = data.partition(b"end_header\n")
     if random.random() < 0.5:
         return change_text(head, random, leaf) + mark + rows
-    return head + mark + (change_text if b"format ascii" in head else leaf_alone)(rows, random, leaf)
-
-
-def leaf_alone(data: bytes, random: Random, leaf: Change) -> bytes:
-    """Change bytes without a structure."""
-    return leaf(data, random)
+    return head + mark + (change_text(rows, random, leaf) if b"format ascii" in head else leaf(rows, random))
 
 
 def change_array(data: bytes, random: Random, leaf: Change) -> bytes:

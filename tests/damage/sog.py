@@ -68,7 +68,7 @@ def swap_pictures(path: Path) -> None:
 def of_sog() -> dict[str, Damage]:
     return {
         "no version": refuse(drop_json("version"), "version 2"),
-        "version as a list": refuse(set_json("version", value=[2]), "version 2"),
+        "a version that is a list": refuse(set_json("version", value=[2]), "version 2"),
         "a count of 10^18": refuse(set_json("count", value=10**18), "count"),
         "a count of 400 digits": refuse(set_json("count", value=HUGE), "count"),
         "a count beyond the pixels": refuse(set_json("count", value=17), "4 x 4", 17),
@@ -76,21 +76,27 @@ def of_sog() -> dict[str, Damage]:
         "a million equal Gaussians": refuse(write_equal(1_000_000, 3), "126 MB"),
         "900 equal Gaussians": accept(write_equal(900, 3)),
         "a texture missing": refuse(drop_member("quats.webp")),
-        "a texture from outside": refuse(set_json("quats", "files", value=["../../etc/passwd"]), "../../etc/passwd"),
+        "a texture outside the archive": refuse(
+            set_json("quats", "files", value=["../../etc/passwd"]), "../../etc/passwd"
+        ),
         "a codebook of one code": refuse(set_json("sh0", "codebook", value=[0.5]), 256),
-        "a huge minimum": refuse(set_json("means", "mins", value=[HUGE] * 3), "too large"),
+        "a minimum of 400 digits": refuse(set_json("means", "mins", value=[HUGE] * 3), "too large"),
         "a minimum of NaN": refuse(set_json("means", "mins", value=[float("nan")] * 3), "NaN"),
-        "a texture with losses": refuse(replace_picture("scales.webp", 4, 4, quality=50), "without loss"),
+        "a texture compressed with losses": refuse(replace_picture("scales.webp", 4, 4, quality=50), "without loss"),
         "a texture of a million pixels": refuse(
             replace_picture("scales.webp", 1024, 1024), "scales.webp", "1024 x 1024"
         ),
-        "a texture of its header": refuse(edit_member("scales.webp", lambda data: data[:25]), "scales.webp", "damaged"),
-        "rotations of no mode": refuse(swap_pictures, "mode"),
-        "a palette of 10^9": refuse(set_json("shN", value={"count": 10**9, "bands": 3, "files": ["a", "b"]}), 65536),
-        "meta.json of bzip2": refuse(
+        "a texture cut off after its header": refuse(
+            edit_member("scales.webp", lambda data: data[:25]), "scales.webp", "damaged"
+        ),
+        "colours in the place of rotations": refuse(swap_pictures, "mode"),
+        "a palette of 10^9 colours": refuse(
+            set_json("shN", value={"count": 10**9, "bands": 3, "files": ["a", "b"]}), 65536
+        ),
+        "meta.json packed by bzip2": refuse(
             add_bomb("meta.json", zipfile.ZIP_BZIP2), "'meta.json'", "method 12", place="a.sog", slow=True
         ),
-        "meta.json that promises less": refuse(add_bomb("meta.json", zipfile.ZIP_DEFLATED), slow=True),
+        "meta.json that unpacks to more than it claims": refuse(add_bomb("meta.json", zipfile.ZIP_DEFLATED), slow=True),
     }
 
 
@@ -154,26 +160,32 @@ def add_name(name: str) -> Change:
 def of_levels() -> dict[str, Damage]:
     chunk, lods = "0_0/meta.json", ("tree", "lods")
     return {
-        "another version": refuse(set_json("version", value=2), "version 1", 2),
-        "a version as a list": refuse(set_json("version", value=[]), "version 1"),
+        "version 2": refuse(set_json("version", value=2), "version 1", 2),
+        "a version that is a list": refuse(set_json("version", value=[]), "version 1"),
         "fewer levels than its tree": refuse(set_json("lodLevels", value=1), "level"),
-        "a tree as a list": refuse(set_json("tree", value=[])),
-        "leaves and children": refuse(set_json("tree", "children", value=[]), "either children or lods"),
-        "a box turned": refuse(set_json("tree", "bound", value={"min": [9, 9, 9], "max": [1, 1, 1]}), "bound"),
+        "a tree that is a list": refuse(set_json("tree", value=[])),
+        "a node with both chunks and children": refuse(
+            set_json("tree", "children", value=[]), "either children or lods"
+        ),
+        "a box whose minimum is above its maximum": refuse(
+            set_json("tree", "bound", value={"min": [9, 9, 9], "max": [1, 1, 1]}), "bound"
+        ),
         "a box of NaN": refuse(set_json("tree", "bound", "min", value=[float("nan")] * 3), "bound"),
-        "a box of huge integers": allow(set_json("tree", "bound", value={"min": [HUGE] * 3, "max": [HUGE] * 3})),
-        "another count": refuse(set_json("count", value=5), "the tree has 9"),
-        "a file beyond the list": refuse(set_json(*lods, "0", "file", value=2), "file"),
+        "a box of integers of 400 digits": allow(
+            set_json("tree", "bound", value={"min": [HUGE] * 3, "max": [HUGE] * 3})
+        ),
+        "a count of 5 over a tree of 9": refuse(set_json("count", value=5), "the tree has 9"),
+        "a file number beyond the list": refuse(set_json(*lods, "0", "file", value=2), "file"),
         "an offset of true": refuse(set_json(*lods, "0", "offset", value=True), "offset"),
-        "a gap": refuse(set_json(*lods, "0", "offset", value=1), "runs of file 0"),
-        "a level in words": refuse(set_json(*lods, "finest", value={}), "finest"),
-        "a chunk of two levels": refuse(set_json(*lods, "1", "file", value=0), "two levels"),
-        "a chunk above": refuse(add_name("../lod-meta.json"), "../lod-meta.json"),
-        "a chunk above, as Windows has it": refuse(add_name("..\\meta.json")),
-        "a chunk of another name": refuse(add_name("0_0/other.json"), "0_0/other.json"),
-        "an environment above": refuse(set_json("environment", value="../meta.json"), "../meta.json"),
-        "a chunk by a link out": refuse(link_out, "link"),
-        "a chunk by two names": refuse(name_twice, "link"),
+        "a gap in a chunk's rows": refuse(set_json(*lods, "0", "offset", value=1), "runs of file 0"),
+        "a level named by a word": refuse(set_json(*lods, "finest", value={}), "finest"),
+        "one chunk in two levels": refuse(set_json(*lods, "1", "file", value=0), "two levels"),
+        "a chunk in the folder above": refuse(add_name("../lod-meta.json"), "../lod-meta.json"),
+        "a chunk in the folder above, as Windows writes it": refuse(add_name("..\\meta.json")),
+        "a chunk not named meta.json": refuse(add_name("0_0/other.json"), "0_0/other.json"),
+        "an environment in the folder above": refuse(set_json("environment", value="../meta.json"), "../meta.json"),
+        "a chunk behind a link out of the folder": refuse(link_out, "link"),
+        "one chunk by two names": refuse(name_twice, "link"),
         "a chunk missing": refuse(lambda path: shutil.rmtree(path.parent / "0_0"), place=chunk),
         "a texture missing": refuse(change_beside("0_0/quats.webp", Path.unlink), place="quats.webp"),
         "a texture of 16 million pixels": refuse(
@@ -181,26 +193,26 @@ def of_levels() -> dict[str, Damage]:
             "4096 x 4096",
             place=chunk,
         ),
-        "fewer rows than its chunk": refuse(edit_json(count_fewer), 5, 6, place=chunk),
-        "a texture from outside": refuse(
+        "fewer rows than the chunk has": refuse(edit_json(count_fewer), 5, 6, place=chunk),
+        "a texture outside the folder": refuse(
             change_beside(chunk, set_json("quats", "files", value=["../../etc/passwd"])),
             "../../etc/passwd",
             place=chunk,
         ),
         "a chunk's count of 10^15": refuse(change_beside(chunk, set_json("count", value=10**15)), "MB", place=chunk),
         "a chunk of version 1": refuse(change_beside(chunk, drop_json("version")), "version 2", 1, place=chunk),
-        "a chunk that is cut": refuse(change_beside("0_0/means_l.webp", cut(0.5)), "means_l.webp", place=chunk),
-        "chunks of equal Gaussians": accept(write_chunks(chunks=2)),
-        "many chunks of equal Gaussians": refuse(write_chunks(180_000, 4, 3), slow=True),
-        "100,000 names": accept(
+        "a chunk's texture cut off halfway": refuse(
+            change_beside("0_0/means_l.webp", cut(0.5)), "means_l.webp", place=chunk
+        ),
+        "two chunks of equal Gaussians": accept(write_chunks(chunks=2)),
+        "four chunks of 180,000 equal Gaussians": refuse(write_chunks(180_000, 4, 3), slow=True),
+        "100,000 names of chunks": accept(
             write_chunks(filenames=[f"{number}/meta.json" for number in range(100_000)]), slow=True
         ),
-        "a deep tree": accept(edit_json(deepen)),
-        "no version": accept(edit_json(forget)),
-        "no more than an empty list": refuse(
-            lambda path: write_file(path, '{"version": 1, "filenames": [], "lodLevels": 1}')
-        ),
+        "a tree 300 nodes deep": accept(edit_json(deepen)),
+        "no version and no counts": accept(edit_json(forget)),
+        "no chunks": refuse(lambda path: write_file(path, '{"version": 1, "filenames": [], "lodLevels": 1}')),
     }
 
 
-DAMAGES = {"sog": of_sog(), "levels": of_levels()}
+DAMAGES = {"sog": of_sog(), "Streamed SOG": of_levels()}

@@ -239,10 +239,10 @@ def write_ply_as(kind: str) -> Make:
         values = np.frombuffer(rows, "<f4")
         text = "".join(" ".join(f"{v:.3f}" for v in row) + "\n" for row in values.reshape(len(SOME), -1)).encode()
         forms = {
-            "big": head.replace(b"little", b"big") + b"end_header\n" + values.astype(">f4").tobytes(),
-            "text": head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + text,
-            "faces": head + FACES + b"end_header\n" + rows + b"\1\0\0\0\0\2\0\0\0\0\1\0\0\0",
-            "faces first": head.replace(b"element vertex", FACES + b"element vertex") + b"end_header\n\0\0" + rows,
+            "in big-endian order": head.replace(b"little", b"big") + b"end_header\n" + values.astype(">f4").tobytes(),
+            "as text": head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + text,
+            "with faces": head + FACES + b"end_header\n" + rows + b"\1\0\0\0\0\2\0\0\0\0\1\0\0\0",
+            "with faces first": head.replace(b"element vertex", FACES + b"element vertex") + b"end_header\n\0\0" + rows,
         }
         path.write_bytes(forms[kind])
 
@@ -287,14 +287,6 @@ def long_lrm(c2w: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> dict[str,
     return {"frames": [{"file_path": name, "w2c": pose.tolist(), **common} for name, pose in poses]}
 
 
-def write_long_lrm(folder: Path) -> None:
-    save_json(folder / "cameras.json", long_lrm(TINY.c2w, TINY.K, (TINY.width, TINY.height)))
-
-
-def write_world_mirror(folder: Path) -> None:
-    save_json(folder / "camera_params.json", world_mirror(TINY.c2w, TINY.K))
-
-
 def frames() -> list[dict[str, Any]]:
     lens = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 8, "w": 24, "h": 16, "k1": 0.1, "camera_model": "OPENCV"}
     return [{"file_path": f"{i}.png", "transform_matrix": m.tolist(), **lens} for i, m in enumerate(TINY.c2w)]
@@ -303,10 +295,6 @@ def frames() -> list[dict[str, Any]]:
 def write_frames(folder: Path) -> None:
     """Write frames with a lens each."""
     save_json(folder / "transforms.json", {"frames": frames(), "applied_transform": np.eye(4)[:3].tolist()})
-
-
-def write_bare_frames(folder: Path) -> None:
-    save_json(folder / "transforms.json", frames())
 
 
 def write_blender(folder: Path) -> None:
@@ -365,8 +353,8 @@ def write_vggt(folder: Path) -> None:
 
 def write_photo(ending: str, kind: str = "") -> Make:
     picture = np.arange(5 * 7 * 3, dtype=np.uint8).reshape(5, 7, 3)
-    kinds = {"": picture, "grey": picture[..., 0], "16 bits": picture.astype(np.uint16) * 257}
-    kinds["alpha"] = np.dstack([picture, picture[..., 0]])
+    kinds = {"": picture, "in grey": picture[..., 0], "of 16 bits": picture.astype(np.uint16) * 257}
+    kinds["with alpha"] = np.dstack([picture, picture[..., 0]])
     return lambda folder: (folder / "a.png").write_bytes(cv2.imencode(f".{ending}", kinds[kind])[1].tobytes())
 
 
@@ -398,29 +386,35 @@ SOUNDS: dict[str, Sound] = {
     "scene": Sound("", PLAIN_SCENE, load_scene, fuzzed=False),
     "photos": Sound(f"images/{NAMES[0]}", lambda folder: None, check_photo, scene=PLAIN_SCENE, fuzzed=False),
     # Gaussians
-    "rows": Sound("scene.ply", lambda folder: gsmerge.write_ply(folder / "scene.ply", TINY.gaussians, overwrite=True),
-                  check_gaussians, scene=PLAIN_SCENE),
+    "scene.ply": Sound("scene.ply",
+                       lambda folder: gsmerge.write_ply(folder / "scene.ply", TINY.gaussians, overwrite=True),
+                       check_gaussians, scene=PLAIN_SCENE),
     "ply": Sound("a.ply", write_some("a.ply"), check_gaussians),
-    **{f"ply, {kind}": Sound("a.ply", write_ply_as(kind), check_gaussians, rare=True)
-       for kind in ("big", "text", "faces", "faces first")},
+    **{f"ply {kind}": Sound("a.ply", write_ply_as(kind), check_gaussians, rare=True)
+       for kind in ("in big-endian order", "as text", "with faces", "with faces first")},
     "compressed ply": Sound("a.compressed.ply", written_by(compressed_bytes, "a.compressed.ply"), check_gaussians),
     "spz": Sound("a.spz", write_some("a.spz"), check_gaussians),
-    "spz 4": Sound("a.spz", written_by(spz4_bytes, "a.spz"), check_gaussians),
+    "spz of version 4": Sound("a.spz", written_by(spz4_bytes, "a.spz"), check_gaussians),
     "sog": Sound("a.sog", write_some("a.sog"), check_gaussians),
     "splat": Sound("a.splat", write_some("a.splat"), check_gaussians),
     "glb": Sound("a.glb", write_some("a.glb"), check_gaussians),
     "tile": Sound("tileset.glb", write_tile, check_gaussians),
     "tileset": Sound("tileset.json", write_tile, check_gaussians, packed=True),
-    "levels": Sound("lod-meta.json", write_levels, check_gaussians, packed=True),
-    "levels of a tree": Sound("lod-meta.json", partial(write_levels, leaves=2), check_gaussians, rare=True,
+    "Streamed SOG": Sound("lod-meta.json", write_levels, check_gaussians, packed=True),
+    "Streamed SOG of a tree": Sound("lod-meta.json", partial(write_levels, leaves=2), check_gaussians, rare=True,
                               packed=True),
     # Cameras beside the rows and photos of their scene
-    "transforms": Sound("transforms.json", lambda folder: write_transforms(folder / "transforms.json", TINY),
+    "transforms.json": Sound("transforms.json", lambda folder: write_transforms(folder / "transforms.json", TINY),
                         check_cameras, scene=OF_CAMERAS),
     "INRIA": Sound("cameras.json", lambda folder: write_inria(folder / "cameras.json", TINY), check_cameras,
                    scene=OF_CAMERAS),
-    "Long-LRM": Sound("cameras.json", write_long_lrm, check_cameras, scene=OF_CAMERAS),
-    "WorldMirror": Sound("camera_params.json", write_world_mirror, check_cameras, scene=OF_CAMERAS),
+    "Long-LRM": Sound(
+        "cameras.json",
+        lambda folder: save_json(folder / "cameras.json", long_lrm(TINY.c2w, TINY.K, (TINY.width, TINY.height))),
+        check_cameras, scene=OF_CAMERAS),
+    "WorldMirror": Sound("camera_params.json",
+                         lambda folder: save_json(folder / "camera_params.json", world_mirror(TINY.c2w, TINY.K)),
+                         check_cameras, scene=OF_CAMERAS),
     "COLMAP text": Sound("sparse/images.txt", lambda folder: write_colmap_text(folder / "sparse", TINY),
                          check_colmap, scene=OF_CAMERAS, named="sparse", packed=True),
     "COLMAP binary": Sound("sparse/images.bin", lambda folder: write_colmap_binary(folder / "sparse", TINY),
@@ -430,8 +424,9 @@ SOUNDS: dict[str, Sound] = {
     "results.npz": Sound("results.npz", lambda folder: write_npz(folder / "results.npz", TINY), check_arrays,
                          scene=OF_CAMERAS),
     # Cameras alone
-    "frames": Sound("transforms.json", write_frames, check_cameras, INSPECT, rare=True),
-    "bare frames": Sound("transforms.json", write_bare_frames, check_cameras, INSPECT, rare=True),
+    "frames with a lens each": Sound("transforms.json", write_frames, check_cameras, INSPECT, rare=True),
+    "a list of frames": Sound("transforms.json", lambda folder: save_json(folder / "transforms.json", frames()),
+                              check_cameras, INSPECT, rare=True),
     "Blender": Sound("transforms.json", write_blender, check_cameras, INSPECT, rare=True),
     "GlobalSplat": Sound("cameras.json", FORMATS["GlobalSplat cameras.json"].write, check_cameras, INSPECT),
     "OpenSfM": Sound("reconstruction.json", FORMATS["OpenSfM"].write, check_cameras, INSPECT),
@@ -439,7 +434,7 @@ SOUNDS: dict[str, Sound] = {
     "Metashape moved": Sound("cameras.xml", write_metashape_moved, check_metashape, INSPECT, rare=True),
     "Polycam": Sound("keyframes/corrected_cameras", FORMATS["Polycam"].write, check_cameras, (), packed=True),
     "predictions.npz": Sound("predictions.npz", write_vggt, check_arrays, INSPECT),
-    "moved Long-LRM": Sound("opencv_cameras.json", write_moved, check_cameras, INSPECT, packed=True, rare=True),
+    "Long-LRM moved": Sound("opencv_cameras.json", write_moved, check_cameras, INSPECT, packed=True, rare=True),
     "dataparser": Sound("transforms.json", write_dataparser, lambda path: read_dataparser(path, path), (), packed=True),
     "SHARP": Sound("a.ply", write_sharp, read_sharp_camera, ()),
     # States and networks
@@ -451,10 +446,10 @@ SOUNDS: dict[str, Sound] = {
                         INSPECT),
     # Photos and lists, which only their readers read
     **{f"photo.{ending}": Sound("a.png", write_photo(ending), check_photo, ()) for ending in PHOTO_ENDINGS},
-    **{f"photo of {kind}": Sound("a.png", write_photo("png", kind), check_photo, (), rare=True)
-       for kind in ("grey", "alpha", "16 bits")},
+    **{f"photo {kind}": Sound("a.png", write_photo("png", kind), check_photo, (), rare=True)
+       for kind in ("in grey", "with alpha", "of 16 bits")},
     **{f"mask.{ending}": Sound("a.png", write_photo(ending), check_mask, (), rare=True) for ending in PHOTO_ENDINGS},
-    "mask of alpha": Sound("a.png", write_photo("png", "alpha"), check_mask, (), rare=True),
-    "list": Sound("list.txt", write_text("list.txt", "a.ply\n# b\nscene c\n\nd.spz\n"), check_list, ()),
-    "set": Sound("pairs.txt", write_text("pairs.txt", PAIRS), check_pairs, ()),
+    "mask in alpha": Sound("a.png", write_photo("png", "with alpha"), check_mask, (), rare=True),
+    "list of scenes": Sound("list.txt", write_text("list.txt", "a.ply\n# b\nscene c\n\nd.spz\n"), check_list, ()),
+    "values of --set": Sound("pairs.txt", write_text("pairs.txt", PAIRS), check_pairs, ()),
 }  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from safetensors.numpy import load_file, save_file
 from gsmerge.io.formats import gsm
 
 from .case import Change, Damage, refuse
-from .changes import edit_bytes, fill_with_zeros, pack_at, pack_members, write_file
+from .changes import edit_bytes, fill_with_zeros, pack_at, pack_members, write
 
 RESULTS = ("means", "quats", "scales", "opacities", "sh0", "shN", "viewmats", "Ks")
 FEATURES = ("merged.means", "refined.latents", "views", "group", "samples.means", "saliency", "origin")
@@ -120,16 +119,16 @@ def of_any() -> dict[str, Damage]:
     """What is wrong with any file."""
     metadata = ([1, "a"], "text", 7, True, {"gsmerge": 1}, {"gsmerge": ["a"]}, {"gsmerge": {"a": "b"}})
     return {
-        "a byte too many": refuse(edit_bytes(lambda data: data + b"x")),
-        "all but the end": refuse(edit_bytes(lambda data: data[:-1])),
-        "a huge header": refuse(pack_at(0, "8s", b"\xff" * 8)),
-        "1 TB of zeros": refuse(fill_with_zeros(2**40), "header"),
-        "1 TB of zeros behind a header": refuse(fill_with_zeros(2**40, (2).to_bytes(8, "little") + b"{}")),
-        "1 TB of zeros behind it": refuse(fill_with_zeros(2**40, None)),
+        "a byte more at the end": refuse(edit_bytes(lambda data: data + b"x")),
+        "the last byte cut off": refuse(edit_bytes(lambda data: data[:-1])),
+        "a header that claims 2^64 bytes": refuse(pack_at(0, "8s", b"\xff" * 8)),
+        "1 TB of zeros in its place": refuse(fill_with_zeros(2**40), "header"),
+        "1 TB of zeros after an empty header": refuse(fill_with_zeros(2**40, (2).to_bytes(8, "little") + b"{}")),
+        "1 TB of zeros at the end": refuse(fill_with_zeros(2**40, None)),
         "no header": refuse(lambda path: save_file(load_file(path), path)),
-        "a header of no JSON": refuse(write_header("{")),
-        "a header of a list": refuse(write_header("[]")),
-        "a header of brackets": refuse(write_header("[" * 100_000)),
+        "a header that is no JSON": refuse(write_header("{")),
+        "a header that is a list": refuse(write_header("[]")),
+        "a header of 100,000 open brackets": refuse(write_header("[" * 100_000)),
         **{f"metadata as {json.dumps(value)}": refuse(set_metadata(value)) for value in metadata},
     }
 
@@ -138,76 +137,73 @@ def of_each(arrays: Iterable[str], floats: Iterable[str]) -> dict[str, Damage]:
     """Each array missing, of another type and of another shape; those of numbers with a NaN."""
     damages: dict[str, Damage] = {}
     for name in arrays:
-        damages[f"no {name}"] = refuse(drop_array(name), name)
-        damages[f"{name} of another type"] = refuse(
+        damages[f"no array {name}"] = refuse(drop_array(name), name)
+        damages[f"array {name} of another type"] = refuse(
             edit_array(name, lambda a: a.astype(np.float32 if a.dtype == np.float64 else np.float64)), name
         )
-        damages[f"{name} of another shape"] = refuse(edit_array(name, lambda a: a[None]), name)
+        damages[f"array {name} of another shape"] = refuse(edit_array(name, lambda a: a[None]), name)
     return damages | {f"NaN in {name}": refuse(fill(name, float("nan")), name) for name in floats}
 
 
 def of_results() -> dict[str, Damage]:
     headers = {
-        "networks": write_header("{}", "gsmerge-networks"),
-        **{f"no {name}": drop_entry(name) for name in ("schema", "kind", "width", "names")},
-        "an older schema": set_header(schema=0),
-        "another kind": set_header(kind="mood"),
+        "the header of a file of networks": write_header("{}", "gsmerge-networks"),
+        **{f"a header without {name}": drop_entry(name) for name in ("schema", "kind", "width", "names")},
+        "schema 0": set_header(schema=0),
+        "an unknown kind": set_header(kind="mood"),
         "views without pixels": set_header(width=0),
         "views of 65536 x 65536": set_header(width=65536, height=65536),
         "a width of true": set_header(width=True),
-        "about in a list": set_header(about=[]),
-        "a name less": set_header(names=["a"]),
-        "names by number": set_header(names=[1, 2]),
+        "about as a list": set_header(about=[]),
+        "one name for several views": set_header(names=["a"]),
+        "names that are numbers": set_header(names=[1, 2]),
     }
     arrays = {
-        "no images": drop_array("images"),
-        "images of another size": edit_array("images", lambda a: a[:, 1:]),
-        "an image less": edit_array("images", lambda a: a[1:]),
+        "no array images": drop_array("images"),
+        "images of fewer rows than the header says": edit_array("images", lambda a: a[:, 1:]),
+        "one image fewer than views": edit_array("images", lambda a: a[1:]),
         "harmonics of degree 5": edit_array("shN", lambda a: np.zeros((len(a), 35, 3), np.float32)),
-        "no Gaussian is finite": edit_array("means", lambda a: a * np.float32(np.nan)),
+        "NaN in all positions": edit_array("means", lambda a: a * np.float32(np.nan)),
         "intrinsics of zeros": edit_array("Ks", np.zeros_like),
-        "views of zeros": edit_array("viewmats", np.zeros_like),
-        "views of 1e300": fill("viewmats", 1e300),
+        "poses of zeros": edit_array("viewmats", np.zeros_like),
+        "a pose of 1e300": fill("viewmats", 1e300),
     }
     return {
         **{name: refuse(change) for name, change in (headers | arrays).items()},
         **of_each(RESULTS, ("viewmats", "Ks")),
-        "the schema before": refuse(set_header(schema=2), "run extend again"),
-        "a schema to come": refuse(set_header(schema=9, gsmerge="9.9"), "update gsmerge"),
-        "three million objects": refuse(set_about(notes=[[]] * 3_000_000), slow=True),
-        "a changed sign": refuse(negate("sh0"), "expected the checksum", place="a.gsm: sh0"),
+        "schema 2, of the version before": refuse(set_header(schema=2), "run extend again"),
+        "schema 9, of a version to come": refuse(set_header(schema=9, gsmerge="9.9"), "update gsmerge"),
+        "three million lists in the header": refuse(set_about(notes=[[]] * 3_000_000), slow=True),
+        "signs of sh0 changed after it was written": refuse(negate("sh0"), "expected the checksum", place="a.gsm: sh0"),
     }
 
 
 def of_features() -> dict[str, Damage]:
     changes = {
-        "no networks": drop_entry("networks"),
+        "a header without networks": drop_entry("networks"),
         "networks of another size": set_header(networks={"width": 32, "heads": 2, "latent": 4}),
         "a unit of zero": set_header(unit=0.0),
-        "no unit": drop_entry("unit"),
-        "views beyond": fill("views", 99),
-        "merged views beyond": fill("merged.views", -2),
+        "a header without unit": drop_entry("unit"),
+        "view numbers beyond the views": fill("views", 99),
+        "merged view numbers below -1": fill("merged.views", -2),
         "groups of no members": edit_array("num_members", np.zeros_like),
         "samples without pixels": edit_array("samples.opacities", lambda a: a[:, :0]),
-        "means of 3e38": fill("merged.means", 3e38),
+        "a merged mean of 3e38": fill("merged.means", 3e38),
     }
     return {
         **{name: refuse(change) for name, change in changes.items()},
         **of_each(FEATURES, ("merged.means", "refined.latents", "group", "saliency", "origin")),
-        "a changed sign": refuse(negate("merged.sh0"), "expected the checksum", place="a.gsm: merged.sh0"),
+        "signs of merged.sh0 changed after it was written": refuse(
+            negate("merged.sh0"), "expected the checksum", place="a.gsm: merged.sh0"
+        ),
     }
-
-
-def write_torch_file(path: Path) -> None:
-    """As torch saves its files."""
-    write_file(path, pack_members({"archive/data.pkl": pickle.dumps({"a": 1})}, zipfile.ZIP_STORED))
 
 
 def of_checkpoint() -> dict[str, Damage]:
     changes = {
-        "a torch file": write_torch_file,
-        "another program's": write_header("{}", "networks"),
-        "another schema": set_header(schema=1),
+        "a file of torch in its place": write(pack_members({"archive/data.pkl": pickle.dumps({"a": 1})})),
+        "a header of another program": write_header("{}", "networks"),
+        "schema 1": set_header(schema=1),
         "no version": set_header(gsmerge=None),
         "no options": set_header(options=None),
         "unknown options": set_header(options={"depth": 3}),
@@ -216,25 +212,20 @@ def of_checkpoint() -> dict[str, Damage]:
         "bounds that bound nothing": set_header(options={"bounds": {"mean": 1e9}}),
         "bounds that are no table": set_header(options={"bounds": 3}),
         "unknown bounds": set_header(options={"bounds": {"far": 1.0}}),
-        "other sizes": set_header(options={"width": 64}),
+        "sizes other than those of the weights": set_header(options={"width": 64}),
         "training that is no table": set_header(training=3),
         "a tensor too many": edit_arrays(lambda arrays: arrays.update(more=np.ones(1, np.float32))),
-        "infinity": fill(WEIGHT, float("inf")),
+        "infinity in a weight": fill(WEIGHT, float("inf")),
     }
     damages = of_any() | of_each([WEIGHT], [WEIGHT]) | {name: refuse(change) for name, change in changes.items()}
     return {name: refuse(d.change, *(d.says or ("expected",)), slow=d.slow) for name, d in damages.items()}
 
 
-def of_batches() -> dict[str, Damage]:
-    """What ``extend`` alone reads."""
-    return {
-        "batches by number": refuse(set_about(batches=5), "batches"),
-        "batches of numbers": refuse(set_about(batches=[5]), "batches"),
-    }
-
-
 DAMAGES = {
-    "gsm to extend": of_batches(),
+    "gsm to extend": {  # what ``extend`` alone reads
+        "a number instead of batches": refuse(set_about(batches=5), "batches"),
+        "numbers instead of the batches": refuse(set_about(batches=[5]), "batches"),
+    },
     "gsm": of_any() | of_results(),
     "gsm of features": of_features(),
     "checkpoint": of_checkpoint(),

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
-from batches import FAST, NAMES, InlinePool, finish, results
+from batches import FAST, NAMES, finish, results
 from forked_commands import CommandServer
 from messages import ERROR, says
-from shared import make_once
+from shared import make_once, write_made, write_scene, write_small, write_smallest
 
 from gsmerge.cli import main
-
-CHART_TARGETS = ("--targets", "{parent}/targets/transforms.json")
-CHART_FAST = ("--grid", "budget=1%,2%", "--set", "fit=none", "--set", "lpips=none")
 
 
 @dataclass(frozen=True)
@@ -34,56 +29,40 @@ Run = Callable[..., Outcome]
 
 
 @pytest.fixture(scope="session")
-def smallest_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three views of 24 x 16 with cameras and images. Read only."""
-    folder = make_scene(tmp_path_factory.mktemp("smallest") / "scene", num_views=3, width=24, height=16)
-    shutil.rmtree(folder / "targets")
-    return folder
+def smallest_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene of :func:`shared.write_smallest`. Read only."""
+    return write_smallest(tmp_path_factory.mktemp("smallest") / "scene")
 
 
 @pytest.fixture
-def small_copy(small_scene: Path, tmp_path: Path) -> Path:
-    """A copy of the small scene that a test may change."""
-    return Path(shutil.copytree(small_scene, tmp_path / "scene"))
+def small_copy(tmp_path: Path) -> Path:
+    """A small scene that a test may change."""
+    return write_small(tmp_path / "scene")
 
 
 @pytest.fixture
-def smallest_copy(smallest_scene: Path, tmp_path: Path) -> Path:
-    """A copy of the smallest scene that a test may change."""
-    return Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
+def smallest_copy(tmp_path: Path) -> Path:
+    """A smallest scene that a test may change."""
+    return write_smallest(tmp_path / "scene")
 
 
 @pytest.fixture(scope="session")
-def compacted_scene(made_scene: Path, shared: Path) -> Path:
+def compacted_scene() -> Path:
     """``small.ply``, which the defaults make of the made scene, and the report ``run.json``. Read only."""
 
     def make(place: Path) -> None:
         place.mkdir()
-        words = ("compact", made_scene, "-o", place / "small.ply", "--json")
+        words = ("compact", make_once("made", write_made), "-o", place / "small.ply", "--json")
         with open(place / "run.json", "w", encoding="utf-8") as report, redirect_stdout(report):
             assert main([str(word) for word in words]) == 0
 
-    return make_once(shared / "compacted", make)
+    return make_once("compacted", make)
 
 
 @pytest.fixture(scope="session")
-def charted_scene(make_scene: Callable[..., Path], shared: Path) -> Path:
-    """A scene ``room``, and ``out`` with the charts of two merges, seconds of drawing. Read only."""
-
-    def make(place: Path) -> None:
-        scene = make_scene(place / "room", num_views=3, width=64, height=48)
-        words = ("lab", "chart", scene, "-o", place / "out", *CHART_TARGETS, *CHART_FAST, "-q")
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
-            assert main([str(word) for word in words]) == 0
-
-    return make_once(shared / "charted", make)
-
-
-@pytest.fixture(scope="session")
-def server(smallest_scene: Path) -> Iterator[CommandServer]:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CommandServer]:
     """A process that has imported what the commands need, which takes it two seconds."""
-    with CommandServer([("inspect", smallest_scene)]) as server:
+    with CommandServer([("inspect", write_smallest(tmp_path_factory.mktemp("server") / "scene"))]) as server:
         yield server
 
 
@@ -101,20 +80,23 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return call
 
 
-@pytest.fixture(scope="session")
-def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four folders with small scenes. Read only."""
-    folder = tmp_path_factory.mktemp("batch") / "rooms"
-    for name in NAMES:
-        make_scene(folder / Path(name).stem, num_views=3, width=96, height=64, seed=NAMES.index(name))
-    return folder
+def write_rooms(folder: Path) -> None:
+    """Write four folders with small scenes."""
+    for i, name in enumerate(NAMES):
+        write_scene(folder / Path(name).stem, num_views=3, width=96, height=64, seed=i)
 
 
 @pytest.fixture(scope="session")
-def undisturbed(rooms: Path) -> dict[str, str]:
-    """What a batch that nothing happens to makes of them."""
-    out = rooms.parent / "undisturbed"
-    assert finish(rooms, "--output", out, *FAST, "--jobs", 2, "-q") == 0
+def rooms() -> Path:
+    """The folder of :func:`write_rooms`. Read only."""
+    return make_once("four-rooms", write_rooms)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What a batch that nothing happens to makes of the four rooms."""
+    out = tmp_path_factory.mktemp("batch") / "undisturbed"
+    assert finish(make_once("four-rooms", write_rooms), "--output", out, *FAST, "--jobs", 2, "-q") == 0
     assert sorted(results(out)) == NAMES
     return results(out)
 

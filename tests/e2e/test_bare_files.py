@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import unaligned_scenes
 from messages import noted
+from shared import write_smallest
 from sweeps import sweep
 
 import gsmerge
@@ -18,10 +19,12 @@ PLACED = ("no cameras", "--cameras", "--images", "cannot be better than its inpu
 
 
 @pytest.fixture(scope="module")
-def bare(smallest_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file alone in its folder. Read only."""
-    path = tmp_path_factory.mktemp("bare") / "scene.ply"
-    gsmerge.write_ply(path, unaligned_scenes.voxels(gsmerge.read_scene(smallest_scene), 0.05).gaussians)
+    folder = tmp_path_factory.mktemp("bare")
+    scene = gsmerge.read_scene(write_smallest(folder / "made"))
+    path = folder / "alone" / "scene.ply"
+    gsmerge.write_ply(path, unaligned_scenes.voxels(scene, 0.05).gaussians)
     return path
 
 

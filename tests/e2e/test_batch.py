@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from batches import FAST, InlinePool, records, results, statuses
 from messages import names
+from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.batch.records import record
@@ -26,15 +27,18 @@ REPORT: dict[str, Any] = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two folders with small scenes, and one with a damaged one. Read only."""
-    folder = tmp_path_factory.mktemp("batch") / "rooms"
+def write_rooms(folder: Path) -> None:
+    """Write two folders with small scenes, and one with a damaged one."""
     for number in range(2):
-        make_scene(folder / f"room{number}", num_views=3, width=24, height=16, seed=number)
+        write_scene(folder / f"room{number}", num_views=3, width=24, height=16, seed=number)
     bad = Path(shutil.copytree(folder / "room0", folder / "bad"))
     (bad / "scene.ply").write_bytes((bad / "scene.ply").read_bytes()[:3000])
-    return folder
+
+
+@pytest.fixture(scope="module")
+def rooms() -> Path:
+    """The folder of :func:`write_rooms`. Read only."""
+    return make_once("bad-room", write_rooms)
 
 
 def batch(run: Run, rooms: Path, out: Path, *options: object) -> Outcome:
@@ -49,22 +53,19 @@ def _in_this_process() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def first(rooms: Path) -> tuple[int, Path]:
-    """Exit code and folder of a run over all three. Read only."""
-    out = rooms.parent / "out"
-    return main(["batch", str(rooms), "--output", str(out), *FAST, "-q", "--jobs", "2"]), out
+def compact_rooms(out: Path) -> None:
+    """Run a batch over all three rooms, one of which fails."""
+    rooms = make_once("bad-room", write_rooms)
+    assert main(["batch", str(rooms), "--output", str(out), *FAST, "-q", "--jobs", "2"]) == 5
 
 
 @pytest.fixture
-def out(first: tuple[int, Path], tmp_path: Path) -> Path:
-    """A copy of that folder."""
-    return Path(shutil.copytree(first[1], tmp_path / "out"))
+def out(tmp_path: Path) -> Path:
+    """A copy of what :func:`compact_rooms` leaves behind."""
+    return Path(shutil.copytree(make_once("bad-room-out", compact_rooms), tmp_path / "out"))
 
 
-def test_one_bad_scene_stops_no_other(first: tuple[int, Path], rooms: Path, run: Run, tmp_path: Path) -> None:
-    code, out = first
-    assert code == 5
+def test_one_bad_scene_stops_no_other(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
     names = [f"room{number}.ply" for number in range(2)]
     assert sorted(results(out)) == names
     assert statuses(out) == {"bad.ply": ["failed"], **{name: ["done"] for name in names}}
@@ -108,13 +109,18 @@ def test_a_mended_scene_is_done_and_json_is_a_line_each(rooms: Path, out: Path, 
     assert [actual.count("done") for actual in statuses(out).values()] == [2] * 3
 
 
-def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path, run: Run) -> None:
+def test_a_dry_run_tells_what_is_left(rooms: Path, out: Path, run: Run) -> None:
     before = listing(out)
     outcome = batch(run, rooms, out, "--dry-run")
     assert outcome.code == 0
     assert f"{rooms / 'bad'} -> {out / 'bad.ply'}" in outcome.out
     assert "note: " not in outcome.out
     assert "1 of 3 scenes" in outcome.out
+    assert listing(out) == before
+
+
+def test_a_dry_run_tells_what_the_run_would_refuse(rooms: Path, out: Path, run: Run) -> None:
+    before = listing(out)
     refused = batch(run, rooms, out, "--dry-run", "--json", "--seed", 1, "--jobs", 3)
     assert refused.code == 5
     assert names(refused.err, "2 of 3 scenes", "in the run")
@@ -123,9 +129,11 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path,
     assert [scene["num_gaussians"] for scene in plan["scenes"]] == [0, 3 * 24 * 16, 3 * 24 * 16]  # one is cut
     assert ["settings" in str(scene["error"]) for scene in plan["scenes"]] == [False, True, True]
     assert listing(out) == before
-    new = batch(run, rooms, out.parent / "new", "--dry-run")
-    assert "3 of 3 scenes" in new.out
-    assert not (out.parent / "new").exists()
+
+
+def test_a_dry_run_makes_no_folder(rooms: Path, tmp_path: Path, run: Run) -> None:
+    assert "3 of 3 scenes" in batch(run, rooms, tmp_path / "new", "--dry-run").out
+    assert not (tmp_path / "new").exists()
 
 
 def test_scenes_of_one_name_fail_and_no_other(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:

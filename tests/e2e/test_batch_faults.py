@@ -8,12 +8,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from batches import FAST, NAMES, PATIENCE, finish, holders, records, results, start, statuses, until
 from messages import names
+from shared import write_scene
 
 from .conftest import Run
 
@@ -50,11 +50,11 @@ def test_a_killed_run_goes_on_where_it_was(rooms: Path, tmp_path: Path, undistur
 
 
 @pytest.mark.slow
-def test_a_killed_process_costs_its_scene_alone(make_scene: Callable[..., Path], tmp_path: Path, run: Run) -> None:
+def test_a_killed_process_costs_its_scene_alone(tmp_path: Path, run: Run) -> None:
     """Two processes are started, each of which imports the package."""
     rooms, out = tmp_path / "rooms", tmp_path / "out"
     for number in range(2):
-        make_scene(rooms / f"room{number}", num_views=3, width=24, height=16, seed=number)
+        write_scene(rooms / f"room{number}", num_views=3, width=24, height=16, seed=number)
 
     def kill() -> None:
         while not (workers := holders(out)):

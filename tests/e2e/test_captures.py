@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scripts import load_script
+from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.scene.read import load_scene
@@ -19,30 +19,27 @@ from gsmerge.scene.read import load_scene
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def script() -> Iterator[Callable[[str], ModuleType]]:
+@pytest.fixture(scope="module", autouse=True)
+def _small_captures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "benchmarks"))
-        patch.setattr(load_script(ROOT / "benchmarks" / "make_capture.py"), "SIDE", 128)
-        yield lambda name: load_script(ROOT / "benchmarks" / f"{name}.py")
+        patch.setattr(script("make_capture"), "SIDE", 128)
+        yield
+
+
+def script(name: str) -> ModuleType:
+    return load_script(ROOT / "benchmarks" / f"{name}.py")
+
+
+def make(place: Path) -> None:
+    """Write a scene, and the capture that is made of it."""
+    made = write_scene(place / "made", num_views=5, width=144, height=96)
+    script("make_capture").make_capture(made, place / "scenes" / "eval" / "made", flat, 3)
 
 
 @pytest.fixture(scope="module")
-def made(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_scene(tmp_path_factory.mktemp("photos") / "made", num_views=5, width=144, height=96)
-
-
-@pytest.fixture(scope="module")
-def capture(script: Callable[[str], ModuleType], made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("capture") / "scenes" / "eval" / "made"
-    script("make_capture").make_capture(made, out, flat, 3)
-    return out
-
-
-@pytest.fixture
-def photos(made: Path, tmp_path: Path) -> Path:
-    """A copy that may be changed."""
-    return Path(shutil.copytree(made, tmp_path / "made"))
+def capture() -> Path:
+    return make_once("capture", make) / "scenes" / "eval" / "made"
 
 
 def flat(views: list[Any], near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
@@ -51,7 +48,7 @@ def flat(views: list[Any], near: float, far: float) -> tuple[np.ndarray, np.ndar
     return np.full(shape, (near * far) ** 0.5), np.full(shape, 0.75)
 
 
-def test_views_are_spread_and_held_out_ones_midway(script: Callable[[str], ModuleType]) -> None:
+def test_views_are_spread_and_held_out_ones_midway() -> None:
     inputs, held_out = script("make_capture").pick_views(50, 12)
     assert inputs == [0, 4, 9, 13, 18, 22, 27, 31, 36, 40, 45, 49]  # of the capture fox
     assert held_out == [2, 6, 11, 15, 20, 24, 29, 33, 38, 42, 47]
@@ -60,9 +57,7 @@ def test_views_are_spread_and_held_out_ones_midway(script: Callable[[str], Modul
 
 
 @pytest.mark.slow
-def test_a_capture_is_read_by_its_export(
-    script: Callable[[str], ModuleType], made: Path, capture: Path, tmp_path: Path
-) -> None:
+def test_a_capture_is_read_by_its_export(capture: Path, tmp_path: Path) -> None:
     document = json.loads((capture / "transforms.json").read_text())
     roles = [frame["role"] for frame in document["frames"]]
     assert roles == ["context", "target", "context", "target", "context"]
@@ -70,7 +65,7 @@ def test_a_capture_is_read_by_its_export(
 
     views = script("captures").read_context(capture)
     assert [view["name"] for view in views] == ["00000.jpg", "00002.jpg", "00004.jpg"]
-    own = gsmerge.read_scene(made)
+    own = gsmerge.read_scene(make_once("capture", make) / "made")
     frames = [frame for frame in document["frames"] if frame["role"] == "context"]
     for view, frame in zip(views, frames, strict=True):
         w2c = np.linalg.inv(view["c2w"])
@@ -86,7 +81,7 @@ def test_a_capture_is_read_by_its_export(
 
 
 @pytest.mark.parametrize("style", ["da3", "depthsplat", "anysplat"])
-def test_every_style_is_read(style: str, script: Callable[[str], ModuleType], capture: Path, tmp_path: Path) -> None:
+def test_every_style_is_read(style: str, capture: Path, tmp_path: Path) -> None:
     loaded = load_scene(script("captures").write_export(capture, tmp_path / style, style))
     assert len(loaded.scene.cameras) == 3
     assert loaded.scene.has_own_pixels == (style != "anysplat")

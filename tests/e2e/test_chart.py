@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from charted import CHART_FAST, CHART_TARGETS, charted_scene
 from messages import names
 
 import gsmerge
@@ -15,18 +16,19 @@ from gsmerge.research.charts import measure_run as running
 from gsmerge.research.charts.measure_run import RunRecord, read_runs
 from gsmerge.settings.compact import CompactOptions
 
-from .conftest import CHART_FAST, CHART_TARGETS, Outcome, Run, listing
+from .conftest import Outcome, Run, listing
 
 
 @pytest.fixture
-def copied(charted_scene: Path, tmp_path: Path) -> Path:
-    """A copy that a test may spoil."""
-    return Path(shutil.copytree(charted_scene, tmp_path / "grid"))
+def copied(tmp_path: Path) -> Path:
+    """A copy of the charted scene that a test may spoil."""
+    return Path(shutil.copytree(charted_scene(), tmp_path / "grid"))
 
 
 @pytest.fixture(autouse=True)
-def _inline(charted_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _inline(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw nothing more, which takes half a second; scenes that are read for one test are not those of another."""
+    charted_scene()
     running.load_source.cache_clear()
     monkeypatch.setattr(
         "gsmerge.research.charts.figures.draw_figures", lambda figures, folder: {f.name: b"<svg/>" for f in figures}
@@ -61,8 +63,8 @@ def again(run: Run, folder: Path, *options: object) -> Outcome:
 
 
 @pytest.mark.slow
-def test_what_a_grid_leaves_behind(charted_scene: Path, tmp_path: Path) -> None:
-    out = charted_scene / "out"
+def test_what_a_grid_leaves_behind(tmp_path: Path) -> None:
+    out = charted_scene() / "out"
     records = runs(out)
     assert list(records) == ["input", "gsmerge, budget 1%, fit none", "gsmerge, budget 2%, fit none"]
     first, one, two = records.values()
@@ -73,7 +75,7 @@ def test_what_a_grid_leaves_behind(charted_scene: Path, tmp_path: Path) -> None:
         assert record.value("lpips_vgg_target") is None
     assert (first.count, one.count, two.count) == (pixels, pixels // 100, pixels // 50)
     assert first.seconds == 0 < one.seconds
-    result = gsmerge.compact(gsmerge.read_scene(charted_scene / "room"), budget="1%", fill=True, fit="none")
+    result = gsmerge.compact(gsmerge.read_scene(charted_scene() / "room"), budget="1%", fill=True, fit="none")
     gsmerge.write_ply(tmp_path / "small.ply", result.gaussians)
     assert (tmp_path / "small.ply").stat().st_size == one.bytes
     page = (out / "index.html").read_text()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from messages import noted, refuses
 from plyfile import PlyData, PlyElement
+from shared import make_once, write_small
 from splat_transform_programs import put_stand_in, run_here
 from sweeps import sweep
 
@@ -34,22 +35,21 @@ from .conftest import Run, assert_refused
 FORMATS = ("out.sog", "lod-meta.json", "tileset.json", "out.ply", "out.spz", "out.splat", "out.glb")
 
 
-@pytest.fixture(scope="module")
-def made_result(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a result with harmonics, its cameras inside and beside it. Read only."""
-    scene, folder = gsmerge.read_scene(small_scene), tmp_path_factory.mktemp("result")
+def make_result(folder: Path) -> None:
+    """Write a result with harmonics, its cameras inside and beside it."""
+    scene = gsmerge.read_scene(make_once("small", write_small))
+    folder.mkdir()
     gaussians = gsmerge.compact(scene, effort="draft", budget=400, fit="none").gaussians
     random = np.random.default_rng(0)
     gaussians = replace(gaussians, shN=random.normal(0, 0.1, (400, 15, 3)).astype(np.float32))
     gsmerge.write_ply(folder / "in.ply", gaussians, comments=["gsmerge result"])
     (folder / "in.cameras.json").write_text(viewer_cameras(scene.cameras, scene.names))
-    return folder
 
 
 @pytest.fixture
-def result(made_result: Path, tmp_path: Path) -> Path:
-    """A copy of them in a folder of its own."""
-    return Path(shutil.copytree(made_result, tmp_path, dirs_exist_ok=True)) / "in.ply"
+def result(tmp_path: Path) -> Path:
+    """The result of :func:`make_result`, in a folder of its own."""
+    return Path(shutil.copytree(make_once("result", make_result), tmp_path, dirs_exist_ok=True)) / "in.ply"
 
 
 def read(path: Path) -> Gaussians:
@@ -92,7 +92,8 @@ def test_streamed_levels_have_a_quarter_of_the_gaussians_each(
         PlacementOptions(up="y"), PlacementOptions(up="-z"), PlacementOptions(scale=3.0),
         PlacementOptions(rotate="20,-50,110"), PlacementOptions(translate="1,2,-3"),
         PlacementOptions(up="z", scale=0.5, rotate="0,0,90", translate="5,0,0"),
-    ], often=2)  # fmt: skip
+    ],
+    ids=["up=y", "up=-z", "scale=3", "rotate=20,-50,110", "translate=1,2,-3", "all of them"], often=2)  # fmt: skip
 def test_a_moved_scene_looks_the_same_from_its_moved_cameras(
     result: Path, tmp_path: Path, options: PlacementOptions
 ) -> None:

@@ -38,19 +38,21 @@ MOST_SECONDS, MOST_MEMORY = 100, 2**30  # of sparse files, whose budget is more 
 OPTIONS = {"-o", "--images"}  # what they name is nothing for ``inspect``
 # One or two of each kind of harm, that take little time: in the default run within limits, too
 OFTEN = (
-    "rows: count 9223372036854775808", "rows: half of the positions NaN", "rows: 8 GB of zeros as lists",
-    "glb: copies without end", "sog: a million equal Gaussians", "spz: half a million of degree 4",
-    "splat: 1 TB of zeros", "gsm: 1 TB of zeros", "levels: a chunk by two names",
-    "transforms: path that is a device, no images", "transforms: large model, 10,000 frames with poses",
-    "COLMAP binary: 18446744073709551615 points", "views.npz: poses as objects", "results.npz: a bomb of floats",
+    "scene.ply: a count of 9223372036854775808", "scene.ply: NaN in half of the positions",
+    "scene.ply: 8 GB of zeros as lists", "glb: 100,000 nodes with the same Gaussians",
+    "sog: a million equal Gaussians", "spz: 500,000 equal Gaussians of degree 4",
+    "splat: 1 TB of zeros in its place", "gsm: 1 TB of zeros in its place", "Streamed SOG: one chunk by two names",
+    "transforms.json: a photo's path that is a device",
+    "transforms.json: a camera_model of 3 MB for 10,000 frames with poses",
+    "COLMAP binary: an image with 18446744073709551615 points",
+    "views.npz: poses as objects that would run code", "results.npz: zeros as photos of 1400 x 1400 floats",
     "photos: a PNG that claims 60000 x 60000",
-    "scene: a folder with line breaks", "scene: scene.ply as a pipe", "scene: images as a loop",
-    "scene: a device as cameras", "scene: the output a pipe",
+    "scene: a folder named with line breaks", "scene: scene.ply as a pipe", "scene: images as a link to itself",
+    "scene: the device /dev/zero as cameras", "scene: the output as a pipe",
 )  # fmt: skip
 QUICK = [name for name, (_, damage) in DAMAGES.items() if not damage.slow]
 BY_COMMANDS = [name for name, (kind, _) in DAMAGES.items() if SOUNDS[kind].words]
-COMPACTED = ("one position 1e30", "half of the positions NaN", *(f"{what} 1e38" for what in ("opacities",
-             "rotations")))  # fmt: skip
+COMPACTED = ("one position of 1e30", "NaN in half of the positions", "opacities of 1e38", "rotations of 1e38")
 
 of_linux = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
 
@@ -180,7 +182,7 @@ def test_damaged_files_are_read_within_a_budget(name: str, tmp_path: Path, serve
 
 
 @of_linux
-@sweep("name", ["glb: a length of 2^62", "rows: 600000 rows of one place", *BY_COMMANDS[::9]])
+@sweep("name", ["glb: values of 2^62 bytes", "scene.ply: 600,000 equal rows", *BY_COMMANDS[::9]])
 def test_damaged_files_can_be_inspected(name: str, tmp_path: Path, server: CommandServer) -> None:
     words = spoil(name, tmp_path)[1]
     num_bytes = size_of(tmp_path)
@@ -192,7 +194,7 @@ def test_damaged_files_can_be_inspected(name: str, tmp_path: Path, server: Comma
 
 @sweep("name", COMPACTED)
 def test_odd_values_are_compacted(name: str, tmp_path: Path, run: Run) -> None:
-    scene = spoil(f"rows: {name}", tmp_path)[0].parent
+    scene = spoil(f"scene.ply: {name}", tmp_path)[0].parent
     outcome = run("compact", scene, "-o", scene / "small.ply", "--set", "fit_steps=2", "--quiet", code=0)
     assert "gsmerge: warning" not in outcome.err
     actual = run("inspect", scene / "small.ply", "--json").out

@@ -47,7 +47,15 @@ class Broken:
         (PermissionError(13, "Denied", "a/b"), 3, "a/b: cannot be read or written (Denied)"),
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
-    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+    ids=[
+        "an unexpected KeyError",
+        "an unexpected error of two lines",
+        "no memory",
+        "no memory in OpenCV",
+        "no memory for a library",
+        "no permission for a file",
+        "Ctrl-C",
+    ],
 )
 def test_failures_inside_the_work(
     error: BaseException, code: int, line: str, smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
@@ -75,6 +83,7 @@ def test_a_folder_without_permission(smallest_copy: Path, run: Run) -> None:
         ("scene.spz", "gsmerge.io.formats.spz._unpack"),
         ("views.npz", "numpy.lib.format.read_array"),
     ],
+    ids=["scene.ply", "scene.sog", "scene.spz", "views.npz"],
 )
 def test_a_lack_of_memory_is_no_damage(
     file: str, reader: str, smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
@@ -171,9 +180,11 @@ def test_a_signal_ends_it_in_order(name: str, code: int, small_copy: Path, root:
 
 
 @pytest.mark.usefixtures("foreground")
-@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)], ids=["SIGTERM", "SIGINT"])
 @pytest.mark.parametrize(
-    "error", [None, SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")]
+    "error",
+    [None, SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")],
+    ids=["swallowed", "as an error of Python", "as an error of the scene"],
 )
 def test_a_signal_that_others_do_not_hand_on(
     name: str, code: int, error: Exception | None, smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch

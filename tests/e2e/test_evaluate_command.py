@@ -10,41 +10,29 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
+from scripts import target_psnr
+from shared import make_once, write_scene
 
 from gsmerge.cli import main
 
 from .conftest import Run, assert_refused
 
 
-@pytest.fixture(scope="module")
-def made(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene of five views of 24 x 16, a result of it, and the report of that run. Read only."""
-    folder = make_scene(tmp_path_factory.mktemp("made") / "scene", num_views=5, width=24, height=16)
+def make(folder: Path) -> None:
+    """Write a scene of five views of 24 x 16, a result of it, and the report of that run."""
+    write_scene(folder, num_views=5, width=24, height=16)
     words = ("compact", folder, "-o", folder / "small.ply", "--effort", "draft", "--budget", "10%", "--json")
     with (folder / "run.json").open("w") as report, redirect_stdout(report):
         assert main([str(word) for word in words]) == 0
-    return folder
 
 
 @pytest.fixture
-def scene(made: Path, tmp_path: Path) -> Path:
-    """A copy that a test may change."""
-    return Path(shutil.copytree(made, tmp_path / "scene"))
+def scene(tmp_path: Path) -> Path:
+    """A copy of what :func:`make` writes, which a test may change."""
+    return Path(shutil.copytree(make_once("evaluated", make), tmp_path / "scene"))
 
 
-@pytest.fixture
-def small(scene: Path) -> Path:
-    """The result in that copy."""
-    return scene / "small.ply"
-
-
-def test_table_and_files(
-    scene_copy: Path,
-    compacted_scene: Path,
-    run: Run,
-    floor: Callable[..., None],
-    target_psnr: Callable[[Path, Path], float],
-) -> None:
+def test_table_and_files(scene_copy: Path, compacted_scene: Path, run: Run, floor: Callable[..., None]) -> None:
     """On the scene of the floor, of which the defaults make a result."""
     small = Path(shutil.copy(compacted_scene / "small.ply", scene_copy))
     table, report = scene_copy / "a.csv", scene_copy / "a.json"
@@ -70,8 +58,8 @@ def test_table_and_files(
 
 
 @pytest.mark.slow
-def test_a_page_shows_what_is_measured(scene: Path, small: Path, run: Run) -> None:
-    call, page = (scene, small, "--targets", scene / "targets"), scene / "page.html"
+def test_a_page_shows_what_is_measured(scene: Path, run: Run) -> None:
+    call, page = (scene, scene / "small.ply", "--targets", scene / "targets"), scene / "page.html"
     document = json.loads(run("evaluate", *call, "--lpips", "none", "--json", code=0).out)
     run("view", *call, "--no-open", "-o", page, code=0)
     text = page.read_text()
@@ -81,8 +69,8 @@ def test_a_page_shows_what_is_measured(scene: Path, small: Path, run: Run) -> No
 
 
 @pytest.mark.slow
-def test_views_that_are_measured(scene: Path, small: Path, run: Run) -> None:
-    call = ("evaluate", scene, small, "--lpips", "none", "--json", "--set")
+def test_views_that_are_measured(scene: Path, run: Run) -> None:
+    call = ("evaluate", scene, scene / "small.ply", "--lpips", "none", "--json", "--set")
     for setting, targets, counts in (
         ("context=false", ("--targets", scene / "targets"), {"target": 4}), ("views=3", (), {"context": 3}),
     ):  # fmt: skip
@@ -106,10 +94,10 @@ def test_lpips_is_measured_with_alexnet_on_four_views(scene: Path, run: Run, mon
 
 
 @pytest.mark.slow
-def test_files_of_every_kind(scene: Path, small: Path, run: Run) -> None:
+def test_files_of_every_kind(scene: Path, run: Run) -> None:
     outputs = {suffix: scene / f"page.{suffix}" for suffix in ("json", "csv")}
     flags = [part for path in outputs.values() for part in ("-o", path)]
-    call = ("evaluate", scene / "scene.ply", small, "--lpips", "none")
+    call = ("evaluate", scene / "scene.ply", scene / "small.ply", "--lpips", "none")
     run(*call, *flags, code=0)
     run(*call, *flags, code=0)  # what it made is replaced
     for path in outputs.values():
@@ -118,8 +106,8 @@ def test_files_of_every_kind(scene: Path, small: Path, run: Run) -> None:
         assert path.read_text() == "mine"
 
 
-def test_names_that_are_no_text(scene: Path, small: Path, run: Run) -> None:
-    odd = small.rename(scene / "odd\udcff\x1b[31m.ply")
+def test_names_that_are_no_text(scene: Path, run: Run) -> None:
+    odd = (scene / "small.ply").rename(scene / "odd\udcff\x1b[31m.ply")
     outputs = [scene / f"page.{suffix}" for suffix in ("json", "csv")]
     flags = [part for path in outputs for part in ("-o", path)]
     outcome = run("evaluate", scene, odd, "--lpips", "none", *flags, code=0)

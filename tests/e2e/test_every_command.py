@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from messages import names
+from shared import write_scene
 from sweeps import sweep
 
 import gsmerge
@@ -46,9 +46,9 @@ PICTURES = {  # with their number
 
 
 @pytest.fixture
-def small_copy(make_scene: Callable[..., Path], tmp_path: Path) -> Path:
+def small_copy(tmp_path: Path) -> Path:
     """A scene with held-out views, of 24 x 16, that a test may change."""
-    return make_scene(tmp_path / "scene", num_views=VIEWS, width=24, height=16)
+    return write_scene(tmp_path / "scene", num_views=VIEWS, width=24, height=16)
 
 
 def call(command: str, scene: Path) -> list[object]:
@@ -135,7 +135,7 @@ def test_names_that_are_not_utf_8(command: str, small_copy: Path, run: Run) -> N
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
-@pytest.mark.parametrize("command", ["compact", "compact a state", "extend", *WRITERS])
+@pytest.mark.parametrize("command", ["compact a state", "extend", *WRITERS])
 def test_rights(command: str, small_copy: Path, run: Run) -> None:
     """Outputs that hold photos are as private as these, and what replaces a file takes its mode."""
     for path in (small_copy / "images").iterdir():

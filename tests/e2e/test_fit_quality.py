@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scripts import target_psnr
+from shared import write_made
 from sweeps import sweep
 
 import gsmerge
@@ -18,17 +20,16 @@ NUM_VIEWS = 5
 
 
 @pytest.fixture(scope="module")
-def compacted(
-    made_scene: Path, tmp_path_factory: pytest.TempPathFactory, target_psnr: Measure
-) -> Callable[..., tuple[CompactResult, float]]:
+def compacted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[CompactResult, float]]:
     """``compacted(k=2)``: the result, and its PSNR (dB) on the targets; each is made once."""
-    scene, out = gsmerge.read_scene(made_scene), tmp_path_factory.mktemp("fit") / "small.ply"
+    folder = write_made(tmp_path_factory.mktemp("fit") / "scene")
+    scene, out = gsmerge.read_scene(folder), folder / "small.ply"
 
     @cache
     def call(**settings: Any) -> tuple[CompactResult, float]:
         result = gsmerge.compact(scene, **settings)
         gsmerge.write_ply(out, result.gaussians, overwrite=True)
-        return result, target_psnr(made_scene / "targets", out)
+        return result, target_psnr(folder / "targets", out)
 
     return call
 
@@ -36,7 +37,7 @@ def compacted(
 @sweep(
     ("superpixels", "settings"),
     [(256, {}), (256, {"fit_steps": 300}), (256, {"k": 2}), (64, {})],
-    ids=["default", "best", "K2", "1%"],
+    ids=["defaults", "fit_steps=300", "k=2", "a quarter of the superpixels"],
 )
 def test_full_fit_reaches_the_floor_with_no_more_than_the_count(
     superpixels: int,
@@ -79,9 +80,6 @@ def test_plain_merging_without_photos(
 
 
 def test_photos_help(
-    compacted: Callable[..., tuple[CompactResult, float]],
-    made_scene: Path,
-    target_psnr: Measure,
-    floor: Callable[..., None],
+    compacted: Callable[..., tuple[CompactResult, float]], made_scene: Path, floor: Callable[..., None]
 ) -> None:
     floor(compacted(superpixels=256)[1] - target_psnr(made_scene / "targets", made_scene / "scene.ply"))

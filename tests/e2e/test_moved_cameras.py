@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from messages import names, noted
+from shared import write_small
 from tiny_scene import edited_json
 
 from gsmerge.kernels import elementary
@@ -30,9 +31,9 @@ def enlarge_cameras(folder: Path) -> Path:
 
 
 @pytest.fixture
-def moved_scene(small_copy: Path) -> Path:
+def moved_scene(tmp_path: Path) -> Path:
     """The small scene with the camera centres in larger units."""
-    return enlarge_cameras(small_copy)
+    return enlarge_cameras(write_small(tmp_path / "scene"))
 
 
 def psnr(folder: Path, photos: Path) -> float:

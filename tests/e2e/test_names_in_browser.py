@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
+from shared import write_smallest
 
 from e2e.conftest import Run
 from gsmerge.cli import main
@@ -30,10 +31,11 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="module")
-def result(smallest_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the scene is made to under a usual name: each page of one scene is of a run with its name."""
-    small = tmp_path_factory.mktemp("result") / "small.ply"
-    assert main(["compact", str(smallest_scene), "-o", str(small), *QUICK, "-q"]) == 0
+    folder = tmp_path_factory.mktemp("result")
+    small = folder / "small.ply"
+    assert main(["compact", str(write_smallest(folder / "scene")), "-o", str(small), *QUICK, "-q"]) == 0
     return small
 
 

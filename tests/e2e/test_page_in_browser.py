@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
+from charted import charted_scene
 
 pytestmark = needs_browser()
 
 
 @pytest.fixture(scope="module")
-def shown(charted_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     with browser(CHROMIUM, tmp_path_factory.mktemp("page") / "profile") as opened:
-        opened.open(charted_scene / "out" / "index.html")
+        opened.open(charted_scene() / "out" / "index.html")
         yield opened
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
+from shared import write_scene
 
 import gsmerge
 from e2e.conftest import Run
@@ -16,10 +16,8 @@ from gsmerge.raster.metrics import psnr
 SIGN = slice(20, 34), slice(30, 52)  # of 64 x 96 pixels: 5 %
 
 
-def test_a_protected_part_of_the_photos_is_shown_better(
-    run: Run, make_scene: Callable[..., Path], tmp_path: Path
-) -> None:
-    room = make_scene(tmp_path / "room", num_views=3, width=96, height=64, seed=0)
+def test_a_protected_part_of_the_photos_is_shown_better(run: Run, tmp_path: Path) -> None:
+    room = write_scene(tmp_path / "room", num_views=3, width=96, height=64, seed=0)
     scene, after = gsmerge.read_scene(room), []
     picture = np.zeros((scene.cameras.height, scene.cameras.width), np.uint8)
     picture[SIGN] = 255
@@ -60,11 +58,11 @@ def test_a_protected_part_of_the_photos_is_shown_better(
     assert any(note.startswith("protect: ") for note in report["notes"])
 
 
-def test_a_batch_takes_no_masks_of_other_scenes(run: Run, make_scene: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_batch_takes_no_masks_of_other_scenes(run: Run, tmp_path: Path) -> None:
     """A scene called masks and a folder of grey masks beside it change no bytes; the folder is named."""
     quick = ("--effort", "draft", "--set", "fit=none")
     for number, name in enumerate(("rooms/room", "rooms/masks", "halls/room")):
-        room = make_scene(tmp_path / name, num_views=3, width=24, height=16, seed=number)
+        room = write_scene(tmp_path / name, num_views=3, width=24, height=16, seed=number)
     for photo in (room / "images").iterdir():
         (path := tmp_path / "halls/masks" / photo.name).parent.mkdir(exist_ok=True)
         assert cv2.imwrite(str(path), np.tile(np.uint8([0, 255]), (16, 12)))
@@ -75,10 +73,10 @@ def test_a_batch_takes_no_masks_of_other_scenes(run: Run, make_scene: Callable[.
         assert (f"--masks {tmp_path}/halls/masks" in done.out) == (folder == "halls")
 
 
-def test_a_batch_takes_what_each_scene_has(run: Run, make_scene: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_batch_takes_what_each_scene_has(run: Run, tmp_path: Path) -> None:
     """Masks and what is to be protected, as of ``compact``: the same bytes."""
     for number in (0, 1):
-        room = make_scene(tmp_path / "rooms" / f"room{number}", num_views=3, width=24, height=16, seed=number)
+        room = write_scene(tmp_path / "rooms" / f"room{number}", num_views=3, width=24, height=16, seed=number)
         for name, level in (("shades", 255), ("signs", 0)):
             picture = np.full((16, 24), level, np.uint8)
             picture[:8, :12] = 255 - level

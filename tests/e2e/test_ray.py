@@ -6,12 +6,12 @@ import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from batches import FAST, NAMES, results, start, statuses
 from messages import names
+from shared import write_scene
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs gsmerge[ray]")
 CLUSTER = """
@@ -79,9 +79,9 @@ def test_no_cluster_at_the_address_is_one_line(rooms: Path, tmp_path: Path) -> N
     assert names(errors, "127.0.0.1:1", "Ray")
 
 
-def test_a_cluster_makes_the_same_bytes(make_scene: Callable[..., Path], tmp_path: Path, root: Path) -> None:
+def test_a_cluster_makes_the_same_bytes(tmp_path: Path, root: Path) -> None:
     """Though three processes are lost."""
-    scene = make_scene(tmp_path / "room", num_views=8, width=96, height=64, seed=2)
+    scene = write_scene(tmp_path / "room", num_views=8, width=96, height=64, seed=2)
     pairs = ("blocks=4", "superpixels=5%", "fit_steps=60", "seed=3")
     words = ("compact", scene, *(word for pair in pairs for word in ("--set", pair)))
     here, there = tmp_path / "here.ply", tmp_path / "there.ply"

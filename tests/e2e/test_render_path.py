@@ -145,13 +145,13 @@ def test_clips_too_large_for_the_memory_are_refused(small_scene: Path, tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("kind", "count"), [("spline,back:0.5", 12), ("orbit", 6)])
 def test_frames_grow_with_the_views_of_a_spline(
-    smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    kind: str, count: int, smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.measure.drawings.SECONDS", 0.2)
-    for kind, count in (("spline,back:0.5", 12), ("orbit", 6)):
-        outcome = run("render", smallest_scene, "--path", kind, "-o", tmp_path / kind[:5], "--json", code=0)
-        assert json.loads(outcome.out)["frames"] == count
+    outcome = run("render", smallest_scene, "--path", kind, "-o", tmp_path / kind[:5], "--json", code=0)
+    assert json.loads(outcome.out)["frames"] == count
 
 
 @sweep("kind", ["orbit", "spline"])
@@ -190,13 +190,15 @@ def test_cameras_of_views_that_the_file_lacks_are_drawn(small_copy: Path, tmp_pa
     assert list(listing(tmp_path / "all")) == [f"view_{i:03d}.png" for i in range(5)]
 
 
-def test_even_sides_of_videos_are_said(small_scene: Path, tmp_path: Path, run: Run) -> None:
-    for name, size in (("a.mp4", (50, 34)), ("a.gif", (49, 33))):
-        call = ("render", small_scene, "--size", "49x33", "--frames", 2, "-o", tmp_path / name, "--json")
-        document = json.loads(run(*call, code=0).out)
-        assert read(tmp_path / name)[0].shape[1::-1] == size == (document["width"], document["height"])
-        said = [note for note in document["notes"] if names(note, "49 x 33", "50 x 34", "even")]
-        assert len(said) == (name == "a.mp4")
+@pytest.mark.parametrize(("name", "size"), [("a.mp4", (50, 34)), ("a.gif", (49, 33))])
+def test_even_sides_of_videos_are_said(
+    name: str, size: tuple[int, int], small_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    call = ("render", small_scene, "--size", "49x33", "--frames", 2, "-o", tmp_path / name, "--json")
+    document = json.loads(run(*call, code=0).out)
+    assert read(tmp_path / name)[0].shape[1::-1] == size == (document["width"], document["height"])
+    said = [note for note in document["notes"] if names(note, "49 x 33", "50 x 34", "even")]
+    assert len(said) == (name == "a.mp4")
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from shared import write_smallest
 
 import gsmerge
 from gsmerge.photos.views import subset
@@ -16,18 +16,18 @@ from .conftest import Run
 
 
 @pytest.fixture(scope="module")
-def one_photo(smallest_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def one_photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene of one view, whose number of Gaussians goes by other rules. Read only."""
-    folder = tmp_path_factory.mktemp("one")
-    gsmerge.write_ply(folder / "scene.ply", subset(gsmerge.read_scene(smallest_scene), [0]).gaussians)
-    cameras = json.loads((smallest_scene / "transforms.json").read_text())
+    folder = write_smallest(tmp_path_factory.mktemp("one") / "scene")
+    alone = subset(gsmerge.read_scene(folder), [0]).gaussians
+    gsmerge.write_ply(folder / "scene.ply", alone, overwrite=True)
+    cameras = json.loads((folder / "transforms.json").read_text())
     (folder / "transforms.json").write_text(json.dumps(cameras | {"frames": cameras["frames"][:1]}))
-    shutil.copytree(smallest_scene / "images", folder / "images")
     return folder
 
 
 @pytest.mark.parametrize("scene", ["smallest_scene", "one_photo"])
-@pytest.mark.parametrize("settings", [{}, {"budget": "auto"}, {"budget": "mobile"}, {"levels": 2}, {"k": 2}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"budget": "auto"}, {"budget": "mobile"}, {"levels": 2}, {"k": 2}])
 def test_a_file_holds_what_python_returns(
     scene: str, settings: dict[str, str], tmp_path: Path, run: Run, request: pytest.FixtureRequest
 ) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import noted
+from shared import write_scene
 from sharp_files import split_views, write_sharp
 
 from gsmerge import read_cameras, read_scene
@@ -21,16 +22,16 @@ FIT = ("--set", "fit_steps=30", "--budget", "700", "--threads", 1)
 
 
 @pytest.fixture(scope="module")
-def sharp(make_scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sharp(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``out/`` with two files, ``photos/`` with what they were made of, and a file of another place. Read only."""
     folder = tmp_path_factory.mktemp("sharp")
     for name in ("out", "photos", "other"):
         (folder / name).mkdir()
-    made = make_scene(folder / "made", num_views=4, width=WIDTH, height=SIDE, seed=2)
+    made = write_scene(folder / "made", num_views=4, width=WIDTH, height=SIDE, seed=2)
     parts = split_views(read_scene(made), (1.1, 0.85, 1.0, 1.0))
     for name, view in zip(NAMES, parts, strict=False):
         write_sharp(folder / "out" / f"{name}.ply", view, (2 * WIDTH, 2 * SIDE), folder / "photos" / f"{name}.jpg")
-    other = make_scene(folder / "elsewhere", num_views=2, width=WIDTH, height=SIDE, seed=5)
+    other = write_scene(folder / "elsewhere", num_views=2, width=WIDTH, height=SIDE, seed=5)
     view = split_views(read_scene(other), (1.0, 1.0))[0]
     write_sharp(folder / "other" / "IMG_0009.ply", view, (2 * WIDTH, 2 * SIDE), folder / "photos" / "IMG_0009.jpg")
     return folder

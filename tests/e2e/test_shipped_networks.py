@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from scripts import target_psnr
+from shared import write_scene
 from sweeps import sweep
 
 import gsmerge
@@ -14,11 +15,9 @@ from gsmerge.networks.checkpoint import SHIPPED
 LEAST_GAIN = 1.0  # dB on photos that the scene was not made from
 
 
-def test_shipped_networks_gain(
-    make_scene: Callable[..., Path], target_psnr: Callable[[Path, Path], float], tmp_path: Path
-) -> None:
+def test_shipped_networks_gain(tmp_path: Path) -> None:
     """Over the analytic stages, on a scene that nobody trained on."""
-    made = make_scene(tmp_path / "scene", num_views=4, width=128, height=96, seed=123)
+    made = write_scene(tmp_path / "scene", num_views=4, width=128, height=96, seed=123)
     scene, psnr = gsmerge.read_scene(made), {}
     for checkpoint in ("none", str(SHIPPED)):
         result = gsmerge.compact(scene, fit="none", checkpoint=checkpoint)
@@ -29,9 +28,9 @@ def test_shipped_networks_gain(
 
 @pytest.mark.slow
 @sweep("k", [1, 2, 4])
-def test_a_budget_is_met_with_networks_and_without(make_scene: Callable[..., Path], tmp_path: Path, k: int) -> None:
+def test_a_budget_is_met_with_networks_and_without(tmp_path: Path, k: int) -> None:
     """Without one, what networks make more opaque is left out less often as too faint."""
-    scene = gsmerge.read_scene(make_scene(tmp_path / "scene", num_views=3, width=96, height=72, seed=123))
+    scene = gsmerge.read_scene(write_scene(tmp_path / "scene", num_views=3, width=96, height=72, seed=123))
     faint, budget = {"fit": "none", "min_opacity": 0.5}, 600
     counts = {}
     for checkpoint in ("none", str(SHIPPED)):
@@ -43,11 +42,9 @@ def test_a_budget_is_met_with_networks_and_without(make_scene: Callable[..., Pat
 
 
 @pytest.mark.slow
-def test_the_papers_method_beats_its_moment_matching(
-    make_scene: Callable[..., Path], target_psnr: Callable[[Path, Path], float], tmp_path: Path
-) -> None:
+def test_the_papers_method_beats_its_moment_matching(tmp_path: Path) -> None:
     """With the networks of absolute outputs that ship, on a scene that nobody trained on."""
-    made = make_scene(tmp_path / "scene", num_views=4, width=128, height=96, seed=123)
+    made = write_scene(tmp_path / "scene", num_views=4, width=128, height=96, seed=123)
     scene, psnr = gsmerge.read_scene(made), {}
     for name, settings in {"networks": {"recipe": "paper"}, "moments": {"method": "moment-matching"}}.items():
         gsmerge.write_ply(tmp_path / "small.ply", gsmerge.compact(scene, **settings).gaussians, overwrite=True)

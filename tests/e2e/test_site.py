@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
+from shared import make_once, write_small
 
 import gsmerge
 from gsmerge.measure.evaluate import near_plane
@@ -23,10 +24,6 @@ SETTLED = "typeof site !== 'undefined' && site !== null && stage.getAttribute('a
 PLACE = "column(site.camera.matrix, 3).toArray()"
 
 
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
-
-
 QUICK = ("--effort", "draft", "--fit", "none")
 
 
@@ -35,7 +32,7 @@ def test_compact_writes_one_file_to_send(run: Run, smallest_copy: Path) -> None:
     assert_refused(run("compact", smallest_copy, "-o", page, "--levels", "2"), 2, page)
     assert not page.parent.exists()  # levels have none
     document = json.loads(run("compact", smallest_copy, "-o", page, *QUICK, "--json", code=0).out)
-    assert names(page.parent) == ["small.html"]
+    assert [path.name for path in page.parent.iterdir()] == ["small.html"]
     assert document["output"]["bytes"] == page.stat().st_size < 1_100_000
 
 
@@ -53,19 +50,20 @@ class Quiet(SimpleHTTPRequestHandler):
         pass
 
 
-@pytest.fixture(scope="module")
-def site(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def make_site(folder: Path) -> None:
+    """Write ``one.html`` of the small scene, and the Gaussians that it shows."""
     from gsmerge.cli import main
 
-    folder = tmp_path_factory.mktemp("made")
-    assert main(["compact", str(small_scene), "-o", str(folder / "scene.sog"), "--effort", "draft", "-q"]) == 0
+    folder.mkdir()
+    small = make_once("small", write_small)
+    assert main(["compact", str(small), "-o", str(folder / "scene.sog"), "--effort", "draft", "-q"]) == 0
     assert main(["convert", str(folder / "scene.sog"), str(folder / "one.html"), "-q"]) == 0
-    return folder
 
 
 @pytest.fixture(scope="module")
-def served(site: Path) -> Iterator[str]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
+def served() -> Iterator[str]:
+    handler = partial(Quiet, directory=str(make_once("site", make_site)))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_port}/one.html"
     server.shutdown()
@@ -81,9 +79,7 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @needs_browser()
-def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
-    tab: Browser, served: str, site: Path, small_scene: Path
-) -> None:
+def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(tab: Browser, served: str, small_scene: Path) -> None:
     tab.open(served)
     tab.wait(SETTLED)
     host = served.removesuffix("one.html")
@@ -96,7 +92,7 @@ def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
     scene = gsmerge.read_scene(small_scene)
     middle = tab.run("data.views[data.start].viewmat")
     view = int(np.abs(scene.cameras.viewmats.reshape(-1, 16) - middle).sum(1).argmin())
-    gaussians = gsmerge.read_gaussians(site / "scene.sog").gaussians
+    gaussians = gsmerge.read_gaussians(make_once("site", make_site) / "scene.sog").gaussians
     drawn = gsmerge.render(gaussians, scene.cameras[[view]], near=near_plane(scene)).images[0].clip(0, 1)
     tab.wait(SETTLED)
     box = tab.box("stage")
@@ -149,7 +145,8 @@ def test_on_a_phone_one_finger_turns_and_two_come_nearer(tab: Browser, served: s
 
 
 @needs_browser()
-def test_one_file_opens_from_disk(tab: Browser, site: Path) -> None:
+def test_one_file_opens_from_disk(tab: Browser) -> None:
+    site = make_once("site", make_site)
     before = len(tab.requests())
     tab.open(site / "one.html")
     assert tab.run("[id('canvas').hidden, id('poster').naturalWidth > 0]") == [True, True]
@@ -163,7 +160,7 @@ def test_one_file_opens_from_disk(tab: Browser, site: Path) -> None:
 @pytest.mark.slow
 @needs_browser()
 @pytest.mark.parametrize("supported", [True, False])
-def test_vr_is_offered_where_the_browser_has_it(supported: bool, tab: Browser, site: Path) -> None:
+def test_vr_is_offered_where_the_browser_has_it(supported: bool, tab: Browser) -> None:
     target = tab.call("Target.createTarget", url="about:blank")["targetId"]
     tab.session = tab.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
     session = "requestSession: async () => { throw Error('off'); }"
@@ -171,7 +168,7 @@ def test_vr_is_offered_where_the_browser_has_it(supported: bool, tab: Browser, s
     script = f"Object.defineProperty(navigator, 'xr', {{ value: {{ {xr} }} }});"
     tab.call("Page.enable")
     tab.call("Page.addScriptToEvaluateOnNewDocument", source=script)
-    tab.call("Page.navigate", url=(site / "one.html").as_uri())
+    tab.call("Page.navigate", url=(make_once("site", make_site) / "one.html").as_uri())
     tab.wait("location.protocol === 'file:' && document.readyState === 'complete'")
     tab.wait(SETTLED)
     assert tab.run("new Promise((end) => setTimeout(() => end(id('headset').hidden)))") is not supported

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +16,7 @@ import pytest
 from damage.case import Change
 from damage.changes import cut
 from damage.tensors import negate
+from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.cli import main
@@ -32,39 +33,48 @@ PAPER = ("--set", "recipe=paper", "--set", "superpixels=60")
 PATIENCE = 120  # seconds, on a machine that is busy with other things
 
 
+def write_walks(folder: Path) -> list[Path]:
+    """Write two scenes of three and four views of 24 x 16, each a world of its own."""
+    return [write_scene(folder / f"walk{n}", num_views=3 + n, width=24, height=16, seed=0) for n in range(2)]
+
+
+def write_states(folder: Path) -> None:
+    """Write the states after one and after two batches."""
+    walks = write_walks(folder)
+    assert main(["extend", str(folder / "1.gsm"), str(walks[0]), *SMALL, "--quiet"]) == 0
+    shutil.copy(folder / "1.gsm", folder / "2.gsm")
+    assert main(["extend", str(folder / "2.gsm"), str(walks[1]), *SMALL, "--quiet"]) == 0
+
+
 @pytest.fixture(scope="session")
-def walks(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
-    """Two scenes of three and four views of 24 x 16, each a world of its own. Read only, which is checked."""
+def walks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
+    """The scenes of :func:`write_walks`. Read only, which is checked."""
     folder = tmp_path_factory.mktemp("walks")
-    scenes = [make_scene(folder / f"walk{n}", num_views=3 + n, width=24, height=16, seed=0) for n in range(2)]
+    scenes = write_walks(folder)
     before = digests(folder)
     yield scenes
     assert digests(folder) == before
 
 
 @pytest.fixture(scope="session")
-def states(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The states after one and after two batches. Read only."""
-    folder = tmp_path_factory.mktemp("states")
-    assert main(["extend", str(folder / "1.gsm"), str(walks[0]), *SMALL, "--quiet"]) == 0
-    shutil.copy(folder / "1.gsm", folder / "2.gsm")
-    assert main(["extend", str(folder / "2.gsm"), str(walks[1]), *SMALL, "--quiet"]) == 0
-    return [folder / "1.gsm", folder / "2.gsm"]
+def states() -> list[Path]:
+    """The states of :func:`write_states`. Read only."""
+    return [make_once("states", write_states) / name for name in ("1.gsm", "2.gsm")]
 
 
 @pytest.fixture(scope="session")
-def features(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Feature Gaussians of two batches. Read only."""
     path = tmp_path_factory.mktemp("features") / "room.gsm"
-    assert main(["extend", str(path), *map(str, walks), *PAPER, "--quiet"]) == 0
+    assert main(["extend", str(path), *map(str, write_walks(path.parent)), *PAPER, "--quiet"]) == 0
     return path
 
 
 @pytest.fixture
-def state(states: list[Path], tmp_path: Path) -> Path:
+def state(tmp_path: Path) -> Path:
     """A state of one batch that a test may spoil."""
     (tmp_path / "work").mkdir()
-    return Path(shutil.copy(states[0], tmp_path / "work" / "state.gsm"))
+    return Path(shutil.copy(make_once("states", write_states) / "1.gsm", tmp_path / "work" / "state.gsm"))
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -191,8 +201,8 @@ def test_a_word_makes_a_result_and_its_page(state: Path, run: Run) -> None:
     assert {"state.compact.ply", "state.compact.compare.html"} <= set(listing(state.parent))
 
 
-def test_no_folder_of_this_machine_is_in_the_file(states: list[Path], walks: list[Path]) -> None:
-    assert str(walks[0].parent).encode() not in states[1].read_bytes()
+def test_no_folder_of_this_machine_is_in_the_file(states: list[Path]) -> None:
+    assert str(states[0].parents[1]).encode() not in states[1].read_bytes()
 
 
 def test_comments_of_the_source_are_copied_as_by_compact(state: Path, tmp_path: Path, run: Run) -> None:
@@ -276,15 +286,13 @@ def test_batches_before_a_broken_one_stay(states: list[Path], walks: list[Path],
 
 
 @pytest.mark.parametrize("exists", [False, True])
-def test_two_at_once_lose_no_batch(
-    exists: bool, state: Path, walks: list[Path], make_scene: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_two_at_once_lose_no_batch(exists: bool, state: Path, walks: list[Path], tmp_path: Path) -> None:
     """The second waits for the first, and adds to what that one has made."""
     from gsmerge.states.files import extend_file
 
     path = state if exists else tmp_path / "new.gsm"
     before = len(load_state(path).about["batches"]) if exists else 0
-    scenes = [walks[1], make_scene(tmp_path / "third", num_views=2, width=24, height=16, seed=0)]
+    scenes = [walks[1], write_scene(tmp_path / "third", num_views=2, width=24, height=16, seed=0)]
     with ThreadPoolExecutor(2) as pool:
         found = [find_scene_files(scene) for scene in scenes]
         ends = [pool.submit(extend_file, path, scene, {"superpixels": 60}) for scene in found]

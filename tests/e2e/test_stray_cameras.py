@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from batches import InlinePool
 from messages import ERROR, names
+from shared import write_smallest
 
 from .conftest import Run, assert_refused
 
@@ -25,11 +26,10 @@ def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def stray(tmp_path: Path, smallest_scene: Path) -> Path:
+def stray(tmp_path: Path) -> Path:
     """A scene beside a damaged camera file."""
-    folder = tmp_path / "room"
-    folder.mkdir()
-    shutil.copy(smallest_scene / "scene.ply", folder)
+    folder = write_smallest(tmp_path / "room")
+    shutil.rmtree(folder / "images")
     (folder / "transforms.json").write_text('{"frames": [')
     return folder
 
@@ -73,7 +73,7 @@ def test_photos_that_do_not_show_the_scene_are_a_doubt_too(smallest_copy: Path, 
     assert run(*words, "--strict", code=4).err.endswith("1 of 1 result is doubtful\n")
 
 
-@pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")], ids=str)
+@pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")])
 def test_commands_that_take_cameras_run_beside_them(words: tuple[str, ...], stray: Path, run: Run) -> None:
     small = stray / "small.ply"
     shutil.copy(stray / "scene.ply", small)

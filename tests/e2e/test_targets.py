@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import scenes
 from messages import noted
+from shared import write_scene
 
 from gsmerge import Scene, compact, read_ply
 from gsmerge.errors import UsageError
@@ -62,9 +62,9 @@ def test_no_more_are_made_than_there_are(scene: Scene) -> None:
     assert not noted(compact(scene, budget=200, fit="none").report.notes, "200")
 
 
-def test_sizes_and_shares_are_limits(make_scene: Callable[..., Path], tmp_path: Path, run: Run) -> None:
+def test_sizes_and_shares_are_limits(tmp_path: Path, run: Run) -> None:
     """No more Gaussians are taken than new views gain from, unless all are asked for; a number is met exactly."""
-    scene = make_scene(tmp_path / "scene", num_views=5, width=24, height=16)
+    scene = write_scene(tmp_path / "scene", num_views=5, width=24, height=16)
     out, quick = tmp_path / "limited.ply", ("--set", "fit_steps=8", "--overwrite", "--json")
 
     def compacted(*words: object) -> tuple[int, list[str]]:

@@ -93,10 +93,12 @@ def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callab
     assert alone.name == f"{scene_copy.name}-scene"
 
 
-def test_wrong_settings_are_refused_in_one_line(small_scene: Path, run: Run, tmp_path: Path) -> None:
-    for place, name, value in (("--set steps", "steps", 0), ("width", "width", 50)):
-        said = run("lab", "train", "--data", small_scene, "--output", tmp_path / "run", "--set", f"{name}={value}")
-        assert_refused(said, 2, place, value)
+@pytest.mark.parametrize(("place", "name", "value"), [("--set steps", "steps", 0), ("width", "width", 50)])
+def test_wrong_settings_are_refused_in_one_line(
+    place: str, name: str, value: int, small_scene: Path, run: Run, tmp_path: Path
+) -> None:
+    said = run("lab", "train", "--data", small_scene, "--output", tmp_path / "run", "--set", f"{name}={value}")
+    assert_refused(said, 2, place, value)
 
 
 def test_data_may_be_a_folder_of_scenes(small_copy: Path, tmp_path: Path, run: Run) -> None:

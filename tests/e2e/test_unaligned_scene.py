@@ -13,6 +13,8 @@ import pytest
 import unaligned_scenes
 from messages import names, noted
 from PIL import Image
+from scripts import target_psnr
+from shared import write_made
 from sweeps import sweep
 from tiny_scene import edited_json
 
@@ -28,16 +30,16 @@ Measure = Callable[[Path, Path], float]
 
 
 @pytest.fixture(scope="module")
-def made(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The made scene as voxels."""
-    folder = Path(shutil.copytree(made_scene, tmp_path_factory.mktemp("unaligned") / "scene"))
+    folder = write_made(tmp_path_factory.mktemp("unaligned") / "scene")
     scene = gsmerge.read_scene(folder)
     gsmerge.write_ply(folder / "scene.ply", unaligned_scenes.voxels(scene, 0.03).gaussians, overwrite=True)
     return folder
 
 
-@sweep("settings", [{}, {"budget": "2%"}, {"k": 2}], ids=str)
-def test_floor(settings: dict, made: Path, tmp_path: Path, target_psnr: Measure, floor: Callable[..., None]) -> None:
+@sweep("settings", [{}, {"budget": "2%"}, {"k": 2}])
+def test_floor(settings: dict, made: Path, tmp_path: Path, floor: Callable[..., None]) -> None:
     """300 steps, as users' fits have."""
     scene = read_scene(made, order="none")
     result = gsmerge.compact(scene, fit_steps=300, **settings)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
-from shared import make_once
+from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.cli import main
@@ -42,9 +42,8 @@ FRESH = (
 )
 
 
-@pytest.fixture
-def opened(page: tuple[Browser, Any]) -> tuple[Browser, Any]:
-    """The page without what the test before did: tests may run alone, and in any order."""
+def refreshed(page: tuple[Browser, Any]) -> tuple[Browser, Any]:
+    """Return the page without what the test before did: tests may run alone, and in any order."""
     tab, _ = page
     tab.call("Emulation.clearDeviceMetricsOverride")
     tab.run(FRESH)
@@ -52,14 +51,9 @@ def opened(page: tuple[Browser, Any]) -> tuple[Browser, Any]:
     return page
 
 
-@pytest.fixture(scope="module")
-def written(make_scene: Any, shared: Path) -> Path:
-    """``page.html`` of the scene ``room``, beside it: once in a run, since it takes seconds. Read only."""
-    return make_once(shared / "view-page", lambda place: write_page(make_scene, place))
-
-
-def write_page(make_scene: Any, folder: Path) -> None:
-    scene = make_scene(folder / "room", num_views=3, width=WIDTH, height=HEIGHT)
+def write_page(folder: Path) -> None:
+    """Write ``page.html`` of the scene ``room``, beside it, which takes seconds."""
+    scene = write_scene(folder / "room", num_views=3, width=WIDTH, height=HEIGHT)
     small, page = scene / "small<b>.ply", folder / "page.html"
     assert main(["compact", str(scene), "-o", str(small), "--effort", "draft", "-q"]) == 0
     longer = with_one_from_outside(gsmerge.read_ply(small).gaussians, gsmerge.read_scene(scene).cameras[[0]])
@@ -69,7 +63,8 @@ def write_page(make_scene: Any, folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def page(written: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, Any]]:
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, Any]]:
+    written = make_once("view-page", write_page)
     scene = written / "room"
     results = [gsmerge.read_ply(scene / name).gaussians for name in ("small<b>.ply", "wide.ply")]
     with browser(CHROMIUM, tmp_path_factory.mktemp("view"), "--enable-unsafe-swiftshader") as tab:
@@ -108,10 +103,12 @@ def picture(tab: Browser) -> np.ndarray:
     raise AssertionError("the picture changes all the time")
 
 
-@pytest.mark.parametrize("views", [slice(1), pytest.param(slice(1, None), marks=pytest.mark.slow)], ids=str)
-def test_3d_is_what_we_render_at_every_input_view(views: slice, opened: tuple[Browser, Any]) -> None:
+@pytest.mark.parametrize(
+    "views", [slice(1), pytest.param(slice(1, None), marks=pytest.mark.slow)], ids=["the first view", "all other views"]
+)
+def test_3d_is_what_we_render_at_every_input_view(views: slice, page: tuple[Browser, Any]) -> None:
     """The browser draws without a GPU."""
-    tab, (scene, small, _) = opened
+    tab, (scene, small, _) = refreshed(page)
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo')")
     inputs = tab.run(
         "data.views.map((view, i) => [view.held_out || view.outside, view.name, i]).filter(one => !one[0])"
@@ -129,8 +126,8 @@ def test_3d_is_what_we_render_at_every_input_view(views: slice, opened: tuple[Br
 
 
 @pytest.mark.slow
-def test_a_gaussian_reaches_in_from_outside(opened: tuple[Browser, Any]) -> None:
-    tab, (scene, small, wide) = opened
+def test_a_gaussian_reaches_in_from_outside(page: tuple[Browser, Any]) -> None:
+    tab, (scene, small, wide) = refreshed(page)
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); set('solid', '1'); set('other', false)")
     name = scene.names[0].rpartition("/")[2].removesuffix(".png")
     tab.run(f"jump(data.views.findIndex(view => view.name === '{name}' && !view.held_out))")
@@ -144,8 +141,8 @@ def test_a_gaussian_reaches_in_from_outside(opened: tuple[Browser, Any]) -> None
 
 
 @pytest.mark.slow
-def test_step_back_shows_the_side_without_photos(opened: tuple[Browser, Any]) -> None:
-    tab, (scene, small, _) = opened
+def test_step_back_shows_the_side_without_photos(page: tuple[Browser, Any]) -> None:
+    tab, (scene, small, _) = refreshed(page)
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); jump(0); zoomTo(6)")
     tab.press("b")
     there = tab.run("[view().name, view().held_out, state.atCamera, id('scores').rows.length]")
@@ -169,9 +166,9 @@ def test_step_back_shows_the_side_without_photos(opened: tuple[Browser, Any]) ->
     assert tab.run("view().outside") is False
 
 
-def test_what_cannot_be_seen_from_here_gives_way(opened: tuple[Browser, Any]) -> None:
+def test_what_cannot_be_seen_from_here_gives_way(page: tuple[Browser, Any]) -> None:
     """Without a GPU a large scene is in stills alone: once the camera has moved, both sides show the result."""
-    tab, _ = opened
+    tab, _ = refreshed(page)
     tab.run("set('mode', 'swipe'); set('solid', '1'); jump(0)")
     tab.run("kept = solid.results.get(1); solid.results.delete(1); show()")
     tags = "[id('left-tag').textContent, id('message').hidden]"
@@ -187,9 +184,9 @@ def test_what_cannot_be_seen_from_here_gives_way(opened: tuple[Browser, Any]) ->
     assert tab.run("[state.atCamera, id('back').hidden, solid.camera.matrix.equals(solid.poses[0])]") == [True] * 3
 
 
-def test_another_result_brings_its_figures(opened: tuple[Browser, Any]) -> None:
+def test_another_result_brings_its_figures(page: tuple[Browser, Any]) -> None:
     """By the slider, from the smallest, or the table: picture, figures and 3D."""
-    tab, _ = opened
+    tab, _ = refreshed(page)
     assert tab.run("data.sizes") == [2, 3]  # one Gaussian more
     said = "[data.results.map(one => one.headline), data.results.map(one => one.figures[0][0])]"
     headlines, counts = tab.run(said)
@@ -212,8 +209,8 @@ def test_another_result_brings_its_figures(opened: tuple[Browser, Any]) -> None:
     assert counts[0] in tab.run("id('figures').textContent")  # of the one on the right
 
 
-def test_the_speed_of_this_device_is_in_the_headline(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
+def test_the_speed_of_this_device_is_in_the_headline(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     tab.run("[solid.frameTime, solid.software] = [source => source === 1 ? 18 : 2, false]; measureSpeed()")
     assert tab.run("id('speed').textContent").replace("\u00a0", " ") == ", about 9 \u00d7 faster to draw"
     assert tab.run("id('speed').title") == "Medians of frames on this device: 18.0 and 2.0 ms"
@@ -225,8 +222,8 @@ def test_the_speed_of_this_device_is_in_the_headline(opened: tuple[Browser, Any]
     tab.run("solid.software = true")
 
 
-def test_swipe_shows_each_on_its_side(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
+def test_swipe_shows_each_on_its_side(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     tab.run(f"{BARE} jump(0); set('solid', ''); set('other', false); set('mode', 'blink'); set('pixels', 'photo')")
     left = picture(tab)
     tab.run("set('other', true)")
@@ -240,8 +237,8 @@ def test_swipe_shows_each_on_its_side(opened: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_a_difference_of_a_scene_with_itself_is_black(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
+def test_a_difference_of_a_scene_with_itself_is_black(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     tab.run(f"{BARE} jump(0); set('mode', 'difference'); set('pixels', 'photo')")
     for solid in ("''", "'1'"):
         tab.run(f"set('solid', {solid})")
@@ -251,8 +248,8 @@ def test_a_difference_of_a_scene_with_itself_is_black(opened: tuple[Browser, Any
         tab.run("set('left', state.right - 1)")
 
 
-def test_keys(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
+def test_keys(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     tab.run("jump(0); set('solid', ''); set('mode', 'swipe'); swipeTo(0.5)")
     for key in ("ArrowLeft", "ArrowDown", "2", "v"):
         tab.press(key)
@@ -260,8 +257,8 @@ def test_keys(opened: tuple[Browser, Any]) -> None:
     assert tab.run("[...id('strip').children].filter(one => one.ariaCurrent === 'true').length") == 1
 
 
-def test_grey_controls_say_why(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
+def test_grey_controls_say_why(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     tab.run("jump(data.views.findIndex(view => view.outside)); set('solid', '')")
     grey = "[...document.querySelectorAll('button:disabled, input:disabled')].filter(one => one.checkVisibility())"
     assert tab.run(f"{grey}.length") >= 1
@@ -274,9 +271,9 @@ def test_grey_controls_say_why(opened: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_full_screen(opened: tuple[Browser, Any]) -> None:
+def test_full_screen(page: tuple[Browser, Any]) -> None:
     """Where the buttons take two lines as well."""
-    tab, _ = opened
+    tab, _ = refreshed(page)
     for width in (1280, 520):
         resize(tab, width, 600)
         tab.press("F", shift=True)
@@ -293,9 +290,9 @@ def resize(tab: Browser, width: int, height: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(1280, 800), (1000, 700), (390, 844)])
-def test_the_picture_fits_the_window(size: tuple[int, int], opened: tuple[Browser, Any]) -> None:
+def test_the_picture_fits_the_window(size: tuple[int, int], page: tuple[Browser, Any]) -> None:
     """Its lower edge is seen without scrolling, upright or not, and the figures above stay in rows of equal length."""
-    tab, _ = opened
+    tab, _ = refreshed(page)
     resize(tab, *size)
     least = min(0.4 * size[1], 0.5 * size[0])
     for width, height in (SIZE, SIZE[::-1]):
@@ -310,9 +307,9 @@ def test_the_picture_fits_the_window(size: tuple[int, int], opened: tuple[Browse
     assert tab.run("document.documentElement.scrollWidth") == size[0]
 
 
-def test_a_phone(opened: tuple[Browser, Any]) -> None:
+def test_a_phone(page: tuple[Browser, Any]) -> None:
     """The headline and the picture come first, with its controls in sight; the table begins with what matters most."""
-    tab, _ = opened
+    tab, _ = refreshed(page)
     resize(tab, 390, 844)
     assert tab.box("headline")["y"] < 40
     assert 60 < tab.box("stage")["y"] < 844 / 3
@@ -359,8 +356,8 @@ def test_a_phone(opened: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_the_colours_follow_the_system_and_the_switch(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
+def test_the_colours_follow_the_system_and_the_switch(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     grounds = []
     for system, scheme in (("dark", ""), ("light", ""), ("light", "dark"), ("dark", "light")):
         tab.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": system}])
@@ -388,9 +385,9 @@ LEFT_AND_RIGHT = "['left', 'right'].map(side => getComputedStyle(id(side)).trans
 
 
 @pytest.mark.slow
-def test_stills_zoom_in_step(opened: tuple[Browser, Any]) -> None:
+def test_stills_zoom_in_step(page: tuple[Browser, Any]) -> None:
     """By double click, wheel, drag and keys: what is below the pointer stays, and both sides show the same part."""
-    tab, _ = opened
+    tab, _ = refreshed(page)
     for mode in ("swipe", "side", "blink"):
         tab.run(f"set('mode', '{mode}'); zoomTo(1)")
         double_click(tab, 0.3, 0.6)
@@ -415,8 +412,8 @@ def test_stills_zoom_in_step(opened: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_fingers_zoom_stills(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
+def test_fingers_zoom_stills(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     resize(tab, 390, 844)
     box = tab.box("stage")
     tab.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
@@ -431,8 +428,8 @@ def test_fingers_zoom_stills(opened: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_moving_framing_and_turning_about_a_point(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
+def test_moving_framing_and_turning_about_a_point(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     tab.run("delete solid.request; set('mode', 'blink'); choose(2); set('left', 2); set('solid', '1')")
     tab.wait(SETTLED)
     place = "solid.camera.matrix.elements.slice(12, 15)"
@@ -467,9 +464,9 @@ def test_moving_framing_and_turning_about_a_point(opened: tuple[Browser, Any]) -
     assert within > 0.8 * total
 
 
-def test_nothing_is_fetched_and_nothing_complains(opened: tuple[Browser, Any]) -> None:
+def test_nothing_is_fetched_and_nothing_complains(page: tuple[Browser, Any]) -> None:
     """After all that the others did."""
-    tab, _ = opened
+    tab, _ = refreshed(page)
     assert [url[:60] for url in tab.requests() if not url.startswith(("file:", "data:", "blob:"))] == []
     assert [url for url in tab.requests() if url.startswith("file:")][1:] == []
     assert [one for one in tab.complaints() if '"level": "warning"' not in one] == []  # of the driver, about its speed

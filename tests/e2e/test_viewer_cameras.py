@@ -106,9 +106,11 @@ def test_conversions_beside_a_result_share_its_cameras(smallest_copy: Path, run:
     assert says(done.err.removeprefix(ERROR), "a.cameras.json", "other cameras", "--overwrite")
 
 
-def test_their_name_is_made_of_the_result_s() -> None:
-    for output, expected in (("small.compressed", "small"), ("a/x.compact", "a/x.compact"), ("a" * 251, "a" * 242)):
-        assert viewer_cameras_path(Path(f"{output}.ply")) == Path(f"{expected}.cameras.json")
+@pytest.mark.parametrize(
+    ("output", "expected"), [("small.compressed", "small"), ("a/x.compact", "a/x.compact"), ("a" * 251, "a" * 242)]
+)
+def test_their_name_is_made_of_the_result_s(output: str, expected: str) -> None:
+    assert viewer_cameras_path(Path(f"{output}.ply")) == Path(f"{expected}.cameras.json")
 
 
 def test_a_folder_with_a_result_and_its_cameras_needs_no_options(smallest_copy: Path, run: Run, tmp_path: Path) -> None:

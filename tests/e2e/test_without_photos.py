@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from scripts import target_psnr
+from shared import write_smallest
 from sweeps import sweep
 
 import gsmerge
@@ -26,10 +27,10 @@ CLOSE = 0.3  # dB between a result fitted to photos and one fitted to colours th
 
 
 @pytest.fixture(scope="module")
-def bare(smallest_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene without its photos. Read only."""
-    folder = tmp_path_factory.mktemp("bare") / "scene"
-    shutil.copytree(smallest_scene, folder, ignore=shutil.ignore_patterns("images"))
+    folder = write_smallest(tmp_path_factory.mktemp("bare") / "scene")
+    shutil.rmtree(folder / "images")
     return folder
 
 
@@ -54,9 +55,7 @@ def test_every_setting_works(options: tuple[object, ...], bare: Path, tmp_path: 
 
 @pytest.mark.slow
 @sweep("effort", ["draft", "fast"])
-def test_as_good_as_with_photos(
-    effort: str, small_scene: Path, tmp_path: Path, target_psnr: Callable[[Path, Path], float]
-) -> None:
+def test_as_good_as_with_photos(effort: str, small_scene: Path, tmp_path: Path) -> None:
     """Judged by photos that neither has seen, over five seeds, between which results so small differ by 0.5 dB."""
     scene, differences = gsmerge.read_scene(small_scene), []
     for seed in range(5):

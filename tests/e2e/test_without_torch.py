@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from shared import make_once, write_small
 
 from gsmerge.cli import main
 from gsmerge.errors import TORCH_INSTALL
@@ -49,24 +50,20 @@ print(json.dumps(done))
 """
 
 
-@pytest.fixture(scope="module")
-def work(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a scene, its compact form and its state. Read only."""
-    folder = tmp_path_factory.mktemp("work")
-    shutil.copytree(small_scene, folder / "scene")
-    scene = str(folder / "scene")
+def make_work(folder: Path) -> None:
+    """Write a scene, its compact form and its state."""
+    scene = str(write_small(folder / "scene"))
     assert main(["compact", scene, *FEW, "--quiet", "-o", str(folder / "small.ply")]) == 0
     assert main(["extend", str(folder / "scene.gsm"), scene, *FEW, "--quiet"]) == 0
-    return folder
 
 
 @pytest.fixture
-def call(work: Path, tmp_path: Path) -> Call:
-    """``call("-m", "gsmerge", ...)`` runs Python in a copy of the folder, as if there were no torch.
+def call(tmp_path: Path) -> Call:
+    """``call("-m", "gsmerge", ...)`` runs Python in a copy of that folder, as if there were no torch.
 
     Nor is there in the processes that it starts.
     """
-    folder = Path(shutil.copytree(work, tmp_path / "work"))
+    folder = Path(shutil.copytree(make_once("work", make_work), tmp_path / "work"))
     start = tmp_path / "start"
     start.mkdir()
     (start / "sitecustomize.py").write_text("import sys\nsys.modules['torch'] = None\n")

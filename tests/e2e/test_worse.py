@@ -11,6 +11,7 @@ import pytest
 from batches import InlinePool, records
 from messages import names
 from scenes import psnr_of
+from shared import write_scene
 from sweeps import sweep
 
 import gsmerge
@@ -25,9 +26,9 @@ SAID = "worse"
 
 
 @pytest.fixture(scope="module")
-def one_photo(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def one_photo(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """The second of three views alone."""
-    folder = make_scene(tmp_path_factory.mktemp("three") / "scene", num_views=3, width=60, height=40)
+    folder = write_scene(tmp_path_factory.mktemp("three") / "scene", num_views=3, width=60, height=40)
     return subset(gsmerge.read_scene(folder), [1])
 
 
@@ -54,7 +55,7 @@ def test_one_photo_is_fitted_though_no_other_shows_what_is_held_out(one_photo: S
     assert report.worse is None
 
 
-@pytest.mark.parametrize("settings", [{"effort": "fast"}, {"fit": "none"}], ids=str)
+@pytest.mark.parametrize("settings", [{"effort": "fast"}, {"fit": "none"}])
 def test_one_photo_without_a_long_fit_gets_more_gaussians(one_photo: Scene, settings: dict[str, Any]) -> None:
     actual = gsmerge.compact(one_photo, threads=1, **settings)
     assert actual.report.options["k"] == 4

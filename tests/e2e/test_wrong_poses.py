@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import motions
 import numpy as np
 import pytest
 from saved_cameras import write_transforms
+from shared import write_scene
 from tiny_scene import edited_json
 
 from gsmerge import to_cameras
@@ -27,9 +27,9 @@ FAST = ("--effort", "fast", "--set", "fit_steps=20", "--json")
 
 
 @pytest.fixture(scope="module")
-def exact(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exact(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Large enough that what cameras are turned by is more than a pixel and a half. Read only."""
-    return make_scene(tmp_path_factory.mktemp("poses") / "scene", num_views=3, width=108, height=72)
+    return write_scene(tmp_path_factory.mktemp("poses") / "scene", num_views=3, width=108, height=72)
 
 
 def turn_cameras(folder: Path, degrees: float, only: int | None = None) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import pytest
 from bare_files import write_without_grid
 from PIL import Image
+from shared import write_small
 
 from gsmerge.cli import app, main
 
@@ -184,11 +184,11 @@ NEED_THE_SCENE = {  # to be known as wrong: refused by the plan, all others befo
 
 
 @pytest.fixture(scope="module")
-def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder that the calls are run in. Read only."""
     folder = tmp_path_factory.mktemp("prepared") / "work"
-    shutil.copytree(small_scene, folder / "room")
-    write_without_grid(small_scene / "scene.ply", folder / "alone.ply")
+    room = write_small(folder / "room")
+    write_without_grid(room / "scene.ply", folder / "alone.ply")
     (folder / "other").mkdir()
     for name in "012":
         Image.new("RGB", (20, 30)).save(folder / f"other/view_00{name}.png")
@@ -205,7 +205,7 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     small = ["--set", "superpixels=60", "--set", "checkpoint=none", "--quiet"]
     paper = ["--set", "superpixels=60", "--set", "recipe=paper", "--quiet"]
     for name, words in (("room", small), ("state", small), ("paper", paper)):
-        assert main(["extend", str(folder / f"{name}.gsm"), str(small_scene), *words]) == 0
+        assert main(["extend", str(folder / f"{name}.gsm"), str(room), *words]) == 0
     return folder
 
 

@@ -49,6 +49,7 @@ class Bar:
     """ComfyUI's ``ProgressBar``; ``seen`` has what was set, of all bars."""
 
     seen: ClassVar[list[int]] = []
+    cancelled: ClassVar[list[bool]] = []
 
     def __init__(self, total: int) -> None:
         self.total = total
@@ -58,8 +59,8 @@ class Bar:
         self.seen.append(value)
 
 
-def modules(folder: Path, cancel: list[bool]) -> dict[str, ModuleType]:
-    """Return the modules by name; ``cancel`` not empty: the run is to end. Files go below ``folder``."""
+def modules(folder: Path) -> dict[str, ModuleType]:
+    """Return the modules by name. Files go below ``folder``; a run ends once ``Bar.cancelled`` is not empty."""
 
     def module(name: str, **content: Any) -> ModuleType:
         new = ModuleType(name)
@@ -67,7 +68,7 @@ def modules(folder: Path, cancel: list[bool]) -> dict[str, ModuleType]:
         return new
 
     def check() -> None:
-        if cancel:
+        if Bar.cancelled:
             raise CancelError
 
     def save_path(prefix: str, outputs: str) -> tuple[str, str, int, str, str]:

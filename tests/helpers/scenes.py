@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -255,6 +256,7 @@ def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
     )
 
 
+@cache
 def self_made(degree: int, views: int = 3) -> tuple[Scene, Gaussians]:
     """A scene whose photos show exactly these Gaussians."""
     scene = make_scene(room(), arc(views, 48, 36), degree=degree)

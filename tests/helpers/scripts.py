@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
 
 def load_script(path: Path) -> ModuleType:
     """Load a script as a module; its name may start with a digit."""
@@ -20,3 +22,9 @@ def load_script(path: Path) -> ModuleType:
     sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
+
+
+def target_psnr(targets: Path, ply: Path) -> float:
+    """Return the PSNR of a result on held-out photos, as the measuring example computes it, dB."""
+    measured: float = load_script(EXAMPLES / "03_measure_targets.py").target_psnr(targets, ply)
+    return measured

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -16,3 +17,19 @@ def sweep(names: str | Sequence[str], values: Iterable[Any], *, often: int = 1, 
         for i, value in enumerate(values)
     ]
     return pytest.mark.parametrize(names, cases, **options)
+
+
+def in_words(value: object) -> str | None:
+    """Name a case by its value: settings as ``k=2 fit=none``, words of a list, and of the name of a function.
+
+    None of what has no short text, which pytest names by the argument and a number.
+    """
+    if callable(value):
+        return value.__name__.replace("_", " ") if value.__name__ != "<lambda>" else None
+    if not isinstance(value, dict | list | tuple | set):
+        return None
+    text = repr(sorted(value) if isinstance(value, set) else value)
+    if len(text) > 100 or " at 0x" in text or "array(" in text:
+        return None
+    words = re.sub(r"[\[\](){}'\",]", "", text).replace(": ", "=")
+    return words or ("defaults" if isinstance(value, dict) else "none")

@@ -64,9 +64,9 @@ def test_rotations_of_zero_and_tiny_ones(size: float) -> None:
     assert_same(rows, 0)
 
 
-def test_other_types_are_taken_by_columns() -> None:
+@pytest.mark.parametrize("kinds", [{"x": "<f8"}, {"f_dc_0": "<i2"}, {"opacity": ">f4"}])
+def test_other_types_are_taken_by_columns(kinds: dict[str, str]) -> None:
     rows = make_rows(0)
-    for kinds in ({"x": "<f8"}, {"f_dc_0": "<i2"}, {"opacity": ">f4"}):
-        other = rows.astype([(name, kinds.get(name, "<f4")) for name in rows.dtype.names or ()])
-        assert _convert_plain(other, empty_arrays(0)) == 0
-        assert_same(other, 0, "f8" if "x" in kinds else "f4")
+    other = rows.astype([(name, kinds.get(name, "<f4")) for name in rows.dtype.names or ()])
+    assert _convert_plain(other, empty_arrays(0)) == 0
+    assert_same(other, 0, "f8" if "x" in kinds else "f4")

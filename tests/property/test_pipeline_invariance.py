@@ -40,7 +40,7 @@ CASES = [
 ]  # fmt: skip
 
 
-@sweep("settings", CASES, ids=str)
+@sweep("settings", CASES)
 def test_threads_change_no_bit(settings: dict) -> None:
     actual = [scenes.compacted(ROOM, threads=threads, **settings).gaussians for threads in (1, 3)]
     assert scenes.identical(*actual)

@@ -24,7 +24,6 @@ def scene() -> Scene:
         {"fit": "none", "checkpoint": "none"},
         {"budget": "8%", "fit_steps": 30, "effort": "best"},  # grows
     ],
-    ids=str,
 )
 def test_one_view_at_a_time_or_all(scene: Scene, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]) -> None:
     actual = []

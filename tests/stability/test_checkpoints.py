@@ -31,7 +31,6 @@ PLAIN = {"fit": "none", "match": "none", "superpixels": 100, "poses": "fixed"}
         {"fit": "full", "fit_steps": 4},
         {"budget": 150},
     ],
-    ids=str,
 )
 def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(2, 32, 24))
@@ -47,20 +46,27 @@ def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: 
     assert "refine" in networks.report.seconds
 
 
-def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
-    scene = make_scene(room(), arc(3, 32, 24))
-    chosen = {"fit": "none", "superpixels": "10%", "poses": "fixed"}
+def compact_shuffled(path: Path, **settings: object) -> gsmerge.Gaussians:
+    """Compact a scene whose rows are in no order."""
+    scene = shuffled(make_scene(room(), arc(3, 32, 24)))
+    chosen = {"fit": "none", "superpixels": "10%", "poses": "fixed", "checkpoint": str(path)}
+    return gsmerge.compact(scene, **chosen, **settings).gaussians
+
+
+def test_networks_change_scenes_in_no_order(tmp_path: Path) -> None:
     path = written(tmp_path / "a.safetensors", untrained())
-    unaligned = shuffled(scene)
-    plain = gsmerge.compact(unaligned, **chosen, checkpoint=str(path))  # which assigns rows by their centres
-    written(path, noisy())
-    one = gsmerge.compact(unaligned, **chosen, checkpoint=str(path), threads=1)
-    assert_invariants(one.gaussians, scene)
-    assert not np.array_equal(one.gaussians.means[:20], plain.gaussians.means[:20])
-    assert identical(one.gaussians, gsmerge.compact(unaligned, **chosen, checkpoint=str(path), threads=3).gaussians)
+    plain = compact_shuffled(path)  # which assigns rows by their centres
+    changed = compact_shuffled(written(path, noisy()))
+    assert_invariants(changed, make_scene(room(), arc(3, 32, 24)))
+    assert not np.array_equal(changed.means[:20], plain.means[:20])
 
 
-@sweep("settings", [{"levels": 2}, {}, {"quality": "15dB"}], ids=str)
+def test_networks_give_scenes_in_no_order_the_same_bits_on_any_number_of_threads(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.safetensors", noisy())
+    assert identical(compact_shuffled(path, threads=1), compact_shuffled(path, threads=3))
+
+
+@sweep("settings", [{"levels": 2}, {}, {"quality": "15dB"}])
 def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(2))
     path = written(tmp_path / "a.safetensors", noisy())
@@ -72,14 +78,14 @@ def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: d
     assert any("checkpoint" in note for note in rival.report.notes)
 
 
-@pytest.mark.parametrize("damage", ["missing", "truncated"])
+@pytest.mark.parametrize("damage", ["missing", "cut off"])
 def test_networks_of_the_package_that_cannot_be_used_are_noted(
     tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = make_scene(room(), arc(2))
     path = tmp_path / "a.safetensors"
     plain = gsmerge.compact(scene, **PLAIN, checkpoint="none")
-    if damage == "truncated":
+    if damage == "cut off":
         path.write_bytes(written(path, noisy()).read_bytes()[:-100])
     monkeypatch.setitem(IN_PACKAGE, "shipped", path)
     fallen = gsmerge.compact(scene, **PLAIN, checkpoint="shipped")
@@ -88,27 +94,32 @@ def test_networks_of_the_package_that_cannot_be_used_are_noted(
     assert "networks" not in fallen.report.choices
 
 
-@sweep("options", [{}, {"method": "random", "budget": 40}], ids=str)
+@sweep("options", [{}, {"method": "random", "budget": 40}])
 def test_a_file_that_is_named_must_be_usable(tmp_path: Path, options: dict[str, object]) -> None:
     with pytest.raises(gsmerge.SceneError, match="nosuch: expected a checkpoint, found no such file"):
         gsmerge.compact(make_scene(room(), arc(2)), **PLAIN | options, checkpoint=str(tmp_path / "nosuch"))
 
 
-def test_a_checkpoint_that_is_required_must_be_usable(tmp_path: Path) -> None:
-    scene, path = make_scene(room(), arc(2)), tmp_path / "a.safetensors"
+def test_a_required_checkpoint_that_is_missing_is_refused(tmp_path: Path) -> None:
     with pytest.raises(gsmerge.SceneError, match=r"a\.safetensors"):
-        gsmerge.compact(scene, **PLAIN, checkpoint=str(path), require_checkpoint=True)
+        compact_shuffled(tmp_path / "a.safetensors", require_checkpoint=True)
+
+
+def test_no_checkpoint_and_a_required_one_contradict() -> None:
     with pytest.raises(ValueError, match="require_checkpoint"):
-        gsmerge.compact(scene, **PLAIN, checkpoint="none", require_checkpoint=True)
-    written(path, noisy())
+        compact_shuffled(Path("none"), require_checkpoint=True)
+
+
+def test_a_required_checkpoint_with_nan_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.safetensors", noisy())
     arrays = load_file(path)
     arrays["encoder.latent.bias"][0] = float("nan")
     save_file(arrays, path)
     with pytest.raises(gsmerge.SceneError):
-        gsmerge.compact(scene, **PLAIN, checkpoint=str(path), require_checkpoint=True)
+        compact_shuffled(path, require_checkpoint=True)
 
 
-@sweep("k", [1, 2, 4], often=2)
+@sweep("k", [1, 2, 4], often=2, ids="k={}".format)
 def test_weights_a_hundred_times_as_large_stay_within_the_bounds(tmp_path: Path, k: int) -> None:
     scene = make_scene(room(), arc(2))
     path = written(tmp_path / "a.safetensors", scaled(noisy(), 100))

@@ -45,7 +45,7 @@ def test_exposure_of_photos_and_gaussians(room: Scene) -> None:
 # 30, 31: nothing to see, and too much
 
 
-@sweep("grey", [0.0, 0.5, 1.0])
+@sweep("grey", [0.0, 0.5, 1.0], ids=["black", "grey", "white"])
 @sweep("segmentation", ["rdseg", "bass-st"])
 def test_flat_pictures(room: Scene, grey: float, segmentation: str) -> None:
     flat = painted(room, np.full_like(room.images, grey))
@@ -76,7 +76,7 @@ def shiny(scene: Scene, strength: float) -> Scene:
     return replace(made, images=images.astype(np.float32))
 
 
-@sweep("settings", [{"fit_steps": 10}, {}, {"fit": "none"}, {"k": 2}], ids=str)
+@sweep("settings", [{"fit_steps": 10}, {}, {"fit": "none"}, {"k": 2}])
 def test_harmonics_survive(room: Scene, settings: dict) -> None:
     scene = shiny(room, 0.3)
     actual = compacted(scene, **settings).gaussians

@@ -43,7 +43,7 @@ def coverage(gaussians: Gaussians, scene: Scene) -> tuple[float, float]:
 # 47: more children, more detail
 
 
-@sweep("settings", [{"fit": "none", "checkpoint": "none"}, {}], ids=str)
+@sweep("settings", [{"fit": "none", "checkpoint": "none"}, {}])
 def test_more_children_show_more(scene: Scene, settings: dict) -> None:
     actual = [compacted(scene, superpixels="4.4%", k=k, **settings).gaussians for k in (1, 2, 4, 8)]
     assert (np.diff([len(g) for g in actual]) > 0).all()
@@ -51,7 +51,7 @@ def test_more_children_show_more(scene: Scene, settings: dict) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [{"fit": "none", "checkpoint": "none"}, {}], ids=str)
+@pytest.mark.parametrize("settings", [{"fit": "none", "checkpoint": "none"}, {}])
 def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
     actual = [compacted(scene, superpixels=share, **settings).gaussians for share in ("1%", "3%", "10%")]
     assert (np.diff([len(g) for g in actual]) > 0).all()
@@ -61,7 +61,7 @@ def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
 # 48: coverage and brightness
 
 
-@sweep("settings", [{}, {"k": 4}, {"match": "none"}], ids=str)
+@sweep("settings", [{}, {"k": 4}, {"match": "none"}])
 def test_photos_keep_coverage_and_brightness(scene: Scene, settings: dict) -> None:
     """What is not merged across views loses 1.1 % over four seeds, the rest half of that."""
     before = coverage(scene.gaussians, scene)
@@ -75,7 +75,7 @@ def test_photos_keep_coverage_and_brightness(scene: Scene, settings: dict) -> No
 LOSSES = {(1, 1): 0.34, (1, 4): 0.16, (3, 1): 0.23, (3, 4): 0.08}
 
 
-@sweep(("views", "k"), list(LOSSES), often=2)
+@sweep(("views", "k"), list(LOSSES), ids=[f"{views} views k={k}" for views, k in LOSSES], often=2)
 def test_plain_merging_loses_a_known_part_of_coverage(clean: Scene, views: int, k: int) -> None:
     own = scenes.take_views(clean, list(range(views)))
     before = coverage(own.gaussians, own)
@@ -87,7 +87,7 @@ def test_plain_merging_loses_a_known_part_of_coverage(clean: Scene, views: int, 
 # 55: glass
 
 
-@sweep("settings", [{"fit": "none"}, {}, {"match": "none"}], ids=str)
+@sweep("settings", [{"fit": "none"}, {}, {"match": "none"}])
 def test_faint_scenes_are_not_pruned(scene: Scene, settings: dict) -> None:
     opacities = np.full_like(scene.gaussians.opacities, 0.05)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
@@ -96,7 +96,7 @@ def test_faint_scenes_are_not_pruned(scene: Scene, settings: dict) -> None:
     assert len(actual) > 0.8 * len(usual)
 
 
-@pytest.mark.parametrize("match", ["overlap", "none"])
+@pytest.mark.parametrize("match", ["overlap", "none"], ids="match={}".format)
 def test_faint_scenes_keep_their_coverage(clean: Scene, match: str) -> None:
     """Where little is hidden, integrated optical depth is what is seen; in pictures so fine that the low-pass of the
     renderer, which thickens small Gaussians, does not count."""

@@ -42,7 +42,7 @@ def one_group_per_view(scene: Scene) -> FeatureGaussians:
 # 1: coincident Gaussians
 
 
-@sweep("settings", [{"fit_steps": 10}, {}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
+@sweep("settings", [{"fit_steps": 10}, {}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}])
 def test_all_gaussians_in_one_place(room: Scene, settings: dict) -> None:
     columns = {name: getattr(room.gaussians, name) for name in scenes.FIELDS}
     first = {name: np.broadcast_to(column[:1], column.shape) for name, column in columns.items()}
@@ -86,7 +86,7 @@ def test_flat_groups_have_a_smallest_scale(small: Scene, axes: list[int]) -> Non
 # 4 to 6: needles, overflow, oversized members
 
 
-@pytest.mark.parametrize("size", [2, 3, 4, 16])
+@pytest.mark.parametrize("size", [2, 3, 4, 16], ids="{} Gaussians".format)
 def test_needle_in_a_group(small: Scene, size: int) -> None:
     """Aspect 1e4: the merged Gaussian keeps within three times the group's extent."""
     pixels = np.arange(small.pixels.shown.size).reshape(small.pixels.shown.shape)
@@ -98,7 +98,7 @@ def test_needle_in_a_group(small: Scene, size: int) -> None:
     assert float(actual.scales.max()) <= 3 * extent
 
 
-@sweep("settings", [{"fit_steps": 10}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
+@sweep("settings", [{"fit_steps": 10}, {"fit": "none"}, {"fit": "none", "k": 4}])
 def test_scales_at_the_ends_of_the_range(room: Scene, settings: dict) -> None:
     scales = room.gaussians.scales.copy()
     scales[::30] = 2e17  # exp(40)
@@ -120,7 +120,7 @@ def test_oversized_members_cost_less_than_a_decibel(room: Scene) -> None:
 # 7: transparent groups
 
 
-@sweep("k", [1, 4])
+@sweep("k", [1, 4], ids="k={}".format)
 def test_transparent_pixels_leave_nothing(room: Scene, k: int) -> None:
     opacities = room.gaussians.opacities.copy().reshape(room.pixels.shown.shape)
     opacities[0] = 0
@@ -131,8 +131,8 @@ def test_transparent_pixels_leave_nothing(room: Scene, k: int) -> None:
     scenes.assert_same_set(actual, others, atol=1e-4)
 
 
-@sweep("fit", ["full", "none"])
-@pytest.mark.parametrize("opacity", [0.0, 1e-5])
+@sweep("fit", ["full", "none"], ids="fit={}".format)
+@pytest.mark.parametrize("opacity", [0.0, 1e-5], ids="opacity {:g}".format)
 def test_wholly_transparent_scene(room: Scene, opacity: float, fit: str) -> None:
     scene = changed(room, opacities=np.full_like(room.gaussians.opacities, opacity))
     scenes.compacted(scene, fit=fit, fit_steps=10)
@@ -185,7 +185,7 @@ def test_huge_gaussian_in_front_of_one_camera(room: Scene) -> None:
 
 
 @sweep("where", ["at", "behind"])
-@sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
+@sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "k": 4}])
 def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: dict) -> None:
     means = room.gaussians.means.copy().reshape(3, 36, 48, 3)
     eyes = room.cameras.centres[:, None, None]
@@ -199,7 +199,7 @@ def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: d
 # 15, 16: depth edges
 
 
-@sweep("settings", [{"fit_steps": 40}, {}, {"fit": "none"}, {"k": 2}], ids=str)
+@sweep("settings", [{"fit_steps": 40}, {}, {"fit": "none"}, {"k": 2}])
 def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     sky = [scenes.plane(2.0, scenes.waves(1), right=0.0), scenes.plane(8e5, scenes.flat(0.1, 0.2, 1.0))]
     scene = scenes.make_scene(sky, scenes.arc(3))
@@ -229,7 +229,7 @@ def test_no_curtain_across_a_depth_edge_of_one_colour() -> None:
 # 17: thin things
 
 
-@sweep("settings", [{"fit_steps": 40}, {}, {"k": 2}, {"fit": "none"}], ids=str)
+@sweep("settings", [{"fit_steps": 40}, {}, {"k": 2}, {"fit": "none"}])
 def test_thin_pole_stays_visible_from_a_new_view(settings: dict) -> None:
     """Two pixels wide; contrast against the wall beside it."""
     scene = scenes.make_scene(scenes.pole(), scenes.arc(3))

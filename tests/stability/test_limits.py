@@ -14,6 +14,7 @@ from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
 
 VIEWS = 4
+LONG = [(1024, 2), (4096, 1), (4096, 8), (8, 4096)]
 PLAIN = {"fit": "none", "checkpoint": "none"}
 
 
@@ -26,7 +27,7 @@ def unaligned(scene: Scene) -> Scene:
     return Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
 
 
-@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}], ids=str)
+@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}])
 def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
     """One Gaussian for each view: met, visible, in the colours of the scene; and one fewer is refused."""
     result = scenes.compacted(room, superpixels="auto", budget=VIEWS, **settings)
@@ -39,7 +40,7 @@ def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
         compact(room, budget=VIEWS - 1, **settings)
 
 
-@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}], ids=str)
+@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}])
 def test_a_budget_of_everything(room: Scene, settings: dict[str, Any]) -> None:
     result = scenes.compacted(room, superpixels="auto", budget="100%", fill=True, match="none", **settings)
     assert len(result.gaussians) == room.num_gaussians
@@ -54,8 +55,8 @@ def test_a_budget_of_every_unaligned_gaussian_changes_none(room: Scene) -> None:
 
 
 @sweep("aligned", [True, False], ids=["aligned", "unaligned"], often=2)
-@sweep("budget", [5, 97, 500, 1501], often=2)
-@sweep("settings", [{}, PLAIN, {"k": 2}, {"k": 8, **PLAIN}, {"segmentation": "grid"}], ids=str, often=2)
+@sweep("budget", [5, 97, 500, 1501], ids="budget={}".format, often=2)
+@sweep("settings", [{}, PLAIN, {"k": 2}, {"k": 8, **PLAIN}, {"segmentation": "grid"}], often=2)
 def test_budgets_without_a_fit_are_met(room: Scene, budget: int, settings: dict[str, Any], aligned: bool) -> None:
     scene = room if aligned else unaligned(room)
     result = compact(scene, budget=budget, **{"fit": "none", **settings})
@@ -64,7 +65,7 @@ def test_budgets_without_a_fit_are_met(room: Scene, budget: int, settings: dict[
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}], ids=str)
+@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}])
 def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(400, 8, 6))
     result = scenes.compacted(scene, **settings)
@@ -73,8 +74,8 @@ def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
     assert scenes.psnr_of(result.gaussians, few) > scenes.psnr_of(scene.gaussians, few) - 1
 
 
-@sweep("size", [(1024, 2), (4096, 1), (4096, 8), (8, 4096)])
-@sweep("settings", [PLAIN, {"fit_steps": 10}], ids=str)
+@sweep("size", LONG, ids=[f"{width} x {height}" for width, height in LONG])
+@sweep("settings", [PLAIN, {"fit_steps": 10}])
 def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
     width, height = size
     cameras = scenes.arc(2, *size)

@@ -31,13 +31,14 @@ def chain(count: int, apart: float) -> FeatureGaussians:
     return scenes.make_features(means, sizes=SIZE, views=np.arange(count) % 7)
 
 
-@sweep("apart", [0.5, 0.2, 1.0, 1.5])
-def test_chain_of_a_thousand_does_not_collapse(apart: float) -> None:
+@sweep("apart", [0.5, 0.2, 1.0, 1.5], ids="{} deviations apart".format)
+# One of each of the seven views is in a cluster, unless told
+@pytest.mark.parametrize(("size", "most"), [(None, 7), (4, 4)], ids=["one of each view", "cluster_size=4"])
+def test_chain_of_a_thousand_does_not_collapse(size: int | None, most: int, apart: float) -> None:
     features = chain(1000, apart)
-    for size, most in ((None, 7), (4, 4)):  # one of each of the seven views, unless told
-        actual = diameters(features, cluster_size=size)
-        assert actual.max() <= 2 * np.sqrt(-8 * np.log(0.7))  # two leaders' reaches: exp(-d^2 / 8) = 0.7
-        assert len(actual) >= 1000 / most
+    actual = diameters(features, cluster_size=size)
+    assert actual.max() <= 2 * np.sqrt(-8 * np.log(0.7))  # two leaders' reaches: exp(-d^2 / 8) = 0.7
+    assert len(actual) >= 1000 / most
 
 
 def test_chain_of_boxes_does_not_collapse() -> None:
@@ -81,7 +82,7 @@ def opposite_cameras(width: int = 32, height: int = 24) -> Cameras:
     return Cameras(np.stack(viewmats), scenes.intrinsics(2, width, height), width, height)
 
 
-@pytest.mark.parametrize("method", ["overlap", "aabb"])
+@pytest.mark.parametrize("method", ["overlap", "aabb"], ids="match={}".format)
 def test_two_sides_of_a_sheet_are_not_merged(method: str) -> None:
     """One colour, two footprints apart, each side seen by its own view."""
     grey, cameras = scenes.flat(0.5, 0.5, 0.5), opposite_cameras()
@@ -94,7 +95,7 @@ def test_two_sides_of_a_sheet_are_not_merged(method: str) -> None:
     assert (np.abs(off - 1) < 0.2).all()
 
 
-@pytest.mark.parametrize("method", ["overlap", "aabb"])
+@pytest.mark.parametrize("method", ["overlap", "aabb"], ids="match={}".format)
 def test_repeated_texture_is_not_merged(method: str) -> None:
     """Every Feature Gaussian looks like every other, and none is near another."""
     rng = np.random.default_rng(0)

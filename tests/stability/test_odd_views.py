@@ -22,7 +22,7 @@ def room() -> Scene:
 # 21: one view several times
 
 
-@sweep("times", [3, 2, 6])
+@sweep("times", [3, 2, 6], ids="{} times".format)
 def test_repeated_view_counts_once_and_looks_the_same(room: Scene, times: int) -> None:
     single, repeated = scenes.take_views(room, [0]), scenes.take_views(room, [0] * times)
     one, many = scenes.plain(single), scenes.plain(repeated)
@@ -126,7 +126,7 @@ def test_wrong_poses_degrade_step_by_step(room: Scene) -> None:
     assert auto[-1] > fixed[-1] + 2
 
 
-@sweep("degrees", DEGREES)
+@sweep("degrees", DEGREES, ids="{} degrees off".format)
 def test_fit_never_hurts_under_wrong_poses(room: Scene, degrees: float) -> None:
     scene = misplaced(room, degrees)
     fitted, unfitted = (scenes.compacted(scene, fit=fit) for fit in ("full", "none"))

@@ -58,7 +58,7 @@ def test_extreme_gaussians(rows: list[tuple[object, ...]], size: tuple[int, int]
     assert_sane(make(*(list(column) for column in zip(*rows, strict=True)), degree=1), camera(*size))
 
 
-@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e30])
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e30], ids="scale {:g}".format)
 def test_scales_of_any_size(scale: float) -> None:
     gaussians = make([[0, 0, 1.0]] * 3, [[1, 0, 0, 0]] * 3, [[scale] * 3, [scale, 1, 1], [1, 1, scale]], [0.5] * 3)
     assert_sane(gaussians, camera(20, 20))

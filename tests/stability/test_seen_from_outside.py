@@ -95,7 +95,7 @@ def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
     assert (result.gaussians.opacities >= 1 / 255).all()
 
 
-@sweep("settings", [{"effort": "draft"}, {"effort": "fast"}, {"k": 4}, {"budget": "20%"}], ids=str)
+@sweep("settings", [{"effort": "draft"}, {"effort": "fast"}, {"k": 4}, {"budget": "20%"}])
 def test_every_effort_and_size(settings: dict[str, object]) -> None:
     scene = room()
     result = scenes.compacted(scene, **settings)

@@ -43,7 +43,7 @@ def test_positions_stay_exact_in_wide_pictures() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("density", DENSITIES, ids="{} superpixels".format)
 def test_photos_are_described_well(density: int, floor: Callable[..., None]) -> None:
     scores = []
     for image in photos().values():

@@ -1,8 +1,7 @@
-"""Fixtures around the tiny scene, and copies of made ones."""
+"""Fixtures around the tiny scene."""
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -15,12 +14,6 @@ def tiny() -> Tiny:
 
 
 @pytest.fixture
-def tiny_folder(tmp_path: Path, tiny: Tiny) -> Path:
+def tiny_folder(tmp_path: Path) -> Path:
     """The tiny scene with transforms.json and images/."""
-    return tiny.save(tmp_path / "scene")
-
-
-@pytest.fixture
-def folder(made: Path, tmp_path: Path) -> Path:
-    """A copy of the module's scene ``made`` that a test may change."""
-    return Path(shutil.copytree(made, tmp_path / "scene"))
+    return make_tiny().save(tmp_path / "scene")

@@ -6,27 +6,38 @@ import gc
 import html
 import pickle
 import re
-from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
+from shared import make_once, write_scene
 
 import gsmerge
 
 
-@pytest.fixture(scope="module")
-def tiny_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_scene(tmp_path_factory.mktemp("tiny") / "scene", num_views=3, width=32, height=24)
+def write_tiny(folder: Path) -> None:
+    write_scene(folder, num_views=3, width=32, height=24)
+
+
+@cache
+def read_tiny() -> gsmerge.Scene:
+    """Return the scene, one object for all tests: a result shows its scene as long as that is there."""
+    return gsmerge.read_scene(make_once("notebooks", write_tiny))
 
 
 @pytest.fixture(scope="module")
-def scene(tiny_scene: Path) -> gsmerge.Scene:
-    return gsmerge.read_scene(tiny_scene)
+def tiny_scene() -> Path:
+    return make_once("notebooks", write_tiny)
 
 
 @pytest.fixture(scope="module")
-def result(scene: gsmerge.Scene) -> gsmerge.CompactResult:
-    return gsmerge.compact(scene, effort="draft", budget=100, levels=2)
+def scene() -> gsmerge.Scene:
+    return read_tiny()
+
+
+@pytest.fixture(scope="module")
+def result() -> gsmerge.CompactResult:
+    return gsmerge.compact(read_tiny(), effort="draft", budget=100, levels=2)
 
 
 @pytest.mark.slow

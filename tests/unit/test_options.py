@@ -64,7 +64,6 @@ def test_every_setting_is_documented(stage: str) -> None:
         {"min_opacity": -1.0}, {"overlap": float("nan")}, {"compactness": 2.0}, {"iou": 1.1}, {"similarity": -1.1},
         {"blocks": 0}, {"blocks": "some"}, {"blocks": True},
     ],
-    ids=str,
 )  # fmt: skip
 def test_values_out_of_range_are_refused_before_any_work(setting: dict) -> None:
     (name,) = setting

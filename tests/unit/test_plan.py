@@ -121,16 +121,21 @@ def test_networks_are_loaded_where_they_help(
     assert choose_networks(options_of(**settings), size) == name
 
 
-def test_quick_efforts_run_the_heads_alone(scene: Scene) -> None:
-    """Unless the networks are named: the refiner takes ten times as long."""
-    for settings, refines in (
-        ({}, True), ({"effort": "fast"}, False), ({"effort": "draft"}, False),
+@pytest.mark.parametrize(
+    ("settings", "refines"),
+    [
+        ({}, True),
+        ({"effort": "fast"}, False),
+        ({"effort": "draft"}, False),
         ({"effort": "draft", "checkpoint": "shipped"}, True),
-    ):  # fmt: skip
-        networks = plan_of(scene, fit="none", **settings).networks
-        assert networks.options.refiner is refines
-        assert any(name.startswith("heads.4") for name in networks.arrays)
-        assert any(name.startswith("refiner") for name in networks.arrays) is refines
+    ],
+)
+def test_quick_efforts_run_the_heads_alone(settings: dict[str, Any], refines: bool, scene: Scene) -> None:
+    """Unless the networks are named: the refiner takes ten times as long."""
+    networks = plan_of(scene, fit="none", **settings).networks
+    assert networks.options.refiner is refines
+    assert any(name.startswith("heads.4") for name in networks.arrays)
+    assert any(name.startswith("refiner") for name in networks.arrays) is refines
 
 
 def test_missing_networks_of_the_package_are_noted(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +146,7 @@ def test_missing_networks_of_the_package_are_noted(scene: Scene, monkeypatch: py
     assert "networks" in record.notes[0]
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"effort": "draft"}, {"quality": "20dB"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"effort": "draft"}, {"quality": "20dB"}])
 def test_without_photos_a_plan_is_the_same_where_pixels_are_known(settings: dict[str, Any], scene: Scene) -> None:
     """Their colours stand in; the estimate, which looks at no colour, knows that."""
     blind, options = replace(scene, images=None), options_of(**settings)
@@ -179,9 +184,7 @@ def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason:
         plan_of(unaligned_scenes.without_order(replace(scene, images=None)), **settings)
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"budget": "auto"}, {"effort": "draft"}, {"crop": "sphere:0,0,0,1e4"}], ids=str
-)
+@pytest.mark.parametrize("settings", [{}, {"budget": "auto"}, {"effort": "draft"}, {"crop": "sphere:0,0,0,1e4"}])
 def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     kept = plan_of(rows, **settings)
@@ -191,7 +194,7 @@ def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings:
     assert estimate(rows, options_of(**settings))["fit"] == "full"  # to the renders, as the run does
 
 
-@pytest.mark.parametrize("settings", [{"budget": 100}, {"k": 2}, {"superpixels": "5%"}, {"quality": "20dB"}], ids=str)
+@pytest.mark.parametrize("settings", [{"budget": 100}, {"k": 2}, {"superpixels": "5%"}, {"quality": "20dB"}])
 def test_what_asks_for_a_count_decides_it(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     assert plan_of(rows, **settings).target_psnr == (20 if "quality" in settings else None)
@@ -226,13 +229,13 @@ def test_photos_decide_the_count_where_rows_are_fewer_than_pixels(scene: Scene) 
     assert not plan_of(unaligned_scenes.without_order(scene)).keeps_fidelity  # a share is enough of as many as pixels
 
 
-def test_few_rows_are_noted_with_the_option_that_gives_more(scene: Scene) -> None:
+@pytest.mark.parametrize(("step", "is_few"), [(3, True), (1, False)])
+def test_few_rows_are_noted_with_the_option_that_gives_more(step: int, is_few: bool, scene: Scene) -> None:
     """As a state has, whose result keeps what it shows, and could show the photos better."""
-    for step, is_few in ((3, True), (1, False)):
-        rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), step))
-        with record_run(None) as record:
-            plan_of(rows)
-        assert noted(record.notes, f"{len(rows.gaussians):,} Gaussians", "--budget") == is_few
+    rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), step))
+    with record_run(None) as record:
+        plan_of(rows)
+    assert noted(record.notes, f"{len(rows.gaussians):,} Gaussians", "--budget") == is_few
 
 
 def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) -> None:
@@ -297,7 +300,7 @@ OPEN = [  # merging across views, and what photos show, decide how many there ar
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("settings", SETTLED + OPEN, ids=str)
+@pytest.mark.parametrize("settings", SETTLED + OPEN)
 def test_the_estimate_is_what_the_run_does(
     settings: dict[str, Any], scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -119,11 +119,11 @@ def test_a_view_that_shows_nothing_says_nothing_of_a_result(scene: Scene) -> Non
     assert 15 < fidelity["psnr"] < 35
 
 
-def test_counts_and_cameras_are_as_asked_for(scene: Scene) -> None:
-    for settings in ({"budget": 200}, {"superpixels": 25, "k": 2}):
-        result = compact(scene, fit_steps=150, **settings)
-        assert len(result.gaussians) == 200
-        np.testing.assert_array_equal(result.cameras.viewmats, scene.cameras.viewmats)
+@pytest.mark.parametrize("settings", [{"budget": 200}, {"superpixels": 25, "k": 2}])
+def test_counts_and_cameras_are_as_asked_for(settings: dict[str, object], scene: Scene) -> None:
+    result = compact(scene, fit_steps=150, **settings)
+    assert len(result.gaussians) == 200
+    np.testing.assert_array_equal(result.cameras.viewmats, scene.cameras.viewmats)
 
 
 def test_the_plan_and_its_estimate_say_so(scene: Scene) -> None:

@@ -178,7 +178,7 @@ def test_pixels_of_a_grid_with_gaps() -> None:
     assert np.array_equal(replace(scene(), gaussians=gaussians(22), pixels=pixels).covered, shown)
 
 
-@pytest.mark.parametrize("views", [[0], [1], [1, 0], [0, 0, 1]], ids=str)
+@pytest.mark.parametrize("views", [[0], [1], [1, 0], [0, 0, 1]])
 def test_pixels_of_some_views(views: list[int]) -> None:
     shown = np.random.default_rng(0).random((2, 3, 4)) < 0.7
     pixels = Pixels.of_grid(shown)
@@ -245,7 +245,7 @@ def test_an_index_selects_rows(index: Any) -> None:
     assert gaussians(2)[index] == gaussians(1, start=1)
 
 
-@pytest.mark.parametrize("change", [{"images": np.zeros((2, 4, 3, 3))}, {"names": ("a",)}], ids=str)
+@pytest.mark.parametrize("change", [{"images": np.zeros((2, 4, 3, 3))}, {"names": ("a",)}])
 def test_wrong_views_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="expected"):
         replace(views(), **change)

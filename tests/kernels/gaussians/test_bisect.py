@@ -96,11 +96,11 @@ def test_every_member_is_in_exactly_one_child(seed: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_children_nest(seed: int) -> None:
+@pytest.mark.parametrize(("coarse", "fine"), [(1, 2), (2, 3), (2, 4), (4, 8)])
+def test_children_nest(coarse: int, fine: int, seed: int) -> None:
     case = Case(seed)
-    for coarse, fine in ((1, 2), (2, 3), (2, 4), (4, 8)):
-        for large, small in zip(case.children(coarse), case.children(fine), strict=True):
-            assert all(any(part <= whole for whole in large) for part in small)
+    for large, small in zip(case.children(coarse), case.children(fine), strict=True):
+        assert all(any(part <= whole for whole in large) for part in small)
 
 
 @pytest.mark.parametrize("seed", range(6))

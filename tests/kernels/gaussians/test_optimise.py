@@ -128,14 +128,10 @@ def step_slowly(run: Run, g: Wanted, step: int) -> None:
         run.scales[i], run.opacities[i] = elementary.exp(x[SIZE:QUAT]), 1 / (1 + elementary.exp(-x[LOGIT]))
 
 
-def doubled(run: Run) -> Run:
-    return Run(*(getattr(run, f.name).astype(np.float64) for f in fields(run)))
-
-
 def test_steps_match_the_slow_twin() -> None:
     """Thirty steps, each with gradients of other rows; long enough for many to reach the box."""
     run = make_run(40)
-    slow = doubled(run)
+    slow = Run(*(getattr(run, f.name).astype(np.float64) for f in fields(run)))
     for step in range(1, 31):
         g = gradients(40, seed=step)
         step_kernel(run, g, step)

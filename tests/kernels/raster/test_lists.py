@@ -94,7 +94,7 @@ def test_members_outside_are_refused_by_what_adds_up(bad: int) -> None:
     assert sums.sum() == SUMS  # those outside the range of Gaussians are another thread's
 
 
-def test_a_range_of_gaussians_outside_is_refused() -> None:
-    for span in ((-1, 2), (0, M + 1)):
-        with pytest.raises(ValueError, match="gather_slots"):
-            gather_slots(np.zeros(1, np.int32), np.ones((1, SUMS), np.float32), *span, np.zeros((M, SUMS), np.float32))
+@pytest.mark.parametrize("span", [(-1, 2), (0, M + 1)])
+def test_a_range_of_gaussians_outside_is_refused(span: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="gather_slots"):
+        gather_slots(np.zeros(1, np.int32), np.ones((1, SUMS), np.float32), *span, np.zeros((M, SUMS), np.float32))

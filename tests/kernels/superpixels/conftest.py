@@ -7,14 +7,15 @@ import pytest
 
 from gsmerge.kernels.superpixels import seeds
 
+SIZE = (17, 23)
+
 
 @pytest.fixture
 def pixels() -> np.ndarray:
-    return np.random.default_rng(3).random((17, 23, 3), dtype=np.float32)
+    return np.random.default_rng(3).random((*SIZE, 3), dtype=np.float32)
 
 
 @pytest.fixture
-def labels(pixels: np.ndarray) -> np.ndarray:
+def labels() -> np.ndarray:
     """30 connected regions of the picture, not padded."""
-    height, width, _ = pixels.shape
-    return seeds.voronoi(seeds.hexagonal_seeds(height, width, 30), height, width)
+    return seeds.voronoi(seeds.hexagonal_seeds(*SIZE, 30), *SIZE)

@@ -28,9 +28,9 @@ def test_flat_pictures_have_no_corners() -> None:
     assert not seeds.corner_response(np.full((7, 9, 3), 0.3, np.float32)).any()
 
 
-def test_no_pixels() -> None:
-    for shape in ((0, 3), (3, 0), (0, 0)):
-        assert seeds.corner_response(np.empty((*shape, 3), np.float32)).shape == shape
+@pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0)])
+def test_no_pixels(shape: tuple[int, int]) -> None:
+    assert seeds.corner_response(np.empty((*shape, 3), np.float32)).shape == shape
 
 
 def test_nan_stays_where_it_is() -> None:

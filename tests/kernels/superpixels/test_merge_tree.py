@@ -121,13 +121,16 @@ def test_regions_without_pixels_cost_nothing() -> None:
     assert (parents[:-1] >= 0).all()
 
 
-def test_cut_labels() -> None:
-    parents = np.array([5, 5, 7, 6, 6, 7, 8, 8, -1], np.int32)  # ((0 1) 2) (3 4)
-    for keep, expected in (
+@pytest.mark.parametrize(
+    ("keep", "expected"),
+    [
         ([False] * 4, [0, 1, 2, 3, 4]),
         ([True, False, False, False], [0, 0, 1, 2, 3]),
         ([True, True, False, False], [0, 0, 1, 2, 2]),
         ([True] * 3 + [False], [0, 0, 0, 1, 1]),
         ([True] * 4, [0] * 5),
-    ):
-        assert kernels.cut_labels(parents, np.array(keep), 5).tolist() == expected
+    ],
+)
+def test_cut_labels(keep: list[bool], expected: list[int]) -> None:
+    parents = np.array([5, 5, 7, 6, 6, 7, 8, 8, -1], np.int32)  # ((0 1) 2) (3 4)
+    assert kernels.cut_labels(parents, np.array(keep), 5).tolist() == expected

@@ -47,27 +47,23 @@ def test_seeds_follow_the_density_to_the_exact_count(count: int) -> None:
     assert len({(y, x) for y, x in places.tolist()}) == count
 
 
-def random_image(height: int, width: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).random((height, width, 3), dtype=np.float32)
-
-
-def test_density_is_at_most_one_and_sums_to_the_count() -> None:
+@pytest.mark.parametrize("count", [1, 20, 50, 99, 100])
+def test_density_is_at_most_one_and_sums_to_the_count(count: int) -> None:
     response = np.zeros((10, 10), np.float32)
     response[3:5] = 100
-    for count in (1, 20, 50, 99, 100):
-        density = seed_density(response, count)
-        assert density.max() <= 1
-        assert density.min() >= 0
-        assert density.sum() == pytest.approx(count)
+    density = seed_density(response, count)
+    assert density.max() <= 1
+    assert density.min() >= 0
+    assert density.sum() == pytest.approx(count)
 
 
-def test_hexagonal_seeds_are_distinct_pixels() -> None:
-    for height, width in ((1, 9), (9, 1), (3, 3), (7, 12), (30, 8)):
-        for count in {1, 2, height * width // 3, height * width - 1, height * width}:
-            seeds = hexagonal_seeds(height, width, count)
-            assert len({(y, x) for y, x in seeds.tolist()}) == count
-            assert (seeds >= 0).all()
-            assert (seeds < [height, width]).all()
+@pytest.mark.parametrize(("height", "width"), [(1, 9), (9, 1), (3, 3), (7, 12), (30, 8)])
+def test_hexagonal_seeds_are_distinct_pixels(height: int, width: int) -> None:
+    for count in {1, 2, height * width // 3, height * width - 1, height * width}:
+        seeds = hexagonal_seeds(height, width, count)
+        assert len({(y, x) for y, x in seeds.tolist()}) == count
+        assert (seeds >= 0).all()
+        assert (seeds < [height, width]).all()
 
 
 def test_hexagonal_rows_are_shifted() -> None:

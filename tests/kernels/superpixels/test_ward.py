@@ -19,15 +19,15 @@ def test_region_rows_are_means(pixels: np.ndarray, labels: np.ndarray) -> None:
         assert rows[k, 5] == len(members)
 
 
-def test_merge_cost_is_the_growth_of_the_error(pixels: np.ndarray, labels: np.ndarray) -> None:
+@pytest.mark.parametrize(("u", "v"), [(0, 1), (4, 20), (7, 29)])
+def test_merge_cost_is_the_growth_of_the_error(u: int, v: int, pixels: np.ndarray, labels: np.ndarray) -> None:
     rows, points, flat = region_rows(pad_labels(labels), pixels, 30, 30, SPREAD), features(pixels), labels.reshape(-1)
     rows[:, ward.INVERSE] = 1 / rows[:, 5]
-    for u, v in [(0, 1), (4, 20), (7, 29)]:
-        apart = squared_error(points[flat == u]) + squared_error(points[flat == v])
-        together = squared_error(points[(flat == u) | (flat == v)])
-        cost = np.empty(1, np.float32)
-        ward.merge_costs(rows, np.array([[u, v]], np.int32), cost)
-        assert cost[0] == pytest.approx(together - apart, rel=1e-3)
+    apart = squared_error(points[flat == u]) + squared_error(points[flat == v])
+    together = squared_error(points[(flat == u) | (flat == v)])
+    cost = np.empty(1, np.float32)
+    ward.merge_costs(rows, np.array([[u, v]], np.int32), cost)
+    assert cost[0] == pytest.approx(together - apart, rel=1e-3)
 
 
 def test_adjacent_pairs_are_all_neighbours(labels: np.ndarray) -> None:

@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ import pytest
 from batches import QUICK, InlinePool, one_job, records, results, statuses
 from messages import names, refuses, says
 from network_fixtures import noisy, untrained, written
+from shared import write_scene
 
 from gsmerge.batch import jobs as calls
 from gsmerge.batch import run as runs
@@ -87,15 +88,10 @@ def run(scene: Path, out: Path, options: Any = QUICK) -> dict[str, Any]:
     return actual
 
 
-@pytest.fixture(scope="module")
-def tiny(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two views of 24 x 16. Read only."""
-    return make_scene(tmp_path_factory.mktemp("tiny") / "room", num_views=2, width=24, height=16)
-
-
 @pytest.fixture
-def scene(tiny: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(tiny, tmp_path / "room"))
+def scene(tmp_path: Path) -> Path:
+    """Two views of 24 x 16."""
+    return write_scene(tmp_path / "room", num_views=2, width=24, height=16)
 
 
 @pytest.fixture
@@ -104,14 +100,14 @@ def out(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What the scene comes to."""
-    out = tmp_path_factory.mktemp("undisturbed")
-    run(tiny, out)
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    run(write_scene(out.with_name("room"), num_views=2, width=24, height=16), out)
     return results(out)
 
 
-def test_what_is_done_is_skipped_and_what_changed_is_not(scene: Path, out: Path) -> None:
+def test_what_is_done_is_skipped(scene: Path, out: Path) -> None:
     first = run(scene, out)
     assert (first["status"], first["error"]) == (DONE, None)
     assert first["report"]["options"]["effort"] == "draft"
@@ -121,6 +117,10 @@ def test_what_is_done_is_skipped_and_what_changed_is_not(scene: Path, out: Path)
     assert (again["status"], again["key"], again["files"]) == (SKIPPED, first["key"], first["files"])
     assert run(scene, out, replace(QUICK, jobs=3))["status"] == SKIPPED
     assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
+
+
+def test_other_settings_are_refused_unless_they_may_overwrite(scene: Path, out: Path) -> None:
+    run(scene, out)
     seed = replace(QUICK, settings=QUICK.settings.with_settings({"seed": 1}))
     before = results(out)
     for _ in range(2):  # the first refusal is no claim
@@ -131,6 +131,10 @@ def test_what_is_done_is_skipped_and_what_changed_is_not(scene: Path, out: Path)
     assert says(
         run(scene, out)["error"], out / "room.ply", "settings"
     )  # back to the first settings: the file is of the others
+
+
+def test_what_changed_is_made_again(scene: Path, out: Path) -> None:
+    run(scene, out)
     (out / "room.ply").unlink()
     assert run(scene, out)["status"] == DONE
     (out / "room.ply").write_bytes(b"spoiled")
@@ -254,7 +258,7 @@ def test_what_is_done_is_skipped_in_a_folder_that_cannot_be_written(
     assert run(scene, out)["status"] == SKIPPED
 
 
-def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> None:
+def test_a_result_that_no_batch_wrote_is_not_replaced(scene: Path, out: Path) -> None:
     out.mkdir()
     (out / "room.ply").write_bytes(b"mine")
     for _ in range(2):  # the first refusal is no claim
@@ -269,7 +273,10 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
     (out / "room.ply").mkdir()
     assert says(run(scene, out)["error"], out / "room.ply", "rename it")
     assert "--overwrite" not in run(scene, out)["error"]
-    (out / "room.ply").rmdir()
+
+
+def test_cameras_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> None:
+    out.mkdir()
     (out / "room.cameras.json").write_bytes(b"mine")  # or those of a result in another format
     assert [file["path"] for file in run(scene, out)["files"]] == ["room.ply"]
     assert (out / "room.cameras.json").read_bytes() == b"mine"

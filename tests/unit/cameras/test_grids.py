@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,18 +44,16 @@ def original(tiny: Tiny, mapping: PhotoTransform, size: tuple[int, int]) -> tupl
 
 
 @pytest.mark.slow
-def test_photos_larger_than_cameras_and_grid(tmp_path: Path) -> None:
+@pytest.mark.parametrize("resize", [resize_to, resize_and_crop])
+def test_photos_larger_than_cameras_and_grid(resize: Callable[..., PhotoTransform], tmp_path: Path) -> None:
     """An npz at the grid's size, photos as they were taken: stretched or cropped, as their colours say."""
-    for name, mapping in (("stretch", resize_to((110, 72), (48, 36))), ("crop", resize_and_crop((110, 72), (48, 36)))):
-        _, photos = original(SMOOTH, mapping, (110, 72))
-        folder = tmp_path / name
-        SMOOTH.save(folder, cameras=False, images=False)
-        write_photos(folder, SMOOTH, photos)
-        write_npz(folder / "results.npz", SMOOTH, image=None, depth=np.ones((3, 36, 48), np.float32))
-        loaded = load_scene(folder, images=folder / "images", order="view-major")
-        scene = loaded.scene
-        assert np.abs(scene.images * 255 - SMOOTH.images).mean() < 8, name
-        assert any(note.startswith("photos of 110 x ") for note in loaded.notes), name
+    _, photos = original(SMOOTH, resize((110, 72), (48, 36)), (110, 72))
+    SMOOTH.save(tmp_path, cameras=False, images=False)
+    write_photos(tmp_path, SMOOTH, photos)
+    write_npz(tmp_path / "results.npz", SMOOTH, image=None, depth=np.ones((3, 36, 48), np.float32))
+    loaded = load_scene(tmp_path, images=tmp_path / "images", order="view-major")
+    assert np.abs(loaded.scene.images * 255 - SMOOTH.images).mean() < 8
+    assert any(note.startswith("photos of 110 x ") for note in loaded.notes)
 
 
 def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
@@ -66,17 +65,17 @@ def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
     assert loaded.notes == ("cameras of 96 x 54 are resized and centre-cropped to 48 x 36, the images' size",)
 
 
-def test_mappings_move_a_point_and_its_photo_alike() -> None:
+@pytest.mark.parametrize("mapping", [resize_to((100, 60), (50, 24)), resize_and_crop((100, 60), (30, 30))])
+def test_mappings_move_a_point_and_its_photo_alike(mapping: PhotoTransform) -> None:
     photo = np.zeros((60, 100, 3), np.uint8)
     photo[24:36, 64:72] = 255
-    for mapping in (resize_to((100, 60), (50, 24)), resize_and_crop((100, 60), (30, 30))):
-        (small,) = mapping.photos([photo])
-        assert small.shape == (mapping.height, mapping.width, 3)
-        y, x = (np.average(np.arange(n) + 0.5, weights=small[..., 0].sum(axis)) for n, axis in
-                ((mapping.height, 1), (mapping.width, 0)))  # fmt: skip
-        K = np.array([[[1.0, 0, 68], [0, 1, 30], [0, 0, 1]]], np.float64)
-        (moved,) = mapping.cameras(Cameras(np.eye(4)[None], K, 100, 60)).Ks
-        assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)
+    (small,) = mapping.photos([photo])
+    assert small.shape == (mapping.height, mapping.width, 3)
+    y, x = (np.average(np.arange(n) + 0.5, weights=small[..., 0].sum(axis)) for n, axis in
+            ((mapping.height, 1), (mapping.width, 0)))  # fmt: skip
+    K = np.array([[[1.0, 0, 68], [0, 1, 30], [0, 0, 1]]], np.float64)
+    (moved,) = mapping.cameras(Cameras(np.eye(4)[None], K, 100, 60)).Ks
+    assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)
 
 
 def test_sizes_that_are_twice_a_principal_point(tmp_path: Path, tiny: Tiny) -> None:
@@ -100,11 +99,13 @@ def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:
     assert np.allclose(load_scene(folder).scene.cameras.Ks, tiny.K)
 
 
-def test_short_intrinsics_in_pixels_stay() -> None:
-    for K, size in (([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]], (8, 8)), ([[50.0, 0, 0.5], [0, 50, 0.5], [0, 0, 1]], (0, 0))):
-        read = make_camera_file("x", "x", W2C_OPENCV, [StoredView("a", np.eye(4), np.array(K), size)])
-        assert np.array_equal(read.Ks[0], np.array(K))
-        assert (int(read.widths[0]), int(read.heights[0])) == size
+@pytest.mark.parametrize(
+    ("K", "size"), [([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]], (8, 8)), ([[50.0, 0, 0.5], [0, 50, 0.5], [0, 0, 1]], (0, 0))]
+)
+def test_short_intrinsics_in_pixels_stay(K: list[list[float]], size: tuple[int, int]) -> None:
+    read = make_camera_file("x", "x", W2C_OPENCV, [StoredView("a", np.eye(4), np.array(K), size)])
+    assert np.array_equal(read.Ks[0], np.array(K))
+    assert (int(read.widths[0]), int(read.heights[0])) == size
 
 
 def test_previews_show_rows_in_any_order(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import noted
-from tiny_scene import Tiny
+from tiny_scene import Tiny, make_tiny
 
 import gsmerge
 from gsmerge.compaction.files import compact_files
@@ -23,7 +23,8 @@ PLAIN = CompactOptions().with_settings({"superpixels": "20%", "fit": "none", "th
 
 
 @pytest.fixture
-def folder(tmp_path: Path, tiny: Tiny) -> Path:
+def folder(tmp_path: Path) -> Path:
+    tiny = make_tiny()
     shN = np.random.default_rng(0).normal(0, 0.1, (len(tiny.gaussians), 24, 3)).astype(np.float32)
     return replace(tiny, gaussians=replace(tiny.gaussians, shN=shN)).save(tmp_path)
 

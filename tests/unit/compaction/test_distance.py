@@ -22,14 +22,18 @@ from gsmerge.photos.views import resize_cameras
 from gsmerge.raster.metrics import decibels
 
 
-@pytest.fixture(scope="module")
-def room() -> Scene:
+def make_room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 80, 60), noise=0.2)
 
 
 @pytest.fixture(scope="module")
-def prepared(room: Scene) -> Prepared:
-    return prepare(room)
+def room() -> Scene:
+    return make_room()
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Prepared:
+    return prepare(make_room())
 
 
 def tiny(gaussians: Gaussians) -> Gaussians:

@@ -61,7 +61,7 @@ def test_four_views_say_what_new_ones_gain(room: Scene) -> None:
     assert report.seconds["new views"] > 0
 
 
-@pytest.mark.parametrize("settings", [{"effort": "draft"}, {"new_views": False}], ids=str)
+@pytest.mark.parametrize("settings", [{"effort": "draft"}, {"new_views": False}])
 def test_drafts_and_who_asks_for_none_get_none(settings: dict[str, object], room: Scene) -> None:
     report = compact(room, **QUICK, **settings).report
     assert report.new_views is None

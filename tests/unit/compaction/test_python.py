@@ -15,14 +15,18 @@ import gsmerge
 from gsmerge.types import Scene
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
+def make_scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(4, 32, 24))
 
 
 @pytest.fixture(scope="module")
-def result(scene: Scene) -> gsmerge.CompactResult:
-    return gsmerge.compact(scene, effort="draft", budget=60, levels=2)
+def scene() -> Scene:
+    return make_scene()
+
+
+@pytest.fixture(scope="module")
+def result() -> gsmerge.CompactResult:
+    return gsmerge.compact(make_scene(), effort="draft", budget=60, levels=2)
 
 
 @pytest.mark.parametrize(

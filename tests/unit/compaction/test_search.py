@@ -269,11 +269,11 @@ def test_a_count_that_is_too_few_is_not_called_enough() -> None:
     assert noted(actual.notes, "each of the 2 counts", "over 0.3 dB worse")
 
 
-def test_one_count_is_built_once_where_no_quality_is_asked_for() -> None:
-    for first in (300, None):
-        counts = CountSearch(make_plan(), first)
-        counts.run(lambda count: built(count, 20.0))
-        assert [candidate.count for candidate in counts.candidates] == [first]
+@pytest.mark.parametrize("first", [300, None])
+def test_one_count_is_built_once_where_no_quality_is_asked_for(first: int | None) -> None:
+    counts = CountSearch(make_plan(), first)
+    counts.run(lambda count: built(count, 20.0))
+    assert [candidate.count for candidate in counts.candidates] == [first]
 
 
 def judge_left_out(curve: Callable[[int], float], target: float, most: int | None = None) -> CountSearch:

@@ -101,7 +101,7 @@ def test_views_that_look_elsewhere_are_alone(wall: Scene) -> None:
     assert agreement.confirmed > 0.7
 
 
-@pytest.mark.parametrize("spoilt", [[], [1], [0, 2]], ids=str)
+@pytest.mark.parametrize("spoilt", [[], [1], [0, 2]])
 def test_shares_are_those_of_a_plain_loop(spoilt: list[int], wall: Scene) -> None:
     """But for the pixels that are drawn."""
     scene = with_nearer_half(wall, spoilt)

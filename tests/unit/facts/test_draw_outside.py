@@ -23,9 +23,13 @@ VIEWS = 3
 DOUBLE = np.array([[2.0], [2.0], [1.0]])  # intrinsics of photos of twice the size
 
 
+def make_room() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(VIEWS, 32, 24, span=3.0))
+
+
 @pytest.fixture(scope="module")
 def room() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(VIEWS, 32, 24, span=3.0))
+    return make_room()
 
 
 def seen_from(room: Scene, views: Sequence[int]) -> Scene:
@@ -40,21 +44,23 @@ def pictured(scene: Scene) -> PicturedScene:
     return PicturedScene.with_pictures(with_pixels(canonicalise(scene)[0]), scene.images, None)
 
 
-@pytest.fixture(scope="module")
-def part(room: Scene) -> PicturedScene:
-    """As two of three views see it, with all that may belong to a photo."""
-    scene, rng = pictured(seen_from(room, [0, 1])), np.random.default_rng(0)
+def make_part() -> PicturedScene:
+    """Return the room as two of three views see it, with all that may belong to a photo."""
+    scene, rng = pictured(seen_from(make_room(), [0, 1])), np.random.default_rng(0)
     masks, empty, importance = rng.random((3, *scene.images.shape[:3]), np.float32)
     large = LargePhotos(scene.cameras.Ks * DOUBLE, 64, 48, (7, 4), lambda photo: np.full((48, 64, 3), photo, np.uint8))
     return replace(scene, masks=masks < 0.5, empty=empty < 0.5, importance=1 + importance, large_photos=large)
 
 
 @pytest.fixture(scope="module")
-def drawn(part: PicturedScene) -> PicturedScene:
-    return draw_outside(part)
+def drawings() -> tuple[PicturedScene, PicturedScene]:
+    """That part of the room, and the same with drawings from outside."""
+    part = make_part()
+    return part, draw_outside(part)
 
 
-def test_drawings_count_where_they_show_mainly_what_no_view_sees(part: PicturedScene, drawn: PicturedScene) -> None:
+def test_drawings_count_where_they_show_mainly_what_no_view_sees(drawings: tuple[PicturedScene, PicturedScene]) -> None:
+    part, drawn = drawings
     placed = drawn.cameras[range(len(part), len(drawn))]
     np.testing.assert_array_equal(drawn.images[len(part) :], render(part.gaussians, placed).images.clip(0, 1))
     unseen = part.pixels.homes < 0
@@ -67,7 +73,8 @@ def test_drawings_count_where_they_show_mainly_what_no_view_sees(part: PicturedS
     assert drawn.pixels.homes[unseen].max() >= len(part) * part.pixels_per_view  # and so they are members
 
 
-def test_own_views_stay_as_they_are(part: PicturedScene, drawn: PicturedScene) -> None:
+def test_own_views_stay_as_they_are(drawings: tuple[PicturedScene, PicturedScene]) -> None:
+    part, drawn = drawings
     assert len({*drawn.names}) == len(drawn) > len(part)
     assert drawn.gaussians is part.gaussians
     own = subset(drawn, range(len(part)))
@@ -79,7 +86,8 @@ def test_own_views_stay_as_they_are(part: PicturedScene, drawn: PicturedScene) -
     assert draw_outside(replace(part, masks=None)).masks[: len(part)].all()
 
 
-def test_larger_photos_get_larger_drawings(part: PicturedScene, drawn: PicturedScene) -> None:
+def test_larger_photos_get_larger_drawings(drawings: tuple[PicturedScene, PicturedScene]) -> None:
+    part, drawn = drawings
     """Those of the views are read as before, by their own numbers."""
     photos = drawn.large_photos
     assert [photos.read(number)[0, 0, 0] for number in photos.ids[: len(part)]] == [7, 4]

@@ -28,14 +28,14 @@ def moved(scene: Scene, factor: float, shift: list[float]) -> Scene:
     return scenes.move(scene, np.eye(3), factor, np.array(shift))
 
 
-def test_unit_is_a_power_of_two_near_the_median_depth(scene: Scene) -> None:
-    for factor in (1e-4, 1.0, 3.0, 1e4):
-        large = moved(scene, factor, [0, 0, 0])
-        unit = scene_frame(large).unit
-        depths = project(large.gaussians.means, large.cameras)[1]
-        own = np.concatenate([depths[0, : scene.pixels_per_view], depths[1, scene.pixels_per_view :]])
-        assert np.log2(unit) % 1 == 0
-        assert 2**-0.51 < float(np.median(own)) / unit < 2**0.51
+@pytest.mark.parametrize("factor", [1e-4, 1.0, 3.0, 1e4])
+def test_unit_is_a_power_of_two_near_the_median_depth(factor: float, scene: Scene) -> None:
+    large = moved(scene, factor, [0, 0, 0])
+    unit = scene_frame(large).unit
+    depths = project(large.gaussians.means, large.cameras)[1]
+    own = np.concatenate([depths[0, : scene.pixels_per_view], depths[1, scene.pixels_per_view :]])
+    assert np.log2(unit) % 1 == 0
+    assert 2**-0.51 < float(np.median(own)) / unit < 2**0.51
 
 
 def test_leave_undoes_enter(scene: Scene) -> None:

@@ -20,15 +20,19 @@ from gsmerge.runtime.record import record_run
 from gsmerge.stages.fit_pairs import merge_scene
 
 
-@pytest.fixture(scope="module")
-def bare() -> Scene:
+def make_bare() -> Scene:
     room = scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.01)
     return Scene(room.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ())
 
 
 @pytest.fixture(scope="module")
-def prepared(bare: Scene) -> Prepared:
-    return prepare(bare)
+def bare() -> Scene:
+    return make_bare()
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Prepared:
+    return prepare(make_bare())
 
 
 def test_views_show_the_input_and_some_are_held_out(prepared: Prepared) -> None:

@@ -21,8 +21,8 @@ def cameras() -> Cameras:
 
 
 @pytest.fixture(scope="module")
-def room(cameras: Cameras) -> Gaussians:
-    made = scenes.make_scene(scenes.room(), cameras, noise=0.01).gaussians
+def room() -> Gaussians:
+    made = scenes.make_scene(scenes.room(), scenes.arc(3, 64, 48), noise=0.01).gaussians
     return made[:: max(1, len(made) // 150)]
 
 

@@ -10,25 +10,15 @@ from gsmerge.raster.photos import Photos
 
 
 @pytest.fixture(scope="session")
-def made() -> tuple[Scene, Gaussians]:
-    return scenes.self_made(0)
+def scene() -> Scene:
+    return scenes.self_made(0)[0]
 
 
 @pytest.fixture(scope="session")
-def scene(made: tuple[Scene, Gaussians]) -> Scene:
-    return made[0]
+def truth() -> Gaussians:
+    return scenes.self_made(0)[1]
 
 
 @pytest.fixture(scope="session")
-def truth(made: tuple[Scene, Gaussians]) -> Gaussians:
-    return made[1]
-
-
-@pytest.fixture(scope="session")
-def photos(scene: Scene) -> tuple[Photos, Photos]:
-    return scenes.pair_of(scene)
-
-
-@pytest.fixture(scope="session")
-def noise(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
-    return scenes.noise_for(photos)
+def photos() -> tuple[Photos, Photos]:
+    return scenes.pair_of(scenes.self_made(0)[0])

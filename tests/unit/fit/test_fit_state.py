@@ -38,8 +38,8 @@ def gaussians() -> Gaussians:
 
 
 @pytest.fixture(scope="module")
-def photos(scene: Scene) -> Photos:
-    return scene_photos(scene)
+def photos() -> Photos:
+    return scene_photos(make(0)[0])
 
 
 def used(gaussians: Gaussians) -> FitState:

@@ -37,8 +37,9 @@ LONG = FitOptions(fit_steps=160, holdout=0.2, tuning=Tuning(outside_every=4))
 
 
 @pytest.fixture(scope="module")
-def outside(truth: Gaussians, photos: Pair) -> Outside:
-    return look(truth, photos)
+def outside() -> Outside:
+    scene, truth = scenes.self_made(0)
+    return look(truth, scenes.pair_of(scene))
 
 
 def look(reference: Gaussians, photos: Pair) -> Outside:

@@ -51,7 +51,6 @@ def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Pic
         (4, True, {"fit_steps": 12}, 1), (4, True, {"photo_scale": 1}, 1), (4, True, {"photo_scale": 3}, 3),
         (4, False, {"photo_scale": 1.5}, 1.5), (1.2, True, {"photo_scale": 1.1}, 1.1),
     ],
-    ids=str,
 )  # fmt: skip
 def test_scale_is_chosen(scene: Scene, larger: float, auto: bool, settings: dict[str, Any], expected: float) -> None:
     actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=auto)
@@ -66,7 +65,6 @@ def test_scale_is_chosen(scene: Scene, larger: float, auto: bool, settings: dict
         (2, {"photo_scale": 2, "fit": "none"}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
         (2, {"photo_scale": 2, "fit_steps": 12}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
     ],
-    ids=str,
 )
 def test_less_than_asked_for_is_said(
     scene: Scene, larger: float, settings: dict[str, Any], expected: float, reason: str

@@ -34,10 +34,6 @@ def merged(of: Members) -> Gaussians:
     return to_gaussians(m.covars, m.extinctions, m.means, m.sh)
 
 
-def own_covariance(of: Members, row: int = 0) -> np.ndarray:
-    return covariances(of.quats[row].astype(np.float64), of.scales[row].astype(np.float64))
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_one_member_is_itself_but_for_the_floor(seed: int) -> None:
     one = members(1, seed, coefficients=16)
@@ -45,7 +41,12 @@ def test_one_member_is_itself_but_for_the_floor(seed: int) -> None:
     covar = covariances(result.quats.astype(np.float64), result.scales.astype(np.float64))[0]
     np.testing.assert_allclose(result.means, one.means, rtol=1e-6)
     floor = (0.1 * 0.05) ** 2 * np.eye(3)
-    np.testing.assert_allclose(covar, own_covariance(one) + floor, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(
+        covar,
+        covariances(one.quats[0].astype(np.float64), one.scales[0].astype(np.float64)) + floor,
+        rtol=1e-5,
+        atol=1e-9,
+    )
     np.testing.assert_allclose(result.sh0, one.sh0, rtol=1e-6)
     np.testing.assert_allclose(result.shN, one.shN, rtol=1e-6)
     # the floor makes the disc larger, and the conserved optical depth thinner by as much

@@ -133,11 +133,16 @@ def test_what_compact_would_give(tiny_folder: Path, tmp_path: Path, tiny: Tiny) 
     assert actual["compact"]["memory_bytes"] > 1e8
 
 
-def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
+@pytest.fixture
+def pruned(tmp_path: Path) -> Path:
+    """The folder of a scene with half of its rows, in no order."""
     smooth = smooth_scene(24, 18)
     some = np.random.default_rng(0).permutation(1296)[:640]
-    folder = replace(smooth, gaussians=smooth.gaussians[some]).save(tmp_path / "scene")
-    actual = inspect(folder)
+    return replace(smooth, gaussians=smooth.gaussians[some]).save(tmp_path / "scene")
+
+
+def test_a_scene_without_pixels(pruned: Path) -> None:
+    actual = inspect(pruned)
     assert actual["alignment"] is None
     assert actual["sight"]["ok"]
     assert [view["share_of_pixels"] for view in actual["coverage"]] == [None] * 3
@@ -146,15 +151,18 @@ def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
     lines = "\n".join(inspection_lines(actual))
     assert "least in images/" in lines
     assert "or more until the photos are shown within 0.3 dB" in lines
-    alone = inspect(folder / "scene.ply", cameras=folder / "transforms.json", order="none")
+    alone = inspect(pruned / "scene.ply", cameras=pruned / "transforms.json", order="none")
     assert alone["compact"] is not None
-    (folder / "transforms.json").unlink()
-    alone = inspect(folder, order="none")
+
+
+def test_a_scene_without_views(pruned: Path) -> None:
+    (pruned / "transforms.json").unlink()
+    alone = inspect(pruned, order="none")
     assert alone["coverage"] == []
     assert alone["sight"] is None
     assert alone["compact"] is not None
     assert "coverage" not in "\n".join(inspection_lines(alone))
-    assert inspect(folder)["compact"] == alone["compact"]  # photos without cameras are left out
+    assert inspect(pruned)["compact"] == alone["compact"]  # photos without cameras are left out
 
 
 SMOOTH = smooth_scene(48, 36)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -33,16 +34,22 @@ def test_only_files_are_read(tmp_path: Path) -> None:
     for path, found in ((tmp_path, "folder"), (tmp_path / "none", "no such file")):
         with refuses(SceneError, path, found):
             check_file(path)
+
+
+def test_text_is_read_up_to_a_size(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"\xef\xbb\xbfab")
     assert check_file(tmp_path / "a") == 5
     assert read_text(tmp_path / "a") == "ab"
     assert list(read_lines(tmp_path / "a")) == ["ab"]
     with refuses(SceneError, "a", "0 MiB"):
         list(read_lines(tmp_path / "a", 4))
+
+
+@pytest.mark.parametrize("read", [read_text, lambda path: list(read_lines(path))], ids=["whole", "line by line"])
+def test_bytes_that_are_no_text_are_refused(read: Callable[[Path], object], tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"a\n\xff")
-    for read in (read_text, lambda path: list(read_lines(path))):
-        with refuses(SceneError, "a", "text"):
-            read(tmp_path / "a")
+    with refuses(SceneError, "a", "text"):
+        read(tmp_path / "a")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
@@ -59,16 +66,16 @@ def test_folders_of_photos_have_an_end(tmp_path: Path, monkeypatch: pytest.Monke
             read(tmp_path / "images")
 
 
-def test_a_budget_grows_with_the_file() -> None:
-    for size, memory, steps in ((0, 64_000_000, 250_000), (10**6, 84_000_000, 350_000)):
-        budget = ReadBudget("a", size)
-        budget.check_memory(memory, "rows")
-        budget.check_steps(steps, "rows")
-        for needed in (memory + 1, float("nan")):
-            with refuses(SceneError, "a", f"{memory // 10**6} MB", "rows"):
-                budget.check_memory(needed, "rows")
-        with refuses(SceneError, "a", f"{steps:,}", f"{steps + 1:,}", "rows"):
-            budget.check_steps(steps + 1, "rows")
+@pytest.mark.parametrize(("size", "memory", "steps"), [(0, 64_000_000, 250_000), (10**6, 84_000_000, 350_000)])
+def test_a_budget_grows_with_the_file(size: int, memory: int, steps: int) -> None:
+    budget = ReadBudget("a", size)
+    budget.check_memory(memory, "rows")
+    budget.check_steps(steps, "rows")
+    for needed in (memory + 1, float("nan")):
+        with refuses(SceneError, "a", f"{memory // 10**6} MB", "rows"):
+            budget.check_memory(needed, "rows")
+    with refuses(SceneError, "a", f"{steps:,}", f"{steps + 1:,}", "rows"):
+        budget.check_steps(steps + 1, "rows")
 
 
 @pytest.mark.parametrize(

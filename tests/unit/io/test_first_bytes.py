@@ -33,11 +33,11 @@ def test_what_stands_in_the_place_of_a_scene(ending: str, name: str, tmp_path: P
         read_gaussians(tmp_path / f"a{ending}")
 
 
-def test_what_stands_in_the_place_of_a_photo(tmp_path: Path) -> None:
-    for content, found in ((LFS, "LFS"), (PAGE, "page")):
-        (tmp_path / "a.JPG").write_bytes(content)
-        with refuses(SceneError, "a.JPG", found):
-            check_file(tmp_path / "a.JPG")
+@pytest.mark.parametrize(("content", "found"), [(LFS, "LFS"), (PAGE, "page")])
+def test_what_stands_in_the_place_of_a_photo(content: bytes, found: str, tmp_path: Path) -> None:
+    (tmp_path / "a.JPG").write_bytes(content)
+    with refuses(SceneError, "a.JPG", found):
+        check_file(tmp_path / "a.JPG")
 
 
 @pytest.mark.parametrize(

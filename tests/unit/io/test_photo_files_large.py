@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene
 from messages import refuses
+from shared import make_once
 from tiny_scene import Tiny, edited_json
 
 import gsmerge
@@ -25,11 +26,16 @@ from gsmerge.scene.read import load_scene
 WIDTH, HEIGHT, SCALE = 48, 32, 3
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene whose photos are three times as large as its grid. Read only."""
+def made_once() -> Path:
+    """Return a scene whose photos are three times as large as its grid. Read only."""
     options = GenerateOptions(views=3, width=WIDTH, height=HEIGHT, noise=0.3, photo_scale=SCALE)
-    return generate_scene(tmp_path_factory.mktemp("large") / "scene", options, seed=2)
+    return make_once("large", lambda folder: generate_scene(folder, options, seed=2))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy that a test may change."""
+    return Path(shutil.copytree(made_once(), tmp_path / "scene"))
 
 
 def change_cameras(folder: Path, change: Callable[[dict[str, float]], None]) -> None:
@@ -63,8 +69,8 @@ def shift_between(scene: Scene, scale: float) -> tuple[float, float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.5, 3])
-def test_larger_photos_show_what_the_grid_shows(made: Path, scale: float) -> None:
-    scene = gsmerge.read_scene(made)
+def test_larger_photos_show_what_the_grid_shows(scale: float) -> None:
+    scene = gsmerge.read_scene(made_once())
     assert scene.has_own_pixels
     assert largest_scale(scene) == pytest.approx(SCALE)
     assert shift_between(scene, scale) == (0, 0)

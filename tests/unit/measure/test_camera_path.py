@@ -60,19 +60,6 @@ def pose_steps(path: Cameras, depth: float = DEPTH) -> np.ndarray:
     return np.sqrt(shifts**2 + (depth * turns) ** 2)
 
 
-def ring(count: int, degrees: float, pitch: float = 0.3) -> Cameras:
-    """Cameras around the point (1, 2, 3), 2 away, that look at it from above; up is -y."""
-    angles = np.radians(degrees) * (np.arange(count) / max(count - 1, 1) - 0.5)
-    turns = [motion_matrices(np.array([[0, angle, 0, 0, 0, 0]]))[0, :3, :3] for angle in angles]
-    tilt = motion_matrices(np.array([[pitch, 0, 0, 0, 0, 0]]))[0, :3, :3]
-    viewmats = np.tile(np.eye(4), (count, 1, 1))
-    for viewmat, turn in zip(viewmats, turns, strict=True):
-        viewmat[:3, :3] = tilt @ turn
-        viewmat[:3, 3] = [0, 0, 2] - viewmat[:3, :3] @ [1.0, 2.0, 3.0]
-    K = np.array([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
-    return Cameras(viewmats, np.tile(K, (count, 1, 1)), 32, 24)
-
-
 def test_a_spline_passes_through_all_cameras_at_even_speed(walk: Cameras) -> None:
     path = spline(walk, DEPTH, 400)
     np.testing.assert_allclose(path.viewmats[[0, -1]], walk.viewmats[[0, -1]], atol=1e-12)

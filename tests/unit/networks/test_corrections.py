@@ -114,13 +114,13 @@ def test_tensors_move_in_the_same_way(torch: Any) -> None:
 
 
 @pytest.mark.parametrize("opacity", [0.0, 1e-6, 1.0])
-def test_opacities_at_the_ends_stay_within_them(opacity: float) -> None:
+@pytest.mark.parametrize("logit", [-3.0, 3.0])
+def test_opacities_at_the_ends_stay_within_them(logit: float, opacity: float) -> None:
     base = replace(base_of(some()), opacities=np.full(20, opacity, np.float32))
-    for logit in (-3.0, 3.0):
-        residuals = zeros()
-        residuals[:, LOGIT_COLUMN] = logit
-        moved = move(base, residuals, EACH, frames()).opacities
-        assert ((moved >= 0) & (moved <= 1)).all()
+    residuals = zeros()
+    residuals[:, LOGIT_COLUMN] = logit
+    moved = move(base, residuals, EACH, frames()).opacities
+    assert ((moved >= 0) & (moved <= 1)).all()
 
 
 def test_rotations_agree_with_each_other(torch: Any) -> None:

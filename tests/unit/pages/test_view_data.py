@@ -31,14 +31,18 @@ from gsmerge.raster.metrics import psnr
 from gsmerge.types import Views
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
+def make_scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 80, 60), noise=0.05)
 
 
 @pytest.fixture(scope="module")
-def half(scene: Scene) -> Gaussians:
-    return scene.gaussians[::2]
+def scene() -> Scene:
+    return make_scene()
+
+
+@pytest.fixture(scope="module")
+def half() -> Gaussians:
+    return make_scene().gaussians[::2]
 
 
 @pytest.fixture(scope="module")
@@ -46,15 +50,21 @@ def small() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.05)
 
 
-@pytest.fixture(scope="module")
-def held_out() -> Views:
+def make_held_out() -> Views:
     other = scenes.make_scene(scenes.room(), scenes.arc(2, 90, 54))
     return Views(other.cameras, other.images, ("x/a.png", "x/b.png"))
 
 
 @pytest.fixture(scope="module")
-def actual(scene: Scene, half: Gaussians, held_out: Views) -> ViewData:
-    return collect_page_data("room", scene, {"half": half, "all": scene.gaussians}, (300, 200, 100), held_out)
+def held_out() -> Views:
+    return make_held_out()
+
+
+@pytest.fixture(scope="module")
+def actual() -> ViewData:
+    scene = make_scene()
+    results = {"half": scene.gaussians[::2], "all": scene.gaussians}
+    return collect_page_data("room", scene, results, (300, 200, 100), make_held_out())
 
 
 def test_a_result_that_is_worse_has_no_expected_gain(small: Scene) -> None:

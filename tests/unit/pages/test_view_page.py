@@ -23,10 +23,14 @@ WEBP, PNG = "data:image/webp;base64,", "data:image/png;base64,"
 NAMES = ("images/<i>0</i>.png", "images/1.png", EVIL)
 
 
-@pytest.fixture(scope="module")
-def data() -> ViewData:
+def make_data() -> ViewData:
     scene = replace(scenes.make_scene(scenes.room(), scenes.arc(3)), names=NAMES)
     return collect_page_data(EVIL, scene, {EVIL: scene.gaussians[::2]}, (2_000_000, 1000))
+
+
+@pytest.fixture(scope="module")
+def data() -> ViewData:
+    return make_data()
 
 
 def page_of(data: ViewData) -> str:
@@ -34,8 +38,8 @@ def page_of(data: ViewData) -> str:
 
 
 @pytest.fixture(scope="module")
-def page(data: ViewData) -> str:
-    return page_of(data)
+def page() -> str:
+    return page_of(make_data())
 
 
 def block(page: str, name: str) -> str:

@@ -22,8 +22,8 @@ def views() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def photos(views: np.ndarray) -> list[np.ndarray]:
-    return list(take_photos(views))
+def photos() -> list[np.ndarray]:
+    return list(take_photos(cut_views(VIEWS)))
 
 
 def assign(
@@ -76,9 +76,9 @@ def test_a_neighbour_stands_for_no_missing_photo(views: np.ndarray, photos: list
     assert assign(views, pool, neighbour, exact=exact)[2] is None
 
 
-def test_photos_of_another_place_show_nothing(views: np.ndarray, others: list[np.ndarray]) -> None:
-    for named in (list(range(VIEWS)), [None] * VIEWS):
-        assert assign(views, others, named, exact=True) == [None] * VIEWS
+@pytest.mark.parametrize("named", [list(range(VIEWS)), [None] * VIEWS])
+def test_photos_of_another_place_show_nothing(named: Named, views: np.ndarray, others: list[np.ndarray]) -> None:
+    assert assign(views, others, named, exact=True) == [None] * VIEWS
 
 
 def test_one_of_noise_is_left_out(views: np.ndarray, photos: list[np.ndarray]) -> None:

@@ -45,10 +45,6 @@ def scene() -> Scene:
     return canonicalise(scenes.make_scene(scenes.room(), scenes.arc(len(VIEWS), 64, 48)))[0]
 
 
-def brightened(scene: Scene, gains: np.ndarray) -> Scene:
-    return replace(scene, images=(scene.images * elementary.exp(gains)[:, None, None]).clip(0, 1).astype(np.float32))
-
-
 def test_size_of_gains() -> None:
     assert root_mean_square(grey(0.9, 1.1)) == pytest.approx(0.1)
 
@@ -68,7 +64,8 @@ def test_gains_of_many_views_follow_from_some_pairs(monkeypatch: pytest.MonkeyPa
     count = 16
     scene, _ = canonicalise(scenes.make_scene(scenes.room(), scenes.arc(count, 24, 16)))
     gains = grey(*np.random.default_rng(0).uniform(-0.2, 0.2, count))
-    solved = _solve_gains(_measure_pairs(brightened(scene, gains), range(count)), count)
+    images = (scene.images * elementary.exp(gains)[:, None, None]).clip(0, 1).astype(np.float32)
+    solved = _solve_gains(_measure_pairs(replace(scene, images=images), range(count)), count)
     assert solved is not None
     np.testing.assert_allclose(solved - solved.mean(0), gains - gains.mean(0), atol=0.03)
 

@@ -214,10 +214,6 @@ def soften(mask: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(mask, (0, 0), 2)
 
 
-def tint(mask: np.ndarray) -> np.ndarray:
-    return np.dstack([mask // 9, mask, mask // 2])
-
-
 PICTURES: dict[
     str, tuple[bool, Callable[[np.ndarray, np.ndarray], np.ndarray]]
 ] = {  # of a photo and a mask of 2 levels
@@ -231,7 +227,7 @@ PICTURES: dict[
     "soft edges": (False, lambda _, mask: soften(mask)),
     "equal channels": (False, lambda _, mask: np.dstack([soften(mask)] * 3)),
     "opacity": (False, lambda _, mask: np.dstack([mask] * 4)),
-    "one colour": (False, lambda _, mask: tint(mask)),
+    "one colour": (False, lambda _, mask: np.dstack([mask // 9, mask, mask // 2])),
     "levels": (False, lambda _, mask: mask // 255 * np.linspace(130, 255, mask.shape[1]).astype(np.uint8)),
     "holes everywhere": (False, lambda _, mask: mask | speckle(mask.shape) // 128 * 255),
 }

@@ -26,10 +26,6 @@ def other(photo: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(cv2.GaussianBlur(photo[::-1, ::-1], (0, 0), 2))
 
 
-def squeeze(photo: np.ndarray) -> np.ndarray:
-    return cv2.resize(photo, (48, 36), interpolation=cv2.INTER_AREA)
-
-
 def write_photos(folder: Path, change: Change) -> None:
     SMOOTH.save(folder)
     for name, image in zip(SMOOTH.names, SMOOTH.images, strict=True):
@@ -41,7 +37,10 @@ CASES: dict[str, tuple[Change, tuple[object, ...]]] = {
     "below": (lambda i: np.vstack([other(i), i]), ("48 x 72", "line 36")),
     "sheet": (lambda i: np.vstack([np.hstack([other(i)] * 2), np.hstack([other(i), i])]), ("96 x 72", "line 36")),
     "bars": (lambda i: np.pad(i, ((9, 9), (12, 12), (0, 0))), ("bars", "72 x 54", "48 x 36")),
-    "both eyes squeezed": (lambda i: squeeze(np.hstack([i, other(i)])), ("24 x 36", "2.00")),
+    "both eyes squeezed": (
+        lambda i: cv2.resize(np.hstack([i, other(i)]), (48, 36), interpolation=cv2.INTER_AREA),
+        ("24 x 36", "2.00"),
+    ),
     "squeezed": (lambda i: cv2.resize(i, (36, 36), interpolation=cv2.INTER_AREA), ("36 x 36", "1.33", "width")),
 }
 

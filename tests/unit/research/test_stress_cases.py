@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from messages import refuses
+from shared import make_once, write_small
 from sweeps import sweep
 
 from gsmerge.errors import SceneError
@@ -30,9 +31,9 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def noisy(small_scene: Path) -> Scene:
+def noisy() -> Scene:
     """With the errors of an export, which runs of every case begin with."""
-    return load_scene(small_scene).scene
+    return load_scene(make_once("small", write_small)).scene
 
 
 def offsets(scene: Scene) -> float:

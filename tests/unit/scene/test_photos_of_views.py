@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,6 +13,7 @@ import pytest
 from messages import names
 from PIL import Image
 from plyfile import PlyData, PlyElement
+from shared import write_scene
 
 from gsmerge.errors import SceneError
 from gsmerge.scene.read import Loaded, load_scene
@@ -22,17 +22,21 @@ VIEWS = 4
 TAGS = {0: 1, 2: 3, 3: 6, 1: 8}  # of orientation, by the quarters that viewers turn a picture counterclockwise
 
 
-@pytest.fixture(scope="module")
-def made(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene of which each row has its pixel. Read only."""
-    folder: Path = make_scene(tmp_path_factory.mktemp("photos") / "room", num_views=VIEWS, width=192, height=144)
-    return folder
+def write_room(folder: Path) -> Path:
+    """Write a scene of which each row has its pixel."""
+    return write_scene(folder, num_views=VIEWS, width=192, height=144)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The scene of :func:`write_room`, which a test may change."""
+    return write_room(tmp_path / "scene")
 
 
 @pytest.fixture(scope="module")
-def truth(made: Path) -> np.ndarray:
+def truth(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     """The photos of all views ``[v,h,w,3]``."""
-    return np.stack([read(path) for path in photos_in(made)])
+    return np.stack([read(path) for path in photos_in(write_room(tmp_path_factory.mktemp("photos") / "room"))])
 
 
 def read(path: Path) -> np.ndarray:
@@ -218,16 +222,16 @@ def test_smaller_copies_alone(folder: Path, truth: np.ndarray) -> None:
     assert absent(loaded) == []
 
 
-def cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
 def dangle(path: Path) -> None:
     path.unlink()
     path.symlink_to("nowhere.png")
 
 
-@pytest.mark.parametrize("spoil", [os.unlink, lambda path: path.write_bytes(b""), cut, dangle])
+@pytest.mark.parametrize(
+    "spoil",
+    [os.unlink, lambda path: path.write_bytes(b""), lambda path: path.write_bytes(path.read_bytes()[:20_000]), dangle],
+    ids=["missing", "empty", "cut off", "a link to nothing"],
+)
 def test_one_photo_that_is_not_there(folder: Path, truth: np.ndarray, spoil: Callable[[Path], object]) -> None:
     path = photos_in(folder)[1]
     spoil(path)

@@ -9,7 +9,7 @@ import pytest
 from exports import export_rows, save_export
 from messages import noted, refuses
 from plyfile import PlyData
-from tiny_scene import Tiny, write_inria
+from tiny_scene import Tiny, make_tiny, write_inria
 
 from gsmerge.batch.find import find_scenes
 from gsmerge.cli import main
@@ -34,8 +34,9 @@ def save_result(path: Path, tiny: Tiny) -> Path:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, tiny: Tiny) -> Path:
+def folder(tmp_path: Path) -> Path:
     """The tiny scene as another program writes it, called ``room.ply``."""
+    tiny = make_tiny()
     return save_export(tmp_path / "scene", tiny, export_rows(tiny), name="room.ply")
 
 

@@ -141,8 +141,7 @@ def test_a_picture_beside_a_grid_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_none(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file of that name has a path."""
+def test_cameras_photos_and_masks_may_be_none(tmp_path: Path, kind: str) -> None:
     folder = save(tmp_path, kind, cameras=True)
     write_images(folder / "masks", replace(SMOOTH, images=np.full_like(SMOOTH.images, 255)))
     assert load_scene(folder, images="none").scene.images is None
@@ -151,6 +150,11 @@ def test_none(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> Non
     alone = load_scene(folder, cameras="none", images="none")
     assert len(alone.scene) == (3 if kind == "grid" else 0)
     assert not alone.doubts
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_folder_called_none_has_a_path(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = save(tmp_path, kind, cameras=True)
     (folder / "none").mkdir()
     (folder / "transforms.json").rename(folder / "none" / "transforms.json")
     monkeypatch.chdir(folder)
@@ -171,13 +175,13 @@ def test_masks_that_nothing_names(tmp_path: Path) -> None:
     assert actual.scene.images is not None
 
 
-@pytest.mark.parametrize("hints", [{"order": "view-major"}, {"order": "view-fastest"}], ids=str)
-def test_hints_on_pixels_for_rows_that_have_none(tmp_path: Path, hints: dict[str, str]) -> None:
+@pytest.mark.parametrize("hints", [{"order": "view-major"}, {"order": "view-fastest"}])
+@pytest.mark.parametrize("cameras", [False, True])
+def test_hints_on_pixels_for_rows_that_have_none(cameras: bool, tmp_path: Path, hints: dict[str, str]) -> None:
     ((name, value),) = hints.items()
-    for cameras in (False, True):
-        folder = save(tmp_path / str(cameras), "voxels", cameras=cameras)
-        with refuses(SceneError, "scene.ply", f"--hint {name}={value}"):
-            load_scene(folder, **hints)
+    folder = save(tmp_path / str(cameras), "voxels", cameras=cameras)
+    with refuses(SceneError, "scene.ply", f"--hint {name}={value}"):
+        load_scene(folder, **hints)
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
+
 from gsmerge import CompactOptions
 from gsmerge.settings.compact import ONE_PIECE, TRIAL
 
 
-def test_values_for_parts_of_a_scene_are_possible() -> None:
-    for values in (ONE_PIECE, TRIAL):
-        assert CompactOptions().with_settings(values).to_dict().items() >= values.items()
+@pytest.mark.parametrize("values", [ONE_PIECE, TRIAL])
+def test_values_for_parts_of_a_scene_are_possible(values: dict[str, object]) -> None:
+    assert CompactOptions().with_settings(values).to_dict().items() >= values.items()
 
 
 def test_settings_that_need_the_scene_in_one_piece_are_named() -> None:

@@ -25,14 +25,18 @@ from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups
 
 
-@pytest.fixture(scope="module")
-def room() -> Scene:
+def make_room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
 
 
 @pytest.fixture(scope="module")
-def groups(room: Scene) -> Groups:
-    return segment(room.images, SegmentOptions(), 40)
+def room() -> Scene:
+    return make_room()
+
+
+@pytest.fixture(scope="module")
+def groups() -> Groups:
+    return segment(make_room().images, SegmentOptions(), 40)
 
 
 def test_middle_pixels() -> None:

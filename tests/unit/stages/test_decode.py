@@ -20,20 +20,25 @@ from gsmerge.types import FeatureGaussians, Groups
 COUNT = 8  # so that no superpixel has fewer than 8 pixels
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
+def make_scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18), degree=1)
 
 
 @pytest.fixture(scope="module")
-def members(scene: Scene) -> Members:
-    return scene_members(scene)
+def scene() -> Scene:
+    return make_scene()
 
 
 @pytest.fixture(scope="module")
-def features(scene: Scene, members: Members) -> FeatureGaussians:
+def members() -> Members:
+    return scene_members(make_scene())
+
+
+@pytest.fixture(scope="module")
+def features() -> FeatureGaussians:
+    scene = make_scene()
     groups = segment(scene.images, SegmentOptions(), COUNT)
-    return encode(scene, members, groups)
+    return encode(scene, scene_members(scene), groups)
 
 
 def assert_alike(a: Gaussians, b: Gaussians) -> None:

@@ -195,16 +195,16 @@ def test_knee_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
     assert count(texture) == knee(texture.counts, texture.distortions) > wall.min_regions
 
 
-def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("floor", [1e-3, 1e-4])
+def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(floor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """D = 0.1 / N without a floor: 10 / ln 10 = 4.3 dB per relative increase everywhere; with one it falls."""
     counts = np.arange(1, 2000)
     monkeypatch.setattr(module, "REGION_KNEE_SLOPE", 2.0)
-    for floor in (1e-3, 1e-4):
-        monkeypatch.setattr(module, "KNEE_FLOOR", floor)
-        actual = knee(counts, 0.1 / counts)
-        middle = actual / 1.25**0.5  # the slope is measured over a factor of 1.25
-        share = (0.1 / middle) / (floor + 0.1 / middle)
-        assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
+    monkeypatch.setattr(module, "KNEE_FLOOR", floor)
+    actual = knee(counts, 0.1 / counts)
+    middle = actual / 1.25**0.5  # the slope is measured over a factor of 1.25
+    share = (0.1 / middle) / (floor + 0.1 / middle)
+    assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
 
 
 def test_knee_of_nothing() -> None:
@@ -215,19 +215,24 @@ def test_knee_of_nothing() -> None:
 # ---------------------------------------------------------------- splitting groups
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
+def make_scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18))
 
 
 @pytest.fixture(scope="module")
-def members(scene: Scene) -> Members:
-    return scene_members(scene)
+def scene() -> Scene:
+    return make_scene()
 
 
 @pytest.fixture(scope="module")
-def features(scene: Scene, members: Members) -> FeatureGaussians:
-    return encode(scene, members, cut(scene.images, 12))
+def members() -> Members:
+    return scene_members(make_scene())
+
+
+@pytest.fixture(scope="module")
+def features() -> FeatureGaussians:
+    scene = make_scene()
+    return encode(scene, scene_members(scene), cut(scene.images, 12))
 
 
 def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, members: Members) -> None:
@@ -272,7 +277,7 @@ def test_children_stand_in_the_order_of_their_groups(features: FeatureGaussians,
     np.testing.assert_array_equal(children.means[np.repeat(whole, counts)], one.means[whole])
 
 
-def test_decode_refuses_strange_counts(features: FeatureGaussians, members: Members) -> None:
-    for counts in (np.ones(3, int), np.zeros(24, int)):
-        with refuses(ValueError, "counts", 24):
-            decode(features, members, DecodeOptions(), counts)
+@pytest.mark.parametrize("counts", [np.ones(3, int), np.zeros(24, int)])
+def test_decode_refuses_strange_counts(counts: np.ndarray, features: FeatureGaussians, members: Members) -> None:
+    with refuses(ValueError, "counts", 24):
+        decode(features, members, DecodeOptions(), counts)

@@ -19,10 +19,14 @@ from gsmerge.states.features import FeatureState
 PAPER: dict[str, Any] = {"recipe": "paper", "superpixels": "10%"}
 
 
-@pytest.fixture(scope="module")
-def room() -> Scene:
+def make_room() -> Scene:
     """Four views of 36 x 24."""
     return scenes.make_scene(scenes.room(), scenes.arc(4, 36, 24), noise=0.005)
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return make_room()
 
 
 def fed(*batches: Scene, **wish: Any) -> Compactor:
@@ -48,8 +52,8 @@ def saved(compactor: Compactor, path: Path) -> Compactor:
 
 
 @pytest.fixture(scope="module")
-def whole(room: Scene) -> Compactor:
-    return fed(room)
+def whole() -> Compactor:
+    return fed(make_room())
 
 
 @pytest.mark.parametrize("k", [1, 2, 4, "mixed"])

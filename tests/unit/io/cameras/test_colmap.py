@@ -58,13 +58,16 @@ def test_colmap_models_without_distortion(tmp_path: Path, tiny: Tiny) -> None:
     assert read_cameras(tmp_path / "a").Ks[0, 1, 1] == 30
 
 
-def test_unknown_colmap_models_are_refused(tmp_path: Path, tiny: Tiny) -> None:
-    for name, model, extra, found in (
-        ("a", 7, (0.1,), "FOV"), ("b", 10, (0.0,) * 8, "THIN_PRISM_FISHEYE"), ("c", 99, (), "model 99"),
-    ):  # fmt: skip
-        write_colmap_binary(tmp_path / name, tiny, model, extra)
-        with refuses(SceneError, "cameras.bin: camera 7", found):
-            read_cameras(tmp_path / name)
+@pytest.mark.parametrize(
+    ("name", "model", "extra", "found"),
+    [("a", 7, (0.1,), "FOV"), ("b", 10, (0.0,) * 8, "THIN_PRISM_FISHEYE"), ("c", 99, (), "model 99")],
+)
+def test_unknown_colmap_models_are_refused(
+    name: str, model: int, extra: tuple[float, ...], found: str, tmp_path: Path, tiny: Tiny
+) -> None:
+    write_colmap_binary(tmp_path / name, tiny, model, extra)
+    with refuses(SceneError, "cameras.bin: camera 7", found):
+        read_cameras(tmp_path / name)
 
 
 def test_a_model_that_shrinks_while_it_is_read(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:

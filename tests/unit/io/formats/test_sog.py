@@ -25,14 +25,14 @@ def gaussians() -> Gaussians:
     return drawn(scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72)), 3)
 
 
-def test_sog_keeps_what_is_transparent_or_opaque(tmp_path: Path) -> None:
+@pytest.mark.parametrize("opacity", [0.0, 1.0])
+def test_sog_keeps_what_is_transparent_or_opaque(opacity: float, tmp_path: Path) -> None:
     """Where every alpha is 255, or 0, WebP stores no alpha, or no colours."""
-    for opacity in (0.0, 1.0):
-        one = replace(corners(), opacities=np.full(3, opacity, np.float32))
-        write_gaussians(tmp_path / "a.sog", one, overwrite=True)
-        actual = read_gaussians(tmp_path / "a.sog").gaussians
-        np.testing.assert_array_equal(actual.opacities, one.opacities)
-        assert np.isfinite(actual.sh0).all()
+    one = replace(corners(), opacities=np.full(3, opacity, np.float32))
+    write_gaussians(tmp_path / "a.sog", one, overwrite=True)
+    actual = read_gaussians(tmp_path / "a.sog").gaussians
+    np.testing.assert_array_equal(actual.opacities, one.opacities)
+    assert np.isfinite(actual.sh0).all()
 
 
 def test_sog_textures_lose_nothing(gaussians: Gaussians) -> None:

@@ -12,14 +12,8 @@ import pytest
 import scenes
 from slow_readers import drawn
 
-from gsmerge import Scene
 from gsmerge.geometry.transforms import multiply_quats, sh0_to_rgb
 from gsmerge.io import write_gaussians
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72))
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -46,8 +40,8 @@ def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_glb_holds_everything(degree: int, scene: Scene, tmp_path: Path) -> None:
-    gaussians = drawn(scene, degree)
+def test_glb_holds_everything(degree: int, tmp_path: Path) -> None:
+    gaussians = drawn(scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72)), degree)
     write_gaussians(tmp_path / "a.glb", gaussians)
     document, actual = read_glb(tmp_path / "a.glb")
     prefix, n = "KHR_gaussian_splatting:", len(gaussians)

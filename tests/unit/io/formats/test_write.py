@@ -124,10 +124,10 @@ def test_more_gaussians_than_readers_take_are_noted() -> None:
     assert noted(limit_notes("a.spz", 0, 10_000_001), "10,000,000", ".sog")
 
 
-def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
-    for ending, degree in ((".ply", 3), (".spz", 3), (".sog", 3), (".splat", 0)):
-        write_gaussians(tmp_path / f"a{ending}", drawn(scene, 4))
-        assert read_back(tmp_path / f"a{ending}").sh_degree == degree
+@pytest.mark.parametrize(("ending", "degree"), [(".ply", 3), (".spz", 3), (".sog", 3), (".splat", 0)])
+def test_a_higher_degree_loses_its_top(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
+    write_gaussians(tmp_path / f"a{ending}", drawn(scene, 4))
+    assert read_back(tmp_path / f"a{ending}").sh_degree == degree
 
 
 def test_names_ask_for_formats() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import refuses
+from shared import make_once
 
 import gsmerge
 from gsmerge.errors import SceneError, UsageError
@@ -26,18 +27,20 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+def make_two() -> Path:
+    """Return a folder with two scenes, which take a second together. Read only."""
+    return make_once("generated", lambda out: generate(out, NUM_SCENES, TINY, seed=0, threads=2))
+
+
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes, which take a second together. Read only."""
-    out = tmp_path_factory.mktemp("generated")
-    generate(out, NUM_SCENES, TINY, seed=0, threads=2)
-    return out
+def folder() -> Path:
+    return make_two()
 
 
 @pytest.fixture
-def first(folder: Path, tmp_path: Path) -> Path:
+def first(tmp_path: Path) -> Path:
     """A folder with the first scene alone, which a test may change."""
-    shutil.copytree(folder / "scene_0000", tmp_path / "scene_0000")
+    shutil.copytree(make_two() / "scene_0000", tmp_path / "scene_0000")
     return tmp_path
 
 
@@ -121,7 +124,7 @@ def test_what_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_counts_and_seeds_are_checked(tmp_path: Path) -> None:
-    for count, seed in ((0, 0), (1, -1)):
-        with refuses(ValueError, "", "1 scene", "seed"):
-            generate(tmp_path, count, TINY, seed=seed)
+@pytest.mark.parametrize(("count", "seed"), [(0, 0), (1, -1)])
+def test_counts_and_seeds_are_checked(count: int, seed: int, tmp_path: Path) -> None:
+    with refuses(ValueError, "", "1 scene", "seed"):
+        generate(tmp_path, count, TINY, seed=seed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -125,14 +126,15 @@ def test_axes_turn_with_their_covariance() -> None:
     assert float((gradient * change).sum()) == pytest.approx(float(difference), rel=1e-2)
 
 
-@pytest.fixture(scope="module")
-def example() -> Example:
+@cache
+def tiny_example() -> Example:
     return make_example(make_training_scene(make_scene(room(), arc(2, 24, 18)), range(2)), PAPER, 0.1, "room")
 
 
 @pytest.fixture
-def fixed_choices(example: Example, monkeypatch: pytest.MonkeyPatch) -> None:
+def fixed_choices(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clusters, neighbours, and what other views say of a group, stay: they jump, and have no gradient."""
+    example = tiny_example()
     matches = match(example.features, PAPER.match_options())
     assert matches.count < len(example.features)
     monkeypatch.setattr("gsmerge.research.training.predict.match", lambda *_: matches)
@@ -163,10 +165,10 @@ def measure(crop: Crop, networks: Networks) -> torch.Tensor:
 @pytest.mark.usefixtures("fixed_choices")
 @sweep("network", [PAPER.network, TINY])
 @sweep("k", [1, 2, 4], often=0)
-def test_gradients_are_central_differences(example: Example, network: NetworkOptions, k: int) -> None:
+def test_gradients_are_central_differences(network: NetworkOptions, k: int) -> None:
     """For every column that a network makes: each reaches the children, through all stages after its own."""
     networks = noisy_networks(network, scale=0.15).requires_grad_(True)
-    crop = whole_photo(example, 0, k).crop
+    crop = whole_photo(tiny_example(), 0, k).crop
     rows = {"encoder.shift": {"shift": slice(0, 3)}, "encoder.latent": {"latent": slice(0, TINY.latent)}}
     rows |= {"merger.out": OF_FEATURES, "refiner.out": OF_FEATURES, f"heads.{k}.out": COLUMNS}
     for name, groups in rows.items():

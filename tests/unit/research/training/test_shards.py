@@ -17,7 +17,6 @@ from gsmerge.errors import SceneError
 from gsmerge.research.generate import GenerateOptions, generate
 from gsmerge.research.training import (
     Example,
-    Shard,
     TrainOptions,
     make_example,
     make_training_scene,
@@ -137,12 +136,8 @@ def test_a_photo_that_is_held_out_makes_other_shards(scenes: list[Path], tmp_pat
     assert scene_key(copy, OPTIONS) != before
 
 
-@pytest.fixture(scope="module")
-def shards(scenes: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[Shard]:
-    return prepare_shards(scenes, PAPER, tmp_path_factory.mktemp("shards"))
-
-
-def test_a_run_names_the_shard_that_is_damaged(shards: list[Shard], tmp_path: Path) -> None:
+def test_a_run_names_the_shard_that_is_damaged(scenes: list[Path], tmp_path: Path) -> None:
+    shards = prepare_shards(scenes, PAPER, tmp_path / "shards")
     data = bytearray(shards[0].path.read_bytes())
     data[-1] ^= 1
     damaged = replace(shards[0], path=tmp_path / "damaged.safetensors")

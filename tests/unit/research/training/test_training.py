@@ -14,31 +14,18 @@ from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.networks.corrections import LOGIT_COLUMN
 from gsmerge.networks.options import Bounds
-from gsmerge.research.training import Example, Shard, TrainOptions, make_example, preset_options, train
-from gsmerge.research.training.scenes import TrainingScene, make_training_scene
+from gsmerge.research.training import Shard, TrainOptions, make_example, preset_options, train
+from gsmerge.research.training.scenes import make_training_scene
 from gsmerge.settings.setting import change_settings
-from gsmerge.types import Scene
 
 
 class StoppedError(Exception):
     """What a test interrupts a run with."""
 
 
-def scene(views: int = 3) -> Scene:
-    return make_scene(room(), arc(views, 32, 24))
-
-
-def training_scene() -> TrainingScene:
-    return make_training_scene(scene(), range(3))
-
-
 @pytest.fixture(scope="module")
-def example() -> Example:
-    return make_example(training_scene(), OPTIONS, 0.1, "room")
-
-
-@pytest.fixture(scope="module")
-def shard(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Shard:
+def shard(tmp_path_factory: pytest.TempPathFactory) -> Shard:
+    example = make_example(make_training_scene(make_scene(room(), arc(3, 32, 24)), range(3)), OPTIONS, 0.1, "room")
     return written(example, tmp_path_factory.mktemp("shards"))
 
 
@@ -47,7 +34,7 @@ def files(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_a_run_has_a_table_and_the_best_checkpoint_and_is_gone_on_with_alone(shard: Shard, tmp_path: Path) -> None:
+def test_a_run_has_a_table_and_the_best_checkpoint(shard: Shard, tmp_path: Path) -> None:
     """Three steps of training with a validation after each take a second."""
     options = replace(OPTIONS, steps=3, save_every=1)
     done = train([shard], [], tmp_path, options)
@@ -60,6 +47,12 @@ def test_a_run_has_a_table_and_the_best_checkpoint_and_is_gone_on_with_alone(sha
     assert best.networks.options == TINY
     assert best.training["data"] == [shard.sha256]
     assert best.training["options"] == options.to_dict()
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_with_its_own_options_and_data_alone(shard: Shard, tmp_path: Path) -> None:
+    options = replace(OPTIONS, steps=1, save_every=1)
+    train([shard], [], tmp_path, options)
     with refuses(SceneError, "state.safetensors", "options", "--output"):
         train([shard], [], tmp_path, replace(options, steps=8))
     with refuses(SceneError, "state.safetensors", "data", "--output"):
@@ -94,15 +87,15 @@ def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(shard
     assert (again.resumed, again.step) == (12, 12)
 
 
-def test_settings_are_checked(tmp_path: Path) -> None:
-    for wrong in (
+@pytest.mark.parametrize("wrong", [
         {"steps": 0}, {"rate": -1.0}, {"levels": (3,)}, {"levels": ()}, {"densities": ()}, {"densities": (2,)},
         {"match": "all"}, {"seed": 1.5}, {"views": ()}, {"views": (-1,)}, {"novel": -0.1}, {"photo_scale": 0},
         {"window": 5}, {"photo_loss": "l2"}, {"lpips_weight": -1}, {"teacher_steps": 0}, {"buffer": 0},
         {"segmentation": "slice"}, {"overlap": 2}, {"iou": -0.1}, {"photo_side": -1}, {"random_views": (3, 2)},
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            replace(OPTIONS, **wrong)
+])  # fmt: skip
+def test_settings_are_checked(wrong: dict[str, object], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        replace(OPTIONS, **wrong)
 
 
 @pytest.mark.slow
@@ -123,21 +116,30 @@ def test_checkpoints_show_more_than_the_networks_in_training(shard: Shard, tmp_p
     assert rows == (tmp_path / "0.0" / "losses.csv").read_text()
 
 
-def test_presets_are_settings() -> None:
+def test_the_paper_s_preset() -> None:
     paper = preset_options("paper")
     assert (paper.photo_loss, paper.photo_weight, paper.ssim_weight, paper.lpips_weight) == ("mse", 1, 0.05, 0.05)
     assert (paper.teacher_weight, paper.diversity_weight, paper.steps) == (0.25, 1, 300_000)
     assert (paper.rate_at(1999), paper.clip) == (5e-5, 10)
     assert paper.rate_at(299_999) == pytest.approx(1e-6, rel=1e-3)
-    assert preset_options("default") == TrainOptions()
     network = replace(paper.network, width=16, bounds=Bounds(mean=0.5))
     assert change_settings(paper, {"steps": 10, "width": 16, "mean": 0.5}) == replace(paper, steps=10, network=network)
     assert paper.photo_level(952, 100) == 2
     assert paper.photo_level(320, 240) == 1
+
+
+def test_the_preset_of_the_shipped_networks() -> None:
     shipped = preset_options("shipped")
     assert [shipped.lpips_weight_at(step) for step in (0, 2079, 2080, 2599)] == [0, 0, 0.06, 0.06]
     assert not shipped.network.encoder
     assert Bounds(color=0) == shipped.network.bounds
+
+
+def test_the_default_preset_changes_nothing() -> None:
+    assert preset_options("default") == TrainOptions()
+
+
+def test_unknown_presets_are_refused() -> None:
     with pytest.raises(ValueError, match="preset"):
         preset_options("papers")
 
