@@ -373,8 +373,8 @@ def build_section(run: Run) -> str:
         ]),
         text(
             "**Superpixels** follow colour borders in the photo, because a Gaussian has one colour.",
-            say(f"Each view has {groups.counts[0]};", len(set(groups.counts)) == 1),
-            f"the pixel belongs to number {run.label}, with {size} pixels.",
+            say(f"Each view has {groups.counts[0]} superpixels.", len(set(groups.counts)) == 1),
+            f"The pixel lies in number {run.label}, which has {size} pixels.",
             "**`encode`** gives each superpixel a Feature Gaussian with the mean and the covariance of its Gaussians,",
             "weighted by their opacities.",
             f"**`correct`** lowers the gain of {faint} of the {len(features)}, because other views see through them",

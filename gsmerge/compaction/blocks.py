@@ -108,11 +108,11 @@ def compact_in_blocks(
                 # blocks drop new Gaussians that belong to other blocks, so each needs a surplus to reach the number
                 growth = max(growth, BLOCK_SURPLUS * limit / max(1, len(joined)))
         shared_start = work.share((joined, owners))
-        fitted = list(adopt_records(work.run("fit", fit_block, count, each_start(starts, shared_start, growth))))
+        fitted = list(adopt_records(work.run("fit", fit_block, count, list_calls(starts, shared_start, growth))))
         joined, owners = join_parts([gaussians for gaussians, _ in fitted])
         joined = fit_seams(joined, owners, starts, options.seed)
         result = finish_joined(joined, scene.cameras, scene.names, frame, options, choices)
-        scored = work.run("score", score_block, count, each_start(starts, work.share(result)))
+        scored = work.run("score", score_block, count, list_calls(starts, work.share(result)))
         scores = [score for score, _ in adopt_records(scored)]
     facts = [
         {
@@ -153,8 +153,11 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
         yield value, record.choices
 
 
-def each_start(starts: Sequence[BlockStart], *values: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the arguments of one call per block: its start, the ``values``, and its number; then free its memory."""
+def list_calls(starts: Sequence[BlockStart], *values: Any) -> Iterator[tuple[Any, ...]]:
+    """Yield the arguments of a call for each block: its start, the ``values``, and its number.
+
+    When the next call is asked for, the memory of the block before is released, since its arguments have been sent.
+    """
     for number, start in enumerate(starts):
         yield start, *values, number
         for scene in (start.prepared.scene, start.prepared.input_scene):

@@ -28,7 +28,9 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
 from gsmerge.values.words import count_words
 
-MAX_SEARCHED = 500_000  # most Gaussians of a scene without cameras for which the search is run; it takes seconds
+MAX_SEARCHED_GAUSSIANS = (
+    500_000  # most Gaussians of a scene without cameras for which the search is run; it takes seconds
+)
 BESIDE = ("cameras", "images", "masks", "protect")  # fields of SceneFiles that are read with the Gaussians
 
 
@@ -57,7 +59,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     max_count = num_pixels if options.method.startswith("unmerged") else limits.count or limits.default
     no_views = is_without_views(scene, options)
     has_target = choices.keeps_fidelity or options.budget.target_psnr is not None
-    found_count = find_count(scene, options) if no_views and has_target and num_input <= MAX_SEARCHED else None
+    found_count = (
+        find_count(scene, options) if no_views and has_target and num_input <= MAX_SEARCHED_GAUSSIANS else None
+    )
     count = found_count or min(scene.num_gaussians or num_pixels, max_count)
     at_once, num_rest = gaussians_at_once(num_pixels, num_blocks), 3 * scene.gaussians.shN.shape[1]
     num_drawn = num_pixels if options.method == "unmerged-fit" else count

@@ -16,7 +16,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from gsmerge.geometry.pooling import pixel_sizes
+from gsmerge.geometry.pooling import measure_pixel_sizes
 from gsmerge.geometry.transforms import find_nearest
 from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
 from gsmerge.raster.images import ONE_AT_A_TIME
@@ -54,12 +54,12 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     g, cameras, by_distance = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
     step = max(1, len(g) // ESTIMATE_GAUSSIANS)
-    units = pixel_sizes(g.means[::step], homes[::step], cameras)
+    units = measure_pixel_sizes(g.means[::step], homes[::step], cameras)
     if by_distance:  # a sample of the Gaussians of a surface lies farther apart
         units = np.minimum(units, find_nearest(g.means[::step], 1)[1][:, 0] / math.sqrt(step))
     if (g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units).mean() < FEWEST_HIDDEN:
         return scene
-    units = find_nearest(g.means, 1)[1][:, 0] if by_distance else pixel_sizes(g.means, homes, cameras)
+    units = find_nearest(g.means, 1)[1][:, 0] if by_distance else measure_pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | by_distance
     num_sharing = 1 if by_distance else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
     # a size of 1 is the scene's median depth

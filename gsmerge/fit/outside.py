@@ -107,7 +107,7 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
 
 
 def _depth_range(points: np.ndarray, cameras: Cameras, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the depths ``[count]`` of the near planes of views from outside, and their largest depths ``[count]``.
+    """Return the depth of the near plane of each of ``count`` views from outside, and the largest depth that each sees.
 
     They follow from the depths of ``points [n,3]`` in the photos' ``cameras``, from which the views step back in turn.
     """

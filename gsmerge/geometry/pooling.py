@@ -46,16 +46,17 @@ def _as_float32(values: np.ndarray) -> np.ndarray:
 
 
 def scene_members(scene: Scene) -> Members:
-    """Return the Gaussians of a canonical scene with pixels as members; footprints are their :func:`pixel_sizes`."""
+    """Return the Gaussians of a canonical scene as members; their footprints are sizes of pixels."""
     g, pixels = scene.gaussians, scene.get_pixels()
-    return _make_members(g, pixel_sizes(_as_float32(g.means), pixels.homes, scene.cameras), pixels)
+    return _make_members(g, measure_pixel_sizes(_as_float32(g.means), pixels.homes, scene.cameras), pixels)
 
 
-def pixel_sizes(means: np.ndarray, homes: np.ndarray, cameras: Cameras) -> np.ndarray:
-    """Return the size ``[n]`` of a pixel at the depth of each of ``means [n,3]``, in units of the world.
+def measure_pixel_sizes(means: np.ndarray, homes: np.ndarray, cameras: Cameras) -> np.ndarray:
+    """Measure the width ``[n]`` of a pixel at each of ``means [n,3]``: the smallest detail that its photo shows.
 
-    The pixel is that of the view to which ``homes [n]`` belongs. For a mean without a pixel (-1) it is the smallest
-    size over all views.
+    ``homes [n]`` are the pixels of the means, numbered over all views; -1 for none. A width is in units of the world,
+    at the depth of the mean in the view of its pixel. For a mean without a pixel it is the smallest width of all views,
+    at its distances from their centres.
     """
     footprints, viewmats, Ks = np.empty(len(means), np.float32), cameras.viewmats.astype(np.float32), cameras.Ks
     focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in Ks])

@@ -96,7 +96,7 @@ class _Outputs:
         if str(path) in _written:
             return path
         self.new_folders.extend(_make_folder(path.parent))
-        _check_output(path, self.overwrite)
+        _check_not_there(path, self.overwrite)
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
         _remove_stale_once(target.parent.absolute())
         temporary = temporary_path(target)
@@ -288,7 +288,7 @@ def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
         return False
 
 
-def _check_output(path: Path, overwrite: bool) -> None:
+def _check_not_there(path: Path, overwrite: bool) -> None:
     """Raise SceneError for an output that cannot be written or must not be replaced."""
     try:
         status = os.stat(path)

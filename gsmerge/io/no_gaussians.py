@@ -17,7 +17,7 @@ from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES, list_images
 from gsmerge.io.scene_files import IMAGE_PLACES
 
-MAX_SEARCHED = 100  # most folders that are searched in a folder of scenes
+MAX_SEARCHED_FOLDERS = 100  # most folders that are searched in a folder of scenes
 _NAME_PLY = "name the .ply of the Gaussians, or the folder that it is in"
 
 
@@ -73,7 +73,7 @@ def find_remedy(folder: Path) -> str:
     """Say what a folder without scenes, or one of its folders, has instead, and what to do; "" if nothing is known."""
     with suppress(OSError):
         subfolders = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
-        contents = [(path, _content(path)) for path in (folder, *islice(subfolders, MAX_SEARCHED))]
+        contents = [(path, _content(path)) for path in (folder, *islice(subfolders, MAX_SEARCHED_FOLDERS))]
         for path, content in sorted(contents, key=lambda entry: entry[1] == _PHOTOS):  # photos come last
             if content is not None:
                 return f"{path} has {content[0]}: {content[1]}"

@@ -16,7 +16,7 @@ from gsmerge.io.photo_files import decode_small, image_size, same_shape
 from gsmerge.io.scene_files import list_folders
 from gsmerge.photos.offsets import OFFSET_PIXELS
 
-_ROUNDING = 1 / 255  # mean difference of channels that rounding to 8 bits may cause
+_CHANNEL_ROUNDING = 1 / 255  # mean difference of channels that rounding to 8 bits may cause
 _MODEL_FOLDERS = {"sparse", "colmap", "distorted"}  # names of folders that have COLMAP's models
 
 
@@ -76,7 +76,7 @@ def find_named_photos(
 def is_grey(path: Path) -> bool:
     """Return True if an image file has no colours, like masks and depths; False if it cannot be read."""
     with suppress(SceneError):
-        return bool(np.ptp(decode_small(path, OFFSET_PIXELS), axis=-1).mean() <= _ROUNDING)
+        return bool(np.ptp(decode_small(path, OFFSET_PIXELS), axis=-1).mean() <= _CHANNEL_ROUNDING)
     return False
 
 

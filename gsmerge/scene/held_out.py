@@ -119,7 +119,7 @@ def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict
     The latter maps views of the file to views of the scene with the same name, by index. It is empty if no similarity
     brings their poses together.
     """
-    stored, shared = _similarity_from_stored(load), _match_by_name(camera_file, load.scene.names)
+    stored, shared = _find_similarity(load), _match_by_name(camera_file, load.scene.names)
     if not shared:
         return stored, {}
     theirs = camera_file.viewmats[list(shared)]
@@ -139,8 +139,12 @@ def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict
     return stored, {}
 
 
-def _similarity_from_stored(load: Loaded) -> Similarity:
-    """Find the similarity from the world of the scene's own camera file to the world of its Gaussians."""
+def _find_similarity(load: Loaded) -> Similarity:
+    """Find the similarity from the world of a scene's own camera file to the world of its Gaussians.
+
+    Cameras of held-out photos are taken to be in the world of that file. Return the identity if there is no such file,
+    or if its poses cannot be compared with those of the scene.
+    """
     if load.recovery is not None:
         return load.recovery.frame
     if load.cameras is None or load.files.cameras is None:

@@ -26,7 +26,7 @@ from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # photos of at most this size, as floats, are not resized unless rows have no pixels
-_ROUNDING = 1e-6  # pixels by which the edge of a window may be off
+_EDGE_ROUNDING = 1e-6  # pixels by which the edge of a window may be off
 
 
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
@@ -122,7 +122,7 @@ def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cam
     corner, grid = np.array([known.left, known.top]), np.array([known.width, known.height])
     reduction = np.array([cameras.width, cameras.height]) / grid  # views of unaligned scenes may be reduced again
     first = np.floor(corner / scale).astype(int)
-    last = np.minimum(np.ceil((corner + grid) / scale - _ROUNDING).astype(int), stored)
+    last = np.minimum(np.ceil((corner + grid) / scale - _EDGE_ROUNDING).astype(int), stored)
     to_file = np.eye(3)
     to_file[(0, 1), (0, 1)] = 1 / (scale * reduction)
     to_file[:2, 2] = corner / scale - first

@@ -51,7 +51,8 @@ class SegmentOptions(Settings):
     """Settings of cutting views into superpixels."""
 
     superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
-        "auto. auto takes 4.4 to 7 %, more the better the depths of the views agree.")  # fmt: skip
+        "auto. auto takes 4.4 to 7 %: the better the "
+        "depths of the views agree, the more.")  # fmt: skip
     segmentation: str = setting("rdseg", "Method that cuts views into superpixels; `gsmerge.stages.superpixels` lists "
         "all.", choices=SEGMENTATIONS)  # fmt: skip
     rectangles: float | None = setting(None, "Of `rdseg`: number of rectangles per superpixel at its start.",

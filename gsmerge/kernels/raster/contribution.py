@@ -43,7 +43,9 @@ def settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, out_
 
 
 def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, count):
-    """Return each Gaussian's largest sum of weights ``[m]`` float32 in a superpixel, and its label ``[m]`` int32.
+    """Return each Gaussian's largest sum of blending weights in a superpixel, and the superpixel's label.
+
+    Both are ``[m]``, float32 and int32.
 
     Of superpixels with equal sums the smallest label is returned. Gaussians that no pixel shows have 0 and -1.
 

@@ -24,8 +24,10 @@ _adjacent_pairs = declare("adjacent_pairs", COUNT, labels=i4("rows", "columns"),
 def adjacent_pairs(labels):
     """Return the labels of all pairs of neighbouring regions, ``[e,2]`` int32, in which pairs may be repeated.
 
-    There is about one pair for each straight piece of a common border.
+    ``labels`` has a border that is one pixel wide and belongs to no region. There is about one pair for each straight
+    piece of a common border.
     """
+    # at most two pairs for each pixel inside the border: to the right, and below
     pairs = np.empty((2 * (labels.shape[0] - 2) * (labels.shape[1] - 2) + 1, 2), np.int32)
     return pairs[: _adjacent_pairs(labels, pairs)]
 

@@ -31,14 +31,14 @@ def parse_grid(pairs: Sequence[str]) -> SettingGrid:
     grid: dict[str, list[Any]] = {}
     for pair in pairs:
         name, _, text = pair.partition("=")
-        values = [parse_value(part.strip()) for part in text.split(",") if part.strip()]
+        values = [parse_grid_value(part.strip()) for part in text.split(",") if part.strip()]
         if name not in flat_settings(CompactOptions) or name in grid or not values:
             raise UsageError(f"--grid {pair}: expected a setting of compact, each once, with values: NAME=A,B")
         grid[name] = values
     return grid
 
 
-def parse_value(text: str) -> Any:
+def parse_grid_value(text: str) -> Any:
     """Parse a number, true or false; return any other text as it is."""
     try:
         return json.loads(text)

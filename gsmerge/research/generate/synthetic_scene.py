@@ -39,7 +39,7 @@ from gsmerge.types import Cameras, Gaussians
 FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
 SWING = 35  # largest angle between -z and a camera, seen from the focus, degrees
 CAMERA_HEIGHTS = 0.9, 1.8  # range of the height of cameras above the ground, metres
-CameraPath = Callable[[float], Array]  # from a position along the path, 0 to 1, to a camera-to-world matrix [4,4]
+PathFunction = Callable[[float], Array]  # from a position along the path, 0 to 1, to a camera-to-world matrix [4,4]
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
@@ -58,7 +58,7 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
     return out
 
 
-def draw_path(room: Room, rng: np.random.Generator, num_views: int) -> CameraPath:
+def draw_path(room: Room, rng: np.random.Generator, num_views: int) -> PathFunction:
     """Draw a random path: an arc around the focus, on which the camera also moves up and down."""
     max_turn = 50  # largest angle between neighbouring views, degrees
     limit = max_turn * max(1, num_views - 1)
@@ -208,7 +208,7 @@ def _shrink_lens(lens: Pinhole) -> Pinhole:
     return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
 
-def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitRoom, CameraPath]:
+def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitRoom, PathFunction]:
     """Draw a room and a path on which all views are usable; after too many tries, return the last ones."""
     side = 1 << min(max(int(1.6 * max(lens.width, lens.height)).bit_length() - 1, 7), 10)  # side of textures, pixels
     path_tries, room_tries = 6, 6  # most paths per room, and most rooms

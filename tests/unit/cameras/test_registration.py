@@ -110,13 +110,13 @@ def test_the_last_bits_do_not_matter(parts: list[Scene], monkeypatch: pytest.Mon
     """Places are rounded, and what moves keypoints by a rounding error moves no place."""
     places = register(parts[:2]).similarities
     assert places[1].scale == round(places[1].scale, DIGITS)
-    find = keypoints._describe
+    find = keypoints._detect_keypoints
 
     def shaken(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
         pixels, descriptors = find(picture, stretch)
         return pixels * (1 + 2e-16), descriptors
 
-    monkeypatch.setattr(keypoints, "_describe", shaken)
+    monkeypatch.setattr(keypoints, "_detect_keypoints", shaken)
     other = register(parts[:2]).similarities[1]
     for name in ("rotation", "scale", "shift"):
         assert np.array_equal(getattr(other, name), getattr(places[1], name))
