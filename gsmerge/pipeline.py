@@ -82,8 +82,8 @@ def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Pla
     """Drop the Gaussians that no view sees, and put new ones into gaps between the views in their place.
 
     Gaps are filled only after a long fit that was accepted, and only if all of the scene counts, not a region of it. A
-    plan that fills the budget, or that drops nothing, keeps unseen Gaussians, except as many as are new. Merged pairs,
-    trials and an unchanged input stay complete.
+    plan that fills the budget, or that drops nothing, keeps unseen Gaussians too, and each new Gaussian takes the place
+    of one of them. Merged pairs, trials and an unchanged input stay complete.
     """
     scene, is_unchanged = prepared.scene, start.is_input and fitted.report is None
     is_long = plan.fit.grows and fitted.report is not None and fitted.report.accepted

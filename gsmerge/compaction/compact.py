@@ -157,7 +157,7 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     plan = add_target(plan, prepared)
 
     def rebuild(count: int | None) -> Candidate:
-        """Build a candidate after those of the search."""
+        """Build a count from all views, and add its seconds to those of the run."""
         candidate = build_scored(method.build, prepared, plan, count)
         add_seconds(candidate.record.seconds)  # in addition to those of the search
         return candidate

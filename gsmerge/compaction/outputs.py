@@ -41,7 +41,7 @@ class Outputs:
 
 
 def plan_outputs(result: Path, options: FileOptions | None = None, *, overwrite: bool = False) -> Outputs:
-    """Name the files of an output; cameras get a file beside the result if its format has none and options allow it."""
+    """Name the files of an output; cameras get a file of their own if the format cannot hold them."""
     options = options or FileOptions()
     is_beside = options.viewer_cameras and not find_format(result).has_cameras
     return Outputs(result, viewer_cameras_path(result) if is_beside else None, overwrite, options)

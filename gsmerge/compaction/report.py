@@ -68,8 +68,8 @@ class CompactReport:
             photos, in drafts, and in blocks.
         psnr_after: Like ``psnr_before``, rendered from the result; if a file is written that rounds positions visibly,
             rendered from the rounded values.
-        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit), and ``pruned``, the
-            number of Gaussians that were left out because no view shows them. Without photos and without pixels,
+        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit), and ``pruned``, by
+            how many Gaussians the result is below its limit, because no view shows more. Without photos and pixels,
             ``fidelity`` has the ``psnr`` (dB) against renders of the input and the number of ``views`` for it; these
             are ``held_out`` if they were placed because the scene has no cameras.
         notes: Warnings about the input and adaptations to it, one sentence each.
@@ -238,7 +238,7 @@ def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]
     if fidelity := choices.get("fidelity"):
         rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_fidelity_views(fidelity))]
     if pruned := choices.get("pruned"):
-        rows += [("dropped", "", f"{pruned:,}", "Gaussians that no view shows")]
+        rows += [("not used", "", f"{pruned:,}", "Gaussians of the limit: no view shows more")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     return [*rows, ("time", "", seconds_line(document), f"most in {stages}")]

@@ -190,7 +190,7 @@ def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
 
 
 def add_target(plan: Plan, prepared: Prepared) -> Plan:
-    """Return the plan with what candidates are compared with: a target of PSNR, or the pixels that the input covers.
+    """Add to the plan the PSNR that a result has to reach, and the pixels that count if the input leaves gaps.
 
     If a result has to keep the quality of the input, the target is the PSNR of the input on the photos less the allowed
     loss. If renders of the input stand for photos, only the pixels that the input covers are scored, because any result

@@ -49,8 +49,8 @@ def fit_scene(
         record_choices(start_count=len(decoded.gaussians))
         if decoded.exact and not options.grows:  # no drop may change the exact number, because nothing grows back
             options = replace(options, min_contribution=0.0)
-        is_met = decoded.exact or options.fills  # the run grows to the whole count, even where that gains little
-        growth = None if is_met else MOST_GROWTH
+        takes_all = decoded.exact or options.fills  # the fit grows to the whole count, even where that gains little
+        growth = None if takes_all else MOST_GROWTH
         job = FitJob(photos, options, decoded.count, growth, seed, report_steps, decoded.fixed, num_scored)
         outside = place_outside_views(scene, decoded.gaussians, job.scored_photos(1), options)
         edges = None if options.beyond else find_edges(scene.cameras, decoded.count)

@@ -42,7 +42,7 @@ class Optimiser:
     def step(self, state: FitState, step: Step) -> float:
         """Change a state by one Adam step on one view; return the mean squared error of the pixels that count."""
         rates, weight = self.run.job.options.tuning, self.run.weight(step)
-        photo, camera = self.view(step)
+        photo, camera = self.select_view(step)
         numbers = self.constants(state, step) | {
             "camera": camera_numbers(**camera),
             "eye": camera_centres(camera["viewmat"].astype(np.float64)),
@@ -77,8 +77,8 @@ class Optimiser:
 
         parallel_map(move_rows, range(0, len(g.ids), ADAM_ROWS))
 
-    def view(self, step: Step) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return the pixels ``[h,w,3]`` float32 of the photo of a step, and the camera that draws them."""
+    def select_view(self, step: Step) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return the pixels ``[h,w,3]`` float32 of a photo with which a step compares, and the camera for them."""
         photos, mode, sample = self.photos[step.mode.size], step.mode, step.sample
         camera = photos.camera(step.view, sample)
         camera |= {"eps2d": mode.eps2d / sample.stride**2, "antialiased": mode.antialiased}

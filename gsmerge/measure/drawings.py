@@ -74,7 +74,7 @@ class DrawOptions:
     background: float = 0.0  # grey level in [0, 1]
 
     def choose(self, names: Sequence[str], most: int | None = None) -> list[int]:
-        """Choose the ids of the views to draw by the option ``views``; without it at most ``most`` views, or all."""
+        """Choose the ids of the views to draw: those of the option ``views``, or else at most ``most``, or else all."""
         if isinstance(self.views, str):
             return [find_view(self.views, names)]
         return pick_views(len(names), self.views or most or len(names))

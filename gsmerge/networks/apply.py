@@ -157,7 +157,10 @@ class NetworkContext(Corrector):
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Return tokens of the Gaussians ``ids`` of ``parts``, see :func:`gsmerge.networks.tokens.part_tokens`."""
+        """Return the networks' input ``[m,c]`` for the Gaussians ``ids [m]`` of ``parts``.
+
+        Each is described relative to its group, ``owners [m]``. Members have more columns than decoded Gaussians.
+        """
         return part_tokens(
             parts, ids, owners, group_features, MEMBER_COLUMNS if isinstance(parts, Members) else PART_COLUMNS
         )

@@ -22,7 +22,10 @@ RENDERS_STEP = 0.09
 
 
 def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int) -> float:
-    """Choose the power of the masses in costs of merging, by the median PSNR of views after a short fit of each."""
+    """Choose which of ``POWERS`` weighs masses in the costs of merging: the one whose Gaussians show the views best.
+
+    Each power is tried by a short fit, and judged by the median PSNR of the views.
+    """
     photos = scene_photos(prepared.scene)
     tuning = replace(options.tuning, outside_from=1.0)  # no steps for views from outside, which are not scored
     short = replace(options, fit_steps=min(options.steps, SHORT), tuning=tuning)

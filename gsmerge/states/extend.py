@@ -170,7 +170,7 @@ def _join_views(before: Scene, batch: Scene) -> Scene:
 
 
 def append_names(before: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return names of views appended to those ``before``; a name that is already in use gets a number in front."""
+    """Append the ``names`` of views to those ``before``, and return all; a name in use gets a number in front."""
     all_names = list(before)
     for name in names:
         numbered = (f"{number}-{name}" for number in range(2, len(all_names) + 3))

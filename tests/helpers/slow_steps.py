@@ -16,7 +16,7 @@ from gsmerge.raster.gradient import Gradients, gradients_of
 
 def step_slowly(optimiser: Optimiser, state: FitState, step: Step) -> float:
     """Take one Adam step on one view, in place, and return the mean squared error, as :meth:`Optimiser.step` does."""
-    photo, camera = optimiser.view(step)
+    photo, camera = optimiser.select_view(step)
     tiled = tile_view(state.splats, **camera, opacities=optimiser.drawn_opacities(state, step))
     state.update_harmonics()
     colors = view_colors(tiled) if state.splats.shN.shape[1] else state.colors[tiled.ids]

@@ -1,4 +1,4 @@
-"""What merging keeps: coverage, brightness, detail with K (method reference, cases 47, 48, 55)."""
+"""What merging keeps: coverage, brightness, detail with K (stability.md, cases 47, 48, 55)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photos under the names that a camera file gives stay, however noisy rows in no order are (method reference, case 70).
+"""Photos under the names that a camera file gives stay, however noisy rows in no order are (stability.md, case 70).
 
 Wrong depth displaces drawings of such rows, and large Gaussians hide in places what photos show. A seed of the smallest
 size takes two CPU seconds, half of them to be made: the first three lost photos while these had to be like drawings.

@@ -1,4 +1,4 @@
-"""Photos as people have them: covered, masked, in bars, in another tone or exposure (method reference, case 29)."""
+"""Photos as people have them: covered, masked, in bars, in another tone or exposure (stability.md, case 29)."""
 
 from __future__ import annotations
 

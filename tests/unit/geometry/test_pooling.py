@@ -74,7 +74,7 @@ def test_two_members_by_hand() -> None:
 
 
 def test_tiles_of_a_sheet_keep_it_closed() -> None:
-    """A square of n x n tiles: the peak optical depth is 12 / 2 pi times the sheet's mean (method reference)."""
+    """A square of n x n tiles: the peak optical depth is 12 / 2 pi times the sheet's mean (stability.md)."""
     n, sigma, depth = 40, 0.6, 0.7
     xs, ys = np.meshgrid(np.arange(n), np.arange(n))
     sheet = members(n * n, opacity=1 - exp(-depth))
