@@ -127,17 +127,20 @@ class Plan:
 
     @property
     def by_contribution(self) -> bool:
-        """Whether Gaussians are given to superpixels by their blending weights, as in the paper."""
+        """Return whether Gaussians are given to superpixels by their blending weights, as in the paper."""
         return self.networks is not None and self.networks.options.makes_children
 
     @property
     def weakens(self) -> bool:
-        """Whether groups that other views see through start with less opacity; a long fit follows and closes holes."""
+        """Return whether groups that other views see through start with less opacity.
+
+        A long fit follows then, and closes the holes.
+        """
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
     @property
     def prunes(self) -> bool:
-        """Whether Gaussians that no photo shows are dropped after the fit."""
+        """Return whether Gaussians that no photo shows are dropped after the fit."""
         return self.fit.min_contribution > 0
 
     @property

@@ -407,7 +407,7 @@ class Scene(ArrayFields):
 
     @property
     def has_own_pixels(self) -> bool:
-        """Whether each view is known to have Gaussians of its own, with the colours of its photo."""
+        """Return whether each view is known to have Gaussians of its own, with the colours of its photo."""
         return self.pixels is not None and self.pixels.own
 
     def get_pixels(self) -> Pixels:
@@ -428,7 +428,7 @@ class Scene(ArrayFields):
 
     @property
     def is_shown(self) -> bool:
-        """Whether there are pictures of the views: photos, or the colours of the views' own Gaussians."""
+        """Return whether there are pictures of the views: photos, or the colours of the views' own Gaussians."""
         return self.has_own_pixels or self.images is not None
 
     @property

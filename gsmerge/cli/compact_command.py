@@ -152,7 +152,10 @@ def _check_outputs(args: opt.Args, files: SceneFiles, settings: CompactOptions, 
 
 
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
-    """Print the report of a run, and how to view it unless a page is ``shown``; TargetError if a target is missed."""
+    """Print the report of a run and, unless a page is ``shown``, how to view the result.
+
+    TargetError if a target is missed.
+    """
     from gsmerge.compaction.report import result_table
     from gsmerge.io.formats.table import VIEWED
 

@@ -134,7 +134,7 @@ class CountSearch:
 
     @property
     def is_met(self) -> bool:
-        """Whether there is a target and a candidate reaches it."""
+        """Return whether there is a target and a candidate reaches it."""
         return self.plan.target_psnr is not None and max(self.psnrs.values()) >= self.plan.target_psnr
 
     def facts(self, result: Candidate) -> SearchFacts:

@@ -49,7 +49,7 @@ class FileSize:
 
     @property
     def packed(self) -> bool:
-        """Whether the size in bytes depends on the content, so that the file has to be made to measure it."""
+        """Return whether the size in bytes depends on the content, so that the file has to be made to measure it."""
         return self.file.count is None
 
 

@@ -49,7 +49,7 @@ class Reference:
 
     @property
     def of_views(self) -> bool:
-        """Whether the pictures show the scene's own views and are more than renders of the scene."""
+        """Return whether the pictures show the scene's own views and are more than renders of the scene."""
         return self.name != RENDERS
 
 

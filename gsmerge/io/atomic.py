@@ -271,15 +271,16 @@ _remove_stale_once = cache(remove_stale)  # once per folder and process, since l
 
 
 def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
-    """Return whether no process writes a temporary file any more: its process has ended, or the file is old.
+    """Return whether a temporary file is abandoned, which is so if the process that writes it has ended.
 
-    The age counts for files of other machines, and on Windows, where ``os.kill`` would end the process.
+    Processes of other machines cannot be asked, nor those on Windows, where ``os.kill`` would end them. There a file
+    counts as abandoned if it is old.
     """
     if machine != _machine_hash() or sys.platform == "win32":
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS
     try:
         os.kill(pid, 0)
-    except (OSError, OverflowError) as error:  # any other error means that the process is another user's
+    except (OSError, OverflowError) as error:  # another user's process is not ours to ask, and a number may be none
         return isinstance(error, ProcessLookupError)
     try:  # a killed process whose parent has not asked for its exit status is still listed, as a zombie
         status = Path(f"/proc/{pid}/stat").read_bytes()

@@ -469,7 +469,7 @@ class PhotoTransform:
 
     @property
     def crops(self) -> bool:
-        """Whether the transform crops photos at the left or top."""
+        """Return whether the transform crops photos at the left or top."""
         return bool(self.left or self.top)
 
     @property

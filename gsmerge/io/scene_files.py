@@ -145,7 +145,7 @@ class SceneFiles:
 
     @property
     def is_state(self) -> bool:
-        """Whether the file is a state (``.gsm``), whose Gaussians have no pixels."""
+        """Return whether the file is a state (``.gsm``), whose Gaussians have no pixels."""
         return self.ply.suffix.lower() == STATE_ENDING
 
     @property
@@ -315,7 +315,7 @@ def can_be_listed(folder: Path, option: str) -> bool:
 def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Path], ...]:
     """Find the photos, cameras and masks that a scene lacks in the folder above its own folders, ``roots``.
 
-    Files of a neighbouring scene do not count, and masks only if they have the names of the scene's photos. Returns
+    Files of a neighbouring scene do not count. Masks count only if they have the names of the scene's photos. Returns
     each option with its path.
     """
     folder = min(filter(Path(os.path.realpath(files.ply)).is_relative_to, roots), default=roots[0]).parent

@@ -97,12 +97,12 @@ class ViewData:
 
     @property
     def scored(self) -> bool:
-        """Whether views have scores, because there are photos or several scenes to compare."""
+        """Return whether views have scores, because there are photos or several scenes to compare."""
         return len(self.sides) > 1 or any(view.photo is not None for view in self.views)
 
     @property
     def held_out(self) -> bool:
-        """Whether the means are over held-out views."""
+        """Return whether the means are over held-out views."""
         return any(view.held_out for view in self.views)
 
 

@@ -76,7 +76,7 @@ def _num_harmonics(degree: int) -> int:
 
 
 def _camera_head(cameras: Cameras) -> dict[str, Any]:
-    """Describe the cameras whose pixels stand for positions, for the line of JSON."""
+    """Return the cameras for the line of JSON, since positions are stored relative to their pixels."""
     poses = [
         {"viewmat": viewmat.reshape(-1).tolist(), "K": [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()]}
         for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True)

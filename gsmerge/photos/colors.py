@@ -101,9 +101,10 @@ def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def vary_in_hue(colors: np.ndarray, weights: np.ndarray) -> float:
-    """Return the root mean square by which colours ``[n,3]`` differ from a tone curve of their brightness.
+    """Return how much of the colours ``[n,3]`` does not follow from their brightness, weighted by ``weights [n]``.
 
-    It is about 0 for grey photos, and for photos of a single tint.
+    This is the root mean square distance to the best tone curve of the grey levels. It is about 0 for grey photos, and
+    for photos of a single tint.
     """
     grey = colors.mean(1, keepdims=True).repeat(3, 1)
     away = (colors - map_tones(fit_tones(grey, colors, weights), grey)) ** 2 * weights[:, None]

@@ -72,7 +72,7 @@ class Exporter:
 
     @property
     def is_marked(self) -> bool:
-        """Whether its files have an element, column or comment that no other exporter writes."""
+        """Return whether its files have an element, column or comment that no other exporter writes."""
         return bool(self.elements or self.byte_columns or self.comment)
 
 

@@ -32,9 +32,9 @@ def decode(
     """Decode each Feature Gaussian into K Gaussians, its children; there are fewer if its members are equal.
 
     The members are halved repeatedly across their widest direction in colour and position, and each part becomes a
-    child. So the children for K = 2 are unions of those for K = 4. Heads with absolute outputs make exactly K children
-    of every group instead. ``counts [g]`` are the K of each group, at least 1; None: ``options.max_k`` for all. The
-    children of a group are adjacent. Those below ``options.min_opacity`` are left out.
+    child. So the children for K = 2 are unions of those for K = 4. Networks with absolute outputs do not halve: they
+    make exactly K children of every group. ``counts [g]`` are the K of each group, at least 1; None: ``options.max_k``
+    for all. The children of a group are adjacent. Those below ``options.min_opacity`` are left out.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)

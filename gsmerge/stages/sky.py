@@ -119,8 +119,9 @@ def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
     bright = colors.max(1)
     saturation = (bright - colors.min(1)) / np.maximum(bright, 1e-6)
     low, high = np.percentile(saturation, (10, 90))
-    # Saturation must differ by the second number, and its correlation with the row must not exceed the first
-    max_correlation, min_spread = -0.12, 0.08
+    # Least difference between percentiles 10 and 90 of the saturation, and largest correlation with the row, which
+    # counts downwards
+    min_spread, max_correlation = 0.08, -0.12
     if high - low < min_spread or np.ptp(rows) == 0:
         return False
     return bool(correlation(rows, saturation) <= max_correlation)

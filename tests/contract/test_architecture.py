@@ -97,7 +97,7 @@ def test_each_file_of_cameras_says_what_it_serves() -> None:
 
 
 def code_spans(page: Path) -> Iterator[str]:
-    """What stands between backticks in the text of a page."""
+    """Return what stands between backticks in the text of a page."""
     text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
     yield from (span.replace("\n", " ") for span in re.findall(r"`([^`]+)`", text))
 
@@ -109,7 +109,7 @@ def top() -> tuple[set[str], set[str]]:
 
 
 def is_there(name: str) -> bool:
-    """Whether a path of a page leads to a file or folder of the package, or of the repository."""
+    """Return whether a path of a page leads to a file or folder of the package, or of the repository."""
     return any(
         (base / f"{name}{ending}").exists() for base in (PACKAGE, ROOT, ROOT / "tests") for ending in ("", ".py", ".c")
     )

@@ -50,7 +50,7 @@ def heads() -> None:
 
 
 def group_numbers() -> None:
-    """What is read besides tokens and latents."""
+    """Check what is read besides tokens and latents."""
     shapes, width, latent = weight_shapes(OPTIONS), OPTIONS.width, OPTIONS.latent
     joined = {name: shapes[f"{name}.join.0.weight"][1] - width for name in ("encoder.set", "merger.set", "refiner")}
     assert joined == dict.fromkeys(joined, 22 + 4) == dict.fromkeys(joined, GROUP_COLUMNS)
@@ -93,7 +93,7 @@ def harmonics() -> None:
 
 
 def training() -> None:
-    """What the checkpoint that ships was trained with, and what ``--preset paper`` has instead."""
+    """Check what the checkpoint that ships was trained with, and what ``--preset paper`` has instead."""
     pytest.importorskip("torch", reason="the package's training imports it")
     from gsmerge.research.training import preset_options
 

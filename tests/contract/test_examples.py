@@ -56,7 +56,7 @@ def test_examples_run_one_after_the_other(
 
 
 def show(value: Any) -> str:
-    """What a notebook shows of a cell's last value."""
+    """Return what a notebook shows of a cell's last value."""
     picture = getattr(value, "_repr_png_", lambda: None)()
     return "png" if picture else getattr(value, "_repr_html_", value.__repr__)()
 

@@ -30,7 +30,7 @@ def records(folder: Path) -> list[dict[str, Any]]:
 
 
 def statuses(folder: Path) -> dict[str, list[str]]:
-    """What was recorded of every result, in order."""
+    """Return what was recorded of every result, in order."""
     actual: dict[str, list[str]] = {}
     for record in records(folder):
         actual.setdefault(record["output"], []).append(record["status"])
@@ -96,7 +96,7 @@ class InlinePool(WorkerPool):
 
 
 def one_job(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Job, Run]:
-    """What :func:`make_result` takes for a single scene, as a run would have it that begins now."""
+    """Return what :func:`make_result` takes for a single scene, as a run would have it that begins now."""
     out.mkdir(exist_ok=True)
     read_run_index.cache_clear()
     (job,) = find_jobs([str(scene)], out, options)

@@ -90,7 +90,7 @@ class Browser:
             time.sleep(0.05)
 
     def box(self, element: str) -> dict[str, float]:
-        """Where an element of the page is, pixels."""
+        """Return where an element of the page is, pixels."""
         box: dict[str, float] = self.run(f"JSON.parse(JSON.stringify({element}.getBoundingClientRect()))")
         return box
 

@@ -64,7 +64,7 @@ def with_intrinsics(tiny: Smooth, K: np.ndarray) -> Smooth:
 
 
 def depth_map_mask(depth: np.ndarray) -> np.ndarray:
-    """What Depth Anything 3 keeps of a view: its own rule, in its own words."""
+    """Return what Depth Anything 3 keeps of a view: its own rule, in its own words."""
     height, width = depth.shape
     mask = np.zeros((height, width), bool)
     top, left = int(8 / 256 * height), int(8 / 256 * width)

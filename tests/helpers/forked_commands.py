@@ -66,7 +66,7 @@ def _memory() -> list[int]:
 
 
 def run_forked(call: Callable[[], int], limits: Limits) -> Outcome:
-    """What ``call``, which returns an exit code, does in a child of this process."""
+    """Return what ``call``, which returns an exit code, does in a child of this process."""
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err, tempfile.TemporaryFile() as start:
         pid = os.fork()
         if pid == 0:

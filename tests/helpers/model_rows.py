@@ -57,7 +57,7 @@ class Export:
 
 @dataclass(frozen=True)
 class Saver:
-    """How a program turns the pixels of its views into rows."""
+    """Describe how a program turns the pixels of its views into rows."""
 
     place: str  # of the .ply in its folder
     order: str = "view-major"

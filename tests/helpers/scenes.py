@@ -323,7 +323,7 @@ def identical(a: Gaussians, b: Gaussians) -> bool:
 
 
 def assert_invariants(gaussians: Gaussians, scene: Scene) -> None:
-    """What must hold of the Gaussians of every compact scene."""
+    """Check what must hold of the Gaussians of every compact scene."""
     for name in FIELDS:
         assert np.isfinite(getattr(gaussians, name)).all(), name
     assert (gaussians.opacities > 0).all()

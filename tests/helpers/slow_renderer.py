@@ -190,7 +190,7 @@ def turned_cameras(count: int = 2) -> Cameras:
 
 
 def pixel_gradients(cameras: Cameras, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """What a loss might want of images ``[c,h,w,3]`` and alphas ``[c,h,w,1]``."""
+    """Return what a loss might want of images ``[c,h,w,3]`` and alphas ``[c,h,w,1]``."""
     generator = torch.Generator().manual_seed(seed)
     shape = (len(cameras), cameras.height, cameras.width)
     return torch.randn(*shape, 3, generator=generator), torch.randn(*shape, 1, generator=generator)

@@ -48,7 +48,7 @@ def sides(shape: Shape, points: np.ndarray) -> np.ndarray:
 
 
 def within(shape: Shape, point: np.ndarray) -> bool:
-    """Whether a point of the surface's level belongs to it: open surfaces end."""
+    """Return whether a point of the surface's level belongs to it: open surfaces end."""
     (x, y, _), (a, b, *_) = np.abs(point), shape.size
     if shape.kind == QUAD:
         return bool(x <= a and y <= b)

@@ -45,7 +45,7 @@ def test_a_view_that_is_not_there_is_refused(view: int) -> None:
 
 
 def places_of(points: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where views show points, and whether, by the plain formula."""
+    """Return where views show points, and whether, by the plain formula."""
     with np.errstate(all="ignore"):
         places, depths = project_points(points.astype(np.float64)[None], poses, np.tile(K, (len(poses), 1, 1)))
         x, y = np.moveaxis(places, -1, 0)
@@ -89,7 +89,7 @@ def test_points_are_seen_by_the_formula_bit_for_bit(seed: int) -> None:
 
 
 def longest_series(choices: list[list[int]]) -> int:
-    """How many of some lists may give one number each, so that the numbers ascend; for each last number."""
+    """Return how many of some lists may give one number each, so that the numbers ascend; for each last number."""
     lengths: dict[int, int] = {}
     for keys in choices:
         best = {key: 1 + max((n for last, n in lengths.items() if last < key), default=0) for key in keys}

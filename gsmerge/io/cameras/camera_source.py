@@ -1,4 +1,4 @@
-"""What camera readers take and return: a file whose content is read once, and cameras before their conversion."""
+"""Hold what camera readers take and return: a file whose content is read once, and cameras as it states them."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_ch
 
 
 def _split_into_children(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight):
-    """Return the children of every group as :func:`bisect` does, and write their errors to ``errors [g, any]``."""
+    """Split groups as :func:`bisect` does, and return the same; also write errors to ``errors [g, any]``."""
     sizes = np.diff(starts)
     counts = np.minimum(counts, np.maximum(sizes, 1))
     longest, most, total = int(sizes.max(initial=0)), int(counts.max(initial=1)), int(counts.sum())

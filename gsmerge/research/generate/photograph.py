@@ -1,7 +1,8 @@
 """Render photos and exact depth of a room.
 
 Each sample is a ray, which finds the first surface. The colour comes from the surface's texture and from lights with
-shadow maps. The curve of a film turns the light into a photo.
+shadow maps. A tone curve like that of film turns the light into the
+colours of a photo.
 """
 
 from __future__ import annotations

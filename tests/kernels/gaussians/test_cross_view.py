@@ -103,7 +103,7 @@ def test_transparent_pixels_and_single_views_say_nothing() -> None:
 
 
 def random_sums(num: int, pixels: int, first: int = 0, last: int | None = None, more: int = 0) -> np.ndarray:
-    """What three views of 6 x 4 pixels say of random points, some of them no numbers."""
+    """Return what three views of 6 x 4 pixels say of random points, some of them no numbers."""
     rng = np.random.default_rng(0)
     points, means = rng.normal(size=(num, 3)), rng.normal(size=(pixels, 3)).astype(np.float32)
     points[:3], means[:9:3] = np.array([[np.nan], [np.inf], [-np.inf]])[:num], np.nan

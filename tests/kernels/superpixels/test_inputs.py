@@ -22,7 +22,7 @@ def make_picture(height: int, width: int) -> np.ndarray:
 
 
 def all_of_them(height: int, width: int) -> list[np.ndarray]:
-    """What every kernel makes of a picture, one from the other."""
+    """Return what every kernel makes of a picture, one from the other."""
     pixels, count = make_picture(height, width), max(1, height * width // 16)
     response = seeds.corner_response(pixels)
     labels, num_regions = kd.split_rectangles(pixels, 2 * count, 8, 1e-5)

@@ -44,7 +44,7 @@ def turned_away(scene: Scene, view: int) -> Scene:
 
 
 def look_at(point: list[float], viewmat: list[list[float]], K: list[list[float]]) -> tuple[float, float, float]:
-    """Where a view shows a point, pixels, and how far ahead it is."""
+    """Return where a view shows a point, pixels, and how far ahead it is."""
     x, y, z = (sum(a * b for a, b in zip(row, (*point, 1.0), strict=True)) for row in viewmat[:3])
     return K[0][0] * x / z + K[0][2], K[1][1] * y / z + K[1][2], z
 

@@ -46,7 +46,7 @@ def alphas(gaussians: Gaussians, scene: Scene) -> np.ndarray:
 
 
 def compared(scene: Scene, **settings: Any) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """What the input and its result cover, and the notes that name the setting."""
+    """Return what the input and its result cover, and the notes that name the setting."""
     result = compact(scene, **FIT, **settings)
     notes = [note for note in result.report.notes if "--set extent=photos" in note]
     return alphas(scene.gaussians, scene), alphas(result.gaussians, scene), notes
