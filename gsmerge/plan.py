@@ -298,7 +298,7 @@ def choose_for_scene(
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     """Return the number of blocks for a scene; UsageError if it cannot be cut into the number that was asked for."""
-    problems = _uncut_settings(options)
+    problems = options.uncut
     if not scene.has_own_pixels:
         problems.append("a scene whose views have no Gaussians of their own")
     count = wanted_blocks(options, scene.num_gaussians, scene.num_views)
@@ -327,13 +327,8 @@ def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 
     """
     blocks = options.blocks.blocks
     if blocks == "auto":
-        return 1 if _uncut_settings(options) else usual_blocks(num_gaussians, num_views)
+        return 1 if options.uncut else usual_blocks(num_gaussians, num_views)
     return 1 if blocks == "none" else int(blocks)
-
-
-def _uncut_settings(options: CompactOptions) -> list[str]:
-    """Name the settings in use that prevent cutting a scene into blocks."""
-    return [*options.whole_only, *options.uncut]
 
 
 def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
@@ -344,7 +339,7 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     of the Gaussians would say little if there are fewer Gaussians than pixels: a scene that is compact already needs
     most of them, a scene of many small ones only a few. Measurements are in docs/internals/notebook.md.
     """
-    if options.decides_count or options.replaces_stages:  # other stages seldom keep the quality
+    if not options.scene_decides:
         return False
     # Gaussians per pixel, from which on a share of them is enough to show the photos
     dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
@@ -475,11 +470,12 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     decode = options.decode
     if decode.k != AUTO:
         return decode
+    if not (scene.has_own_pixels and scene.num_cameras == 1):
+        return replace(decode, k=USUAL_K)
     decides_count = options.budget.quality is not None or options.changed_counts
     has_long_fit = options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
-    has_one_camera = scene.has_own_pixels and scene.num_cameras == 1
-    needs_more = has_one_camera and not (decides_count or options.replaces_stages or has_long_fit)
-    return replace(decode, k=LONE_K if needs_more else USUAL_K)
+    keeps_k = decides_count or options.replaces_stages or has_long_fit
+    return replace(decode, k=USUAL_K if keeps_k else LONE_K)
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:

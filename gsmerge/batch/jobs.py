@@ -100,19 +100,14 @@ class CompactCall:
         scene = digest({"scene": content_hash(list_files(files)), **version})
         return f"{scene}.{digest({'settings': settings, 'reading': reading})}"
 
-    def run(
-        self, files: SceneFiles, out: Path, cameras: Path | None, threads: int
-    ) -> tuple[dict[str, Any], list[Path]]:
-        """Compact a scene; return its report, and the paths of the result, its coarser levels and its cameras.
-
-        ``out`` and ``cameras`` are where the result and its cameras are written; None writes no cameras.
-        """
+    def run(self, files: SceneFiles, outputs: Outputs, threads: int) -> tuple[dict[str, Any], list[Path]]:
+        """Compact a scene; return its report, and the paths of the result, its coarser levels and its cameras."""
         document = compact_files(
-            files, replace(self.settings, threads=threads), Outputs(out, cameras, overwrite=True),
+            files, replace(self.settings, threads=threads), outputs,
             opacity=self.opacity, hints=self.hints, hashed=True,
         )  # fmt: skip
         written = [*(level["path"] for level in document["levels"]), document["viewer_cameras"]]
-        return document, [out, *map(Path, filter(None, written))]
+        return document, [outputs.result, *map(Path, filter(None, written))]
 
 
 @dataclass(frozen=True)

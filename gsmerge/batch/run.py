@@ -13,7 +13,7 @@ import os
 import warnings
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from statistics import median_low
@@ -22,9 +22,9 @@ from typing import Any
 from gsmerge.batch.find import main_file
 from gsmerge.batch.jobs import DISTINGUISH, BatchOptions, Job
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, prepare_folder, record
+from gsmerge.compaction.outputs import plan_outputs
 from gsmerge.errors import SceneError, error_line
 from gsmerge.io.atomic import atomic_output, describe_existing, remove_stale
-from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file
 from gsmerge.measure.documents import file_sha256, finite
@@ -201,16 +201,18 @@ def _make_result(job: Job, run: Run, mark: Path) -> dict[str, Any]:
     refused = refusal(job, run.folder, known, key, overwrite=run.overwrite, begun=mark.exists())
     if refused:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
-    out, cameras = run.folder / job.output, viewer_cameras_path(run.folder / job.output)
-    is_own = known is not None and any(run.folder / file["path"] == cameras for file in known.files)
-    is_free = os.path.realpath(cameras) not in map(os.path.realpath, files.paths) and (
-        is_own or run.overwrite or not os.path.lexists(cameras)  # results in other formats share them
-    )
+    outputs = plan_outputs(run.folder / job.output, overwrite=True)
+    if (cameras := outputs.viewer_cameras) is not None:
+        is_own = known is not None and any(run.folder / file["path"] == cameras for file in known.files)
+        is_free = os.path.realpath(cameras) not in map(os.path.realpath, files.paths) and (
+            is_own or run.overwrite or not os.path.lexists(cameras)  # results in other formats share them
+        )
+        outputs = outputs if is_free else replace(outputs, viewer_cameras=None)
     with atomic_output(mark, overwrite=True) as temporary:  # on the disk before the result
         temporary.write_text(f"{os.getpid()}\n")
     with warnings.catch_warnings(record=True) as caught_warnings:
         warnings.simplefilter("default")
-        document, written = job.call.run(files, out, cameras if is_free else None, run.threads)
+        document, written = job.call.run(files, outputs, run.threads)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught_warnings))
     facts = [
         {"path": Path(os.path.relpath(path, run.folder)).as_posix(), "sha256": file_sha256(path)}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
-from gsmerge.cli.paths import check_format, check_outputs, default_output, input_files, output_file, with_beside
+from gsmerge.cli.paths import check_outputs, default_output, input_files, output_file
 from gsmerge.errors import TargetError, UsageError
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.files import FileOptions
@@ -100,7 +100,7 @@ def _compact(
     from gsmerge.compaction.outputs import plan_outputs
 
     outputs = plan_outputs(out, writing, overwrite=args.overwrite)
-    settings = _choose_levels(args, settings, out)
+    settings = _choose_levels(args, settings, outputs)
     _check_outputs(args, source, settings, outputs)
     if args.dry_run:
         print_plan(args, source, settings, outputs, hints)
@@ -117,12 +117,11 @@ def _compact(
     _say_result(args, document, out, shown=on_read is not None)
 
 
-def _choose_levels(args: opt.Args, settings: CompactOptions, out: Path) -> CompactOptions:
-    """Choose the number of levels by the format of ``out``; UsageError if levels or budget do not fit the format."""
+def _choose_levels(args: opt.Args, settings: CompactOptions, outputs: Outputs) -> CompactOptions:
+    """Choose the number of levels by the format of the output; UsageError if levels or budget do not fit it."""
     from gsmerge.facts.counts import STREAMED_LEVELS
-    from gsmerge.io.formats.table import find_format
 
-    format_ = find_format(out)
+    out, format_ = outputs.result, outputs.format
     if format_.levels == "inside" and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
     if not format_.levels and settings.budget.levels > 1:
@@ -134,19 +133,16 @@ def _choose_levels(args: opt.Args, settings: CompactOptions, out: Path) -> Compa
 
 
 def _check_outputs(args: opt.Args, files: SceneFiles, settings: CompactOptions, outputs: Outputs) -> None:
-    """Raise an error if a file of the result cannot be written, or if its format does not fit the options."""
-    from gsmerge.io.formats.table import find_format
+    """Raise an error if a file of the result cannot be written."""
     from gsmerge.io.formats.write import level_output
 
-    out = outputs.result
-    num_files = settings.budget.levels if find_format(out).levels == "apart" else 1
-    levels = [level_output(out, level) for level in range(1, num_files)]
+    num_files = settings.budget.levels if outputs.format.levels == "apart" else 1
+    levels = [level_output(outputs.result, level) for level in range(1, num_files)]
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
     # Without --overwrite the camera file may exist, from a result in another format
     replaced_cameras = outputs.viewer_cameras if args.overwrite else None
-    paths = (*with_beside(out), *levels, replaced_cameras)
+    paths = (*outputs.paths, *levels, replaced_cameras)
     check_outputs(paths, (*input_files(files), *networks), overwrite=args.overwrite or args.dry_run)
-    check_format(out, outputs.options)
     if outputs.options.columns == "full" and settings.budget.in_bytes:
         raise UsageError(f"columns full: expected a --budget that is a number or a share, got {settings.budget.budget}")
 
@@ -185,16 +181,15 @@ def _decode(args: opt.Args, path: Path, out: Path) -> None:
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected Feature Gaussians as the only input, got {len(args.scenes)} inputs")
     args.require_scene(FEATURE_OPTIONS, path)
+    from gsmerge.compaction.outputs import plan_outputs
     from gsmerge.settings.stages import DecodeOptions
     from gsmerge.states.files import decode_file, decoding_line
 
     decoding, writing = args.make(DecodeOptions, FileOptions, columns="needed")
-    check_outputs(with_beside(out), (path,), overwrite=args.overwrite or args.dry_run)
-    check_format(out, writing)
+    outputs = plan_outputs(out, writing, overwrite=args.overwrite)
+    check_outputs(outputs.paths, (path,), overwrite=args.overwrite or args.dry_run)
     before = {"import": perf_counter() - args.start}
-    document = decode_file(
-        path, out, decoding, writing, overwrite=args.overwrite, dry_run=args.dry_run, seconds_before=before,
-    )  # fmt: skip
+    document = decode_file(path, outputs, decoding, dry_run=args.dry_run, seconds_before=before)
     say_notes(document["notes"], quiet=args.silent)
     print_document(document, decoding_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
-from gsmerge.cli.paths import check_format, check_outputs, output_file, with_beside
+from gsmerge.cli.paths import check_outputs, output_file
 from gsmerge.errors import UsageError
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import PlacementOptions
@@ -46,11 +46,11 @@ def convert(args: opt.Args) -> None:
     writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
     images = None if photos.images is None else opt.named_or_none(photos.images)
     named = [path for path in (args.cameras, images) if isinstance(path, Path)]
-    output = output_file(output, inputs[0].name)
-    check_outputs(with_beside(output), (*inputs, *named), overwrite=args.overwrite)
-    check_format(output, writing)
-    from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.compaction.outputs import plan_outputs
+
+    outputs = plan_outputs(output_file(output, inputs[0].name), writing, overwrite=args.overwrite)
+    check_outputs(outputs.paths, (*inputs, *named), overwrite=args.overwrite)
+    from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.runtime.memory import conversion_bytes, memory_problem
     from gsmerge.runtime.record import record_run
@@ -60,8 +60,7 @@ def convert(args: opt.Args) -> None:
         say(problem, kind="warning", quiet=args.silent)
     hints = args.hints()
     options = ConvertOptions(
-        inputs, plan_outputs(output, writing, overwrite=args.overwrite), args.cameras, images, args.opacity,
-        hints.scales, hints.colors, cleaning, placement,
+        inputs, outputs, args.cameras, images, args.opacity, hints.scales, hints.colors, cleaning, placement,
     )  # fmt: skip
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
         document = convert_files(options)

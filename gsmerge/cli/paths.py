@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.settings.files import FileOptions
 
 if TYPE_CHECKING:
     from gsmerge.io.scene_files import SceneFiles
@@ -26,26 +25,6 @@ def output_file(output: Path, name: str) -> Path:
     """
     is_folder = output.is_dir() or not (output.suffix or os.path.lexists(output))
     return output / name if is_folder else output
-
-
-def check_format(output: Path, options: FileOptions) -> None:
-    """Raise UsageError if an output's ending is unknown, needs a missing package, or does not fit the options."""
-    from gsmerge.io.formats.table import TILESET, output_format
-
-    format_ = output_format(output)
-    if options.columns == "full" and not (format_.columns and options.normals):
-        raise UsageError(f"columns full: expected a .ply output with normals, got {output.name}")
-    if options.place is not None and format_ is not TILESET:
-        raise UsageError(f"place: expected {TILESET.ending} as the output, got {output.name}")
-    if options.spz_version != FileOptions.spz_version and format_.ending not in (".spz", TILESET.ending):
-        raise UsageError(f"spz_version: expected .spz or {TILESET.ending} as the output, got {output.name}")
-
-
-def with_beside(output: Path) -> list[Path]:
-    """List an output and the file that its format writes beside it under a fixed name."""
-    from gsmerge.io.formats.table import find_format
-
-    return [path for path in (output, find_format(output).beside_path(output)) if path is not None]
 
 
 def check_outputs(

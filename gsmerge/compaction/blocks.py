@@ -135,7 +135,7 @@ def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, co
     steps, num_gaussians = 0 if choices.fit.fit == "none" else choices.fit.steps, choices.limits.default
     settings, view_pixels = choices.settings(options), scene.pixels_per_view
     costs = RunCosts(settings, view_pixels * len(scene), view_pixels, 1 / count, steps)
-    build, [scores] = costs.build_part(num_gaussians), costs.end_parts([], None)
+    build, [scores] = costs.build_part(num_gaussians), costs.end_parts(num_gaussians, [])
     merged, fitted = RunPart(build.stages / count), RunPart(0.0, build.fits / count)
     seam_cost = 0.5  # of the fit of seams, as a share of the fits of all blocks
     seams = [RunPart(0.0, seam_cost * build.fits)] * (steps > 0)

@@ -17,10 +17,10 @@ from weakref import ReferenceType, ref
 import numpy as np
 
 from gsmerge.compaction.candidate import Candidate, make_candidate
-from gsmerge.compaction.costs import CountChoice, RunCosts, expected_parts, mean_inside
+from gsmerge.compaction.costs import measure_costs
 from gsmerge.compaction.file_size import Rebuild, meet_bytes
 from gsmerge.compaction.methods import Method, choose_method
-from gsmerge.compaction.new_views import can_try, try_new_views
+from gsmerge.compaction.new_views import try_new_views
 from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, search_count
 from gsmerge.errors import Doubt, DoubtWarning, TargetError
@@ -29,7 +29,6 @@ from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
-from gsmerge.photos.row_colors import RENDERS
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, choose_blocks, choose_for_scene, make_plan
 from gsmerge.runtime.record import (
@@ -101,7 +100,7 @@ def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Pro
         if options.clean.crop is not None:
             scene = crop_scene(scene.numpy(), options.clean.crop)
         result = _compact_once(scene, options)
-        if result.report.is_far and not (options.decides_count or options.replaces_stages):
+        if result.report.is_far and options.scene_decides:
             result = _compact_simpler(scene, options, result)
         if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
             result = result.to_single()
@@ -153,8 +152,7 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     A search finds the number of Gaussians, unless the options state it, and builds the result. Then its coarser levels
     are built, a trial measures what new views gain, and the input is scored for the report.
     """
-    plan = make_plan(prepared, options)  # from here on, the plan replaces the options
-    plan = add_target(plan, prepared)
+    plan = add_target(make_plan(prepared, options), prepared)  # from here on, the plan replaces the options
 
     def rebuild(count: int | None) -> Candidate:
         """Build a count from all views, and add its seconds to those of the run."""
@@ -162,31 +160,20 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
         add_seconds(candidate.record.seconds)  # in addition to those of the search
         return candidate
 
-    costs, has_trial = measure_costs(prepared, plan), plan.new_views and can_try(prepared)
-    has_target, has_curve = plan.target_psnr is not None, plan.auto_count or plan.max_drop is not None
-    choice = CountChoice(has_target, has_curve, plan.max_drop, rendered=prepared.reference.name == RENDERS)
-    expect_parts(expected_parts(costs, plan.limits, plan.limits.default, choice, has_trial=has_trial))
+    costs = measure_costs(prepared, plan)
+    expect_parts(costs.all_parts(plan.limits, plan.limits.default))
     search = search_count(prepared, plan, method.build)
     best = run_search(search, method.build, rebuild, prepared)
     best = meet_bytes(best, rebuild, prepared, plan)
+    num_best = len(best.gaussians)
+    coarser_counts = level_counts(num_best, plan.levels, plan.limits.min_count)
+    expect_parts(costs.end_parts(num_best, coarser_counts))
     # coarser levels keep the cameras that the result has
     level_start = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
-    counts = level_counts(len(best.gaussians), plan.levels, plan.limits.min_count)
-    expect_parts(costs.end_parts(counts, costs.trial_part(len(best.gaussians)) if has_trial else None))
-    levels = [build_scored(method.build, *level_start, count) for count in counts]
-    trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
+    levels = [build_scored(method.build, *level_start, count) for count in coarser_counts]
+    trial = try_new_views(prepared, plan, method.build, num_best)
     begin_part()  # the last part, which scores the input
     return make_result(best, levels, prepared, plan, search.facts(best), trial)
-
-
-def measure_costs(prepared: Prepared, plan: Plan) -> RunCosts:
-    """Return the facts about a run in one piece from which the costs of its parts follow."""
-    scene, steps = prepared.scene, 0 if plan.fit.fit == "none" else plan.fit.steps
-    settings = plan.settings | ({} if plan.checkpoint else {"checkpoint": "none"})
-    num_pixels = max(scene.pixels_per_view * len(scene), len(scene.gaussians))
-    is_placed = plan.merges_pairs and prepared.reference.placed
-    inside = mean_inside(scene)
-    return RunCosts(settings, num_pixels, scene.pixels_per_view, inside, steps, plan.merges_pairs, is_placed)
 
 
 def run_search(search: CountSearch, build: Build, rebuild: Rebuild, prepared: Prepared) -> Candidate:

@@ -19,7 +19,7 @@ from gsmerge.geometry.frame import scene_frame
 from gsmerge.io import GaussianFile, file_notes, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
-from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, upward_axis
+from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, result_comments, upward_axis
 from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_columns, read_extra_columns
 from gsmerge.io.formats.read import FileInfo, kept_comments
 from gsmerge.io.formats.rounding import format_notes
@@ -95,7 +95,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     comments, comment_notes = _join_comments(infos, format_, moves=options.placement.moves)
     notes += comment_notes
     if any(RESULT_COMMENT in info.comments for info in infos):
-        comments.insert(0, RESULT_COMMENT)
+        comments = result_comments(None, comments)
     report_progress(f"convert: {outputs.result.name}", steps - 1, steps)
     levels = [gaussians]
     for level_count in level_counts(len(gaussians), STREAMED_LEVELS) if format_.levels == "inside" else ():

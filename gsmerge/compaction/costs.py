@@ -13,8 +13,12 @@ from typing import Any
 import numpy as np
 
 from gsmerge.compaction.curve import curve_counts
+from gsmerge.compaction.new_views import can_try
 from gsmerge.facts.counts import CountLimits, level_counts
+from gsmerge.facts.prepare import Prepared
 from gsmerge.measure.coverage import shares_inside
+from gsmerge.photos.row_colors import RENDERS
+from gsmerge.plan import Plan
 from gsmerge.runtime.record import RunPart
 from gsmerge.settings.compact import OURS
 from gsmerge.types import Scene
@@ -39,6 +43,16 @@ INSIDE_GAUSSIANS = 10_000  # sample of Gaussians for the mean share that lies in
 PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
 
 
+@dataclass(frozen=True)
+class CountChoice:
+    """How a run chooses the number of Gaussians; by default, the options state it."""
+
+    has_target: bool = False  # Several candidates are built until one reaches a PSNR
+    has_curve: bool = False  # The scene's curve decides, unless ``has_target`` or ``rendered``
+    max_drop: float | None = None  # Largest loss of quality (dB) that is allowed on the curve; None: the knee decides
+    rendered: bool = False  # Renders of the input stand for photos, so there is no curve
+
+
 @dataclass(frozen=True, eq=False)
 class RunCosts:
     """Facts about a run from which its costs follow."""
@@ -50,6 +64,23 @@ class RunCosts:
     steps: int  # Steps of a fit; 0 without a fit
     merges_pairs: bool = False  # Neighbours are merged pair by pair, instead of superpixels
     is_placed: bool = False  # The views are placed, since the scene has none
+    choice: CountChoice = CountChoice()
+    has_trial: bool = False  # A trial estimates the quality of new views
+
+    def all_parts(self, limits: CountLimits, count: int) -> list[RunPart]:
+        """Return the parts that a run for about ``count`` Gaussians is expected to have, in their order.
+
+        First come the fits of a curve, if there is one, then the builds of the result, or of all candidates of a
+        search. The parts of :meth:`end_parts` follow.
+        """
+        choice, builds = self.choice, 1
+        if choice.has_target:
+            builds = USUAL_BUILDS_OF_RENDERS if choice.rendered else USUAL_BUILDS
+        parts = [self.build_part(count)] * builds
+        if choice.has_curve and not (choice.has_target or choice.rendered):
+            counts, steps = curve_counts(choice.max_drop, limits.default, limits.min_count, limits.max_count)
+            parts = [*(self.build_part(point_count, steps) for point_count in counts), *parts]
+        return [*parts, *self.end_parts(count, level_counts(count, self.settings["levels"], limits.min_count))]
 
     def build_part(self, count: float, steps: int | None = None) -> RunPart:
         """Return the part that builds ``count`` Gaussians, with a fit of ``steps`` (None: of the run's steps)."""
@@ -63,15 +94,15 @@ class RunCosts:
         step = COST_STEP * view_pixels + COST_DRAWN * self.inside * count
         return RunPart(self.num_pixels * work / 1e6, steps * step / 1e6)
 
-    def end_parts(self, counts: Sequence[float], trial: RunPart | None) -> list[RunPart]:
-        """Return the parts that follow a result: levels of ``counts`` Gaussians, a trial, the scores of the input."""
-        scores = RunPart(self.num_pixels * (COST_PLACED if self.is_placed else COST_INPUT) / 1e6)
-        return [*map(self.build_part, counts), *([] if trial is None else [trial]), scores]
+    def end_parts(self, count: float, coarser: Sequence[float]) -> list[RunPart]:
+        """Return the parts that follow a result of ``count`` Gaussians: coarser levels, a trial, scores of the input.
 
-    def trial_part(self, count: float) -> RunPart:
-        """Return the part that estimates new views of a result of ``count`` Gaussians by a trial, in two rounds."""
+        ``coarser`` are the numbers of Gaussians of the levels. The trial has two rounds.
+        """
         build = self.build_part(count)
-        return RunPart(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)
+        trial = [RunPart(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)] * self.has_trial
+        scores = RunPart(self.num_pixels * (COST_PLACED if self.is_placed else COST_INPUT) / 1e6)
+        return [*map(self.build_part, coarser), *trial, scores]
 
     def seconds(self, parts: Sequence[RunPart], num_views: int, threads: int) -> float:
         """Return the wall time of a run with these parts, imports included."""
@@ -79,42 +110,27 @@ class RunCosts:
         return IMPORT_SECONDS + work / (1 + THREAD_GAIN * max(0, min(threads, num_views) - 1))
 
 
-@dataclass(frozen=True)
-class CountChoice:
-    """How a run chooses the number of Gaussians; by default, the options state it."""
-
-    has_target: bool = False  # Several candidates are built until one reaches a PSNR
-    has_curve: bool = False  # The scene's curve decides, unless ``has_target`` or ``rendered``
-    max_drop: float | None = None  # Largest loss of quality (dB) that is allowed on the curve; None: the knee decides
-    rendered: bool = False  # Renders of the input stand for photos, so there is no curve
-
-
 def mean_inside(scene: Scene) -> float:
     """Measure the mean share of a scene's Gaussians that lie in a view, on a sample; 1 without views."""
     return float(np.mean(shares_inside(scene, INSIDE_GAUSSIANS) or [1.0]))
 
 
-def expected_parts(
-    costs: RunCosts, limits: CountLimits, count: int, choice: CountChoice, *, has_trial: bool
-) -> list[RunPart]:
-    """Return the parts that a run is expected to have before it starts, in their order, each with its seconds.
-
-    First come the fits of a curve, if there is one, then the builds of the result, or of all candidates of a search.
-    The parts of :meth:`RunCosts.end_parts` follow.
-
-    Args:
-        costs: Facts about the run.
-        limits: Limits on the number of Gaussians.
-        count: Gaussians of the result, as far as they are known.
-        choice: How the run chooses the number of Gaussians.
-        has_trial: Whether a trial estimates new views.
-    """
-    builds = 1
-    if choice.has_target:
-        builds = USUAL_BUILDS_OF_RENDERS if choice.rendered else USUAL_BUILDS
-    parts = [costs.build_part(count)] * builds
-    if choice.has_curve and not (choice.has_target or choice.rendered):
-        counts, steps = curve_counts(choice.max_drop, limits.default, limits.min_count, limits.max_count)
-        parts = [*(costs.build_part(point_count, steps) for point_count in counts), *parts]
-    coarser = level_counts(count, costs.settings["levels"], limits.min_count)
-    return [*parts, *costs.end_parts(coarser, costs.trial_part(count) if has_trial else None)]
+def measure_costs(prepared: Prepared, plan: Plan) -> RunCosts:
+    """Return the facts about a run in one piece from which the costs of its parts follow."""
+    scene, steps = prepared.scene, 0 if plan.fit.fit == "none" else plan.fit.steps
+    return RunCosts(
+        settings=plan.settings | ({} if plan.checkpoint else {"checkpoint": "none"}),
+        num_pixels=max(scene.pixels_per_view * len(scene), len(scene.gaussians)),
+        view_pixels=scene.pixels_per_view,
+        inside=mean_inside(scene),
+        steps=steps,
+        merges_pairs=plan.merges_pairs,
+        is_placed=plan.merges_pairs and prepared.reference.placed,
+        choice=CountChoice(
+            has_target=plan.target_psnr is not None,
+            has_curve=plan.auto_count or plan.max_drop is not None,
+            max_drop=plan.max_drop,
+            rendered=prepared.reference.name == RENDERS,
+        ),
+        has_trial=plan.new_views and can_try(prepared),
+    )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gsmerge.compaction.compact import find_count
-from gsmerge.compaction.costs import CountChoice, RunCosts, expected_parts, mean_inside
+from gsmerge.compaction.costs import CountChoice, RunCosts, mean_inside
 from gsmerge.compaction.files import Outputs, with_output_name
 from gsmerge.compaction.methods import choose_method, is_without_views
 from gsmerge.compaction.partition import gaussians_at_once
@@ -69,11 +69,12 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     steps = 0 if fit == "none" else choices.fit.steps
     all_pixels, budget = at_once * num_blocks, options.budget  # pixels of views in several blocks count several times
     inside = 1.0 if no_views else mean_inside(scene)
-    costs = RunCosts(settings, all_pixels, all_pixels / max(1, len(scene)), inside, steps, no_views, no_views)
-    choice = CountChoice(has_target, budget.auto or budget.max_drop is not None, budget.max_drop, size.rendered)
-    has_trial = steps > 0 and scene.has_own_pixels and options.new_views is not False
-    parts = expected_parts(costs, limits, num_drawn, choice, has_trial=has_trial)
-    seconds = costs.seconds(parts, len(scene), options.threads or available_threads())
+    costs = RunCosts(
+        settings, all_pixels, all_pixels / max(1, len(scene)), inside, steps, merges_pairs=no_views, is_placed=no_views,
+        choice=CountChoice(has_target, budget.auto or budget.max_drop is not None, budget.max_drop, size.rendered),
+        has_trial=steps > 0 and scene.has_own_pixels and options.new_views is not False,
+    )  # fmt: skip
+    seconds = costs.seconds(costs.all_parts(limits, num_drawn), len(scene), options.threads or available_threads())
     memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=num_pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {

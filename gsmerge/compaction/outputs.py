@@ -15,7 +15,7 @@ from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.cameras.viewer_cameras import is_own_settings, viewer_cameras, viewer_cameras_path, viewer_settings
-from gsmerge.io.formats.table import TILESET, Contents, Format, find_format, output_format
+from gsmerge.io.formats.table import TILESET, Contents, Format, output_format
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import AXES
 from gsmerge.types import Cameras
@@ -39,11 +39,26 @@ class Outputs:
         """The format of the result; UsageError if its name has no ending that can be written."""
         return output_format(self.result)
 
+    @property
+    def paths(self) -> list[Path]:
+        """The result, and the file that its format always writes beside it, if there is one."""
+        beside = self.format.beside_path(self.result)
+        return [self.result] if beside is None else [self.result, beside]
+
 
 def plan_outputs(result: Path, options: FileOptions | None = None, *, overwrite: bool = False) -> Outputs:
-    """Name the files of an output; cameras get a file of their own if the format cannot hold them."""
-    options = options or FileOptions()
-    is_beside = options.viewer_cameras and not find_format(result).has_cameras
+    """Name the files of an output; cameras get a file of their own if the format cannot hold them.
+
+    UsageError if the name has no ending that can be written, or if the options do not fit the format.
+    """
+    options, format_ = options or FileOptions(), output_format(result)
+    if options.columns == "full" and not (format_.columns and options.normals):
+        raise UsageError(f"columns full: expected a .ply output with normals, got {result.name}")
+    if options.place is not None and format_ is not TILESET:
+        raise UsageError(f"place: expected {TILESET.ending} as the output, got {result.name}")
+    if options.spz_version != FileOptions.spz_version and format_.ending not in (".spz", TILESET.ending):
+        raise UsageError(f"spz_version: expected .spz or {TILESET.ending} as the output, got {result.name}")
+    is_beside = options.viewer_cameras and not format_.has_cameras
     return Outputs(result, viewer_cameras_path(result) if is_beside else None, overwrite, options)
 
 

@@ -108,10 +108,13 @@ class CompactOptions(Settings):
         return self.changed(COUNTS)
 
     @property
-    def decides_count(self) -> bool:
-        """True if settings decide the number of Gaussians, false if the scene does."""
-        names = [name for name in self.changed_counts if name != "budget" or not self.budget.leaves_open]
-        return self.budget.quality is not None or bool(names)
+    def scene_decides(self) -> bool:
+        """True if the scene decides the number of Gaussians: no setting does, and none replaces stages.
+
+        Other stages than the usual ones seldom keep the quality of the input.
+        """
+        decided = [name for name in self.changed_counts if name != "budget" or not self.budget.leaves_open]
+        return not (decided or self.budget.quality is not None or self.replaces_stages)
 
     @property
     def replaces_stages(self) -> bool:
@@ -134,9 +137,9 @@ class CompactOptions(Settings):
 
     @property
     def uncut(self) -> list[str]:
-        """Names of the settings in use that exclude blocks, but allow views that arrive in batches."""
+        """Names of the settings in use that exclude blocks; views that arrive in batches allow some of them."""
         values, kept = self.to_dict(), {"poses": "free", "exposure": "per-photo", "budget": AUTO}
-        return [f"{name} {value}" for name, value in kept.items() if values[name] == value]
+        return [*self.whole_only, *(f"{name} {value}" for name, value in kept.items() if values[name] == value)]
 
     @property
     def compact_only(self) -> list[str]:

@@ -11,7 +11,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.files import read_input
-from gsmerge.compaction.outputs import plan_outputs, write_outputs
+from gsmerge.compaction.outputs import Outputs, write_outputs
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.atomic import common_mode
 from gsmerge.io.formats.arrays import result_comments
@@ -25,7 +25,6 @@ from gsmerge.runtime.record import Progress
 from gsmerge.scene.content_hash import content_hash, digest, doubt_changed, list_files
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.settings.extend import batch_settings
-from gsmerge.settings.files import FileOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.compactor import extend_state
@@ -145,11 +144,9 @@ def batch_line(document: Mapping[str, Any]) -> str:
 
 def decode_file(
     path: Path,
-    out: Path,
+    outputs: Outputs,
     options: DecodeOptions,
-    writing: FileOptions,
     *,
-    overwrite: bool = False,
     dry_run: bool = False,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
@@ -158,7 +155,7 @@ def decode_file(
     With ``dry_run`` nothing is written. Raises SceneError if a file cannot be read or written, and UsageError for a K
     that the networks do not make.
     """
-    start, state = perf_counter(), load_state(path)
+    start, out, state = perf_counter(), outputs.result, load_state(path)
     features, batches = state.features, state.about["batches"]
     if features is None:
         raise SceneError(path, "expected Feature Gaussians, found results", "compact it as a scene")
@@ -176,7 +173,7 @@ def decode_file(
     cameras = features.frame.leave_cameras(features.cameras)
     notes = format_notes(out, gaussians)
     contents = Contents([gaussians], result_comments(None), cameras, features.names, scene_title(path))
-    num_bytes = write_outputs(plan_outputs(out, writing, overwrite=overwrite), contents)
+    num_bytes = write_outputs(outputs, contents)
     seconds = {**(seconds_before or {}), "read": read_end - start, "decode": decode_end - read_end}
     seconds["write"] = perf_counter() - decode_end
     return document | {

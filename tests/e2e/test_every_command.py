@@ -211,7 +211,7 @@ def test_every_command_notes_odd_rows(command: str, small_copy: Path, run: Run) 
 @pytest.mark.parametrize(
     ("command", "output"),
     [
-        ("compact", "transforms.json"), ("view", "transforms.json"),
+        ("compact", "scene.ply"), ("view", "transforms.json"),
         ("render", "images/view_000.png"), ("render", "images"),
         ("render --path orbit", "images"),
     ],

@@ -8,7 +8,7 @@ import numpy as np
 from made_gaussians import random_gaussians
 
 from gsmerge import CompactOptions
-from gsmerge.compaction.costs import IMPORT_SECONDS, CountChoice, RunCosts, expected_parts
+from gsmerge.compaction.costs import IMPORT_SECONDS, CountChoice, RunCosts
 from gsmerge.compaction.estimate import estimate
 from gsmerge.facts.counts import count_limits
 from gsmerge.facts.scene_size import SceneSize
@@ -26,10 +26,9 @@ def seconds(
     """Wall time of a run, with settings of ``compact``."""
     options = CompactOptions().with_settings({"checkpoint": "none"} | changes)
     size = SceneSize(views * VIEW, views, 320, 480, True, rendered=False)
-    costs = RunCosts(options.to_dict(), views * VIEW, VIEW, 0.5, steps)
+    costs = RunCosts(options.to_dict(), views * VIEW, VIEW, 0.5, steps, choice=choice, has_trial=has_trial)
     limits = count_limits(size, options.segment, options.decode, options.budget)
-    expected = expected_parts(costs, limits, count, choice, has_trial=has_trial)
-    return costs.seconds(expected, views, threads)
+    return costs.seconds(costs.all_parts(limits, count), views, threads)
 
 
 def test_more_work_takes_longer() -> None:

@@ -28,11 +28,11 @@ def test_settings_that_need_the_scene_in_one_piece_are_named() -> None:
 def test_what_decides_instead_of_the_scene() -> None:
     def decides(**settings: object) -> tuple[bool, bool, bool]:
         options = CompactOptions().with_settings(settings)
-        return options.decides_count, options.replaces_stages, options.changes_superpixels
+        return options.scene_decides, options.replaces_stages, options.changes_superpixels
 
     assert decides() == decides(budget="auto") == decides(budget="mobile") == decides(checkpoint="none")
-    assert decides() == (False, False, False)
+    assert decides() == (True, False, False)
     assert decides(budget=100) == decides(k=2) == decides(superpixels="2%") == decides(quality="30dB")
-    assert decides(budget=100) == (True, False, False)
+    assert decides(budget=100) == (False, False, False)
     assert decides(checkpoint="shipped") == (False, True, False)
-    assert decides(match="none") == decides(compactness=0.1) == decides(k_low=20.0) == (False, False, True)
+    assert decides(match="none") == decides(compactness=0.1) == decides(k_low=20.0) == (True, False, True)
