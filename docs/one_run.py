@@ -221,12 +221,12 @@ def head(run: Run) -> str:
         ),
         text(
             "Lists give arrays with shape and type, and the values of one row.",
-            f"The row is that of pixel ({X}, {Y}) of view {VIEW}, or of what this pixel has become.",
+            f"The row belongs to pixel ({X}, {Y}) of view {VIEW}, or to what became of this pixel.",
         ),
         f"![One view: photo, superpixels, Feature Gaussians, merged, fitted, result](../images/{PICTURE.name})",
         text(
             f"All panels show view {VIEW}. Ellipses are contours at one standard deviation: yellow for pixels of this",
-            "view alone, blue for several views, pink for what the pixel has become.",
+            "view alone, blue for several views, pink for what became of the pixel.",
         ),
     ])  # fmt: skip
 
@@ -289,14 +289,14 @@ def prepare_section(run: Run) -> str:
             entry("moved", prepared.moved),
         ]),
         text(
-            "The frame has its origin at the median of the means. Its unit is the power of two next to the median",
+            "The frame has its origin at the median of the means. Its unit is the power of two nearest to the median",
             "depth, so thresholds mean the same in every scene.",
             say(
-                "The photos show what the Gaussians show, so they are the reference of the fit and of all scores.",
+                "The photos show what the Gaussians show, so the fit and all scores refer to them.",
                 prepared.reference.name == "photos" and prepared.reference.score_views == tuple(range(VIEWS)),
             ),
             f"Other views confirm the depth of {100 * agreement.confirmed:.0f} % of the pixels.",
-            say("The photos agree as they are, so no exposure changes and no camera moves.",
+            say("The photos agree, so no exposure and no camera changes.",
                 not prepared.moved and prepared.reference.photo_files is None),
         ),
     ])  # fmt: skip
@@ -323,18 +323,18 @@ def plan_section(run: Run) -> str:
         ]),
         text(
             say(
-                "No option asks for a number, and each view has Gaussians of its own, so"
+                "No option limits the number of Gaussians, and each view has its own, so"
                 f" {plan.settings['superpixels']} of the",
                 limits.exact is None and not plan.keeps_fidelity and plan.target_psnr is None,
             ),
-            f"{pixels:,} pixels of a view become Gaussians. These are {limits.per_view} for each view,",
+            f"{pixels:,} pixels of a view become Gaussians: {limits.per_view} for each view,",
             f"and {limits.default:,} in all. The fit has {plan.fit.steps} steps. It starts with fewer Gaussians,",
             say(
                 f"{first} for each view, and adds the others where the photos show the largest errors.",
                 plan.fit.grows and not plan.merges_pairs,
             ),
             say(
-                "Networks stay out, since a fit to photos gains more than they do.",
+                "Networks are not used, since a fit to photos gains more.",
                 plan.checkpoint is None and run.prepared.reference.of_views,
             ),
         ),
@@ -358,7 +358,7 @@ def build_section(run: Run) -> str:
         text(
             "[`pipeline.py`](../../gsmerge/pipeline.py) calls the files of `stages/` in turn, and `fit/` after",
             "`decode_merged`. Each line begins with a function. Not shown are `assign` (a row belongs to the",
-            "superpixel of its pixel) and `refine` (networks stay out).",
+            "superpixel of its pixel) and `refine` (only networks refine).",
         ),
         "\n".join([
             entry("segment_scene: groups.labels", groups.labels, (VIEW, Y, X)),
@@ -374,29 +374,29 @@ def build_section(run: Run) -> str:
         text(
             "**Superpixels** follow colour borders in the photo, because a Gaussian has one colour.",
             say(f"Each view has {groups.counts[0]} superpixels.", len(set(groups.counts)) == 1),
-            f"The pixel lies in number {run.label}, which has {size} pixels.",
+            f"The pixel lies in superpixel {run.label}, which has {size} pixels.",
             "**`encode`** gives each superpixel a Feature Gaussian with the mean and the covariance of its Gaussians,",
             "weighted by their opacities.",
-            f"**`correct`** lowers the gain of {faint} of the {len(features)}, because other views see through them",
-            say("and their depth is likely wrong.", plan.weakens and faint > 0),
+            f"**`correct`** lowers the gain of {faint} of the {len(features)}: more views see through these than",
+            say("confirm them, so their depth is likely wrong.", plan.weakens and faint > 0),
         ),
         text(
             "**`match`** finds Feature Gaussians of different views that overlap and have similar colours, and so",
             say(
-                "show one surface. The pixel's cluster has one of each of the views"
+                "show one surface. The pixel's cluster has one Feature Gaussian of each of the views"
                 f" {', '.join(map(str, features.views[own][:-1]))} and {features.views[own][-1]}.",
                 len({*features.views[own]}) == len(own) > 1 and plan.match.match == "overlap",
             ),
-            f"**`merge`** turns {len(features)} into {len(merged)}, one for each cluster; `views` is",
-            say("-1 where several views were merged.", int(merged.views[run.merged]) == -1),
-            "**`decode_merged`** makes a Gaussian of each, with an opacity that keeps the optical depth of its",
-            "members.",
-            say("K is 1, so no superpixel gets more.", plan.decode.k == 1 and len(decoded.gaussians) == len(merged)),
+            f"**`merge`** turns {len(features)} Feature Gaussians into {len(merged)}, one for each cluster; `views` is",
+            say("-1 if several views were merged.", int(merged.views[run.merged]) == -1),
+            "**`decode_merged`** makes one Gaussian of each,",
+            say("since K is 1.", plan.decode.k == 1 and len(decoded.gaussians) == len(merged)),
+            "Its opacity keeps the optical depth of the members, times the gain.",
         ),
         text(
             "**`fit_scene`** changes all parameters until renders look like the photos. Half way it splits the",
             "Gaussians with the largest errors, and later it drops faint ones.",
-            f"{len(fitted.gaussians):,} are left, {len(children)} of them from the pixel's.",
+            f"{len(fitted.gaussians):,} are left, {len(children)} of which come from the pixel's Gaussian.",
             "The first steps draw a quarter of all pixels, and leave out patches of the photos.",
             f"The PSNR of the patches rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
@@ -406,8 +406,8 @@ def build_section(run: Run) -> str:
         ),
         text(
             f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians, which change no photo by more than",
-            "rounding does, and adds Gaussians where cameras between the photos see nothing.",
-            say("Here there are no such places.", not others),
+            "rounding does. It adds Gaussians where cameras between the photos see nothing,",
+            say("but here it adds none.", not others),
         ),
     ])  # fmt: skip
 
@@ -432,10 +432,10 @@ def result_section(run: Run) -> str:
         text(
             f"{len(gaussians):,} Gaussians replace {run.prepared.input_scene.num_gaussians:,}.",
             say(
-                "They show the photos better than the input, some of whose depths are wrong.",
+                "The result shows the photos better than the input, which has wrong depths.",
                 report.psnr_after > report.psnr_before,
             ),
-            "The fit has seen these photos. So the report also estimates the gain in views that no photo shows, by",
+            "The fit has seen these photos. So the report also estimates the gain of new views, by",
             say(
                 "fits that leave photos out.",
                 report.worse is None and new.low > 0,

@@ -84,11 +84,6 @@ def test_functions_of_arrows_are_in_their_files() -> None:
             assert any(hasattr(owner, name) for owner in owners), name
 
 
-def test_every_file_of_stages_is_an_arrow_or_said_to_be_none() -> None:
-    files = {f"stages/{path.stem}" for path in (PACKAGE / "stages").glob("*.py") if not path.stem.startswith("_")}
-    assert set(re.findall(r"`(stages/\w+)`", section("Arrows"))) == files
-
-
 def test_each_file_of_cameras_says_what_it_serves() -> None:
     cells = "".join(line.split("|")[1] for line in section("Cameras").splitlines() if line.startswith("| `"))
     files = [path for path in (PACKAGE / "cameras").iterdir() if not path.name.startswith("_")]

@@ -184,8 +184,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
     ),
     SHARP: (f"Each photo needs {register.MIN_MATCHES} points in common with another one",),
     CONVENTIONS: (
-        f"a low-pass of {tiled_view.EPS2D:g} square pixels on every footprint",
-        f"none is above {blend.MAX_ALPHA:g}",
+        f"a low-pass adds a variance of {tiled_view.EPS2D:g} square pixels",
+        f"larger ones than {blend.MAX_ALPHA:g} are set to {blend.MAX_ALPHA:g}",
         f"a Gaussian window of {metrics.WINDOW} x {metrics.WINDOW} pixels, sigma {metrics.SIGMA:g}",
         f"larger than a {part(scene_size.LARGE_SCALE)} of the scene",
         f"base colours are beyond {scene_size.BRIGHT_COLOR:g}",
@@ -193,8 +193,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
     ),
     EXPORTERS: (
         f"is at most {part(rows_first._PLAIN_PX)} a pixel in every view",
-        f"lie within {score.MAX_MEDIAN_PX:g} pixels of their pixels (median), and {word(int(score.SHUFFLED_MARGIN))}"
-        " times as close as with shuffled pixels",
+        f"in every view is at most {score.MAX_MEDIAN_PX:g} pixels (less in small pictures), and a"
+        f" {part(1 / score.SHUFFLED_MARGIN)} of that from shuffled pixels",
         f"up to {cameras_off.MAX_PX:g} pixels off (median; {percent(cameras_off.MAX_SHARE)} of the side",
     ),
     FORMATS: (
