@@ -27,10 +27,9 @@ from gsmerge.settings.pictures import GIF
 from gsmerge.types import StrPath
 
 # Code and name of the encoders for each ending. The first one that OpenCV has is used. Browsers play all but MPEG-4.
-# VP8 takes a third of the time of VP9 and 1.6 times the space
+# VP8 takes a third of the time of VP9, and its files are 1.6 times as large
 ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
-# Name of an encoding, and the encoder, container and options with which the program ffmpeg makes it. Nearly every
-# program plays H.264
+# Name, encoder, container and options of the encoding that the program ffmpeg makes. Nearly every program plays H.264
 H264 = ("H.264", "libx264", "mp4", (
     "-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709",  # the colours that players expect of large frames
     "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
@@ -64,8 +63,8 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
     """Place the captions of scenes side by side at the bottom of a frame, from left to right.
 
     ``texts`` are the name, the count and the size of each scene. If there is room, count and size share a line.
-    Otherwise each has its own line, or each word of the count has one. A name may be shortened. Other lines that do not
-    fit are left out.
+    Otherwise each has its own line. If the count is still too wide, it is broken between its words. A name may be
+    shortened. Other lines that do not fit are left out.
     """
     scale, thickness = max(0.45, height / 900), max(1, round(height / 600))
     line_height = round(LINE * scale)
@@ -75,7 +74,7 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
         return int(cv2.getTextSize(text, FACE, scale, thickness)[0][0])
 
     def widest(rows: Sequence[Sequence[str]]) -> int:
-        """Return the width of the widest text but the names, which may be shortened."""
+        """Return the largest width of a text, except for the names, which may be shortened."""
         return max(text_width(text) for row in rows for text in row[1:])
 
     rows: list[tuple[str, ...]] = [(name, f"{count}, {size}") for name, count, size in texts]
@@ -98,10 +97,11 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
     return captions
 
 
-def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[int]]:
-    """Return the borders of ``count`` scenes in each frame: ``[frames,count+1]`` columns of pixels from 0 to ``width``.
+def swipe_borders(count: int, frames: int, fps: float, width: int) -> list[list[int]]:
+    """Return where the borders of ``count`` scenes are in each frame of a clip that is ``width`` pixels wide.
 
-    The inner borders begin evenly spread, and move together to the right, to the left, and back.
+    Element ``[frame][i]`` is the left border of scene i, and the right border of scene i - 1: a column of pixels. The
+    inner borders begin evenly spread. They move together to the right, to the left, and back.
     """
     swipe_seconds = 6  # time in which a border moves to both sides and back
     rounds = max(1, round(frames / fps / swipe_seconds))
@@ -115,8 +115,8 @@ def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[i
 def draw_swipe(pictures: Sequence[BytePicture], borders: Sequence[int], captions: Sequence[Caption]) -> BytePicture:
     """Make a frame from columns of pictures of several scenes, each with its caption, and draw lines between them.
 
-    All pictures are from one camera. ``borders`` are the frame's row of :func:`swipe_places`. The captions are drawn
-    into the pictures themselves.
+    All pictures are from one camera. ``borders`` are those of the frame, see :func:`swipe_borders`. The captions are
+    drawn into the pictures themselves.
     """
     frame = np.empty_like(pictures[0])
     lines_per_width = 480  # a line is as wide as a frame divided by this
@@ -131,7 +131,7 @@ def draw_swipe(pictures: Sequence[BytePicture], borders: Sequence[int], captions
 
 
 class FfmpegWriter:
-    """Writes frames with the program ffmpeg. It has the methods of :class:`cv2.VideoWriter`."""
+    """Writer of frames with the program ffmpeg. It has the methods of :class:`cv2.VideoWriter`."""
 
     def __init__(self, program: str, path: Path, shape: tuple[int, ...], fps: float) -> None:
         height, width, _ = shape
@@ -220,7 +220,7 @@ def _write_gif(path: Path, frames: Sequence[BytePicture], fps: float) -> None:
     step = 1 + len(frames) * frames[0].shape[0] * frames[0].shape[1] // GIF_SAMPLE
     sample = np.concatenate([frame.reshape(-1, 3)[i % step :: step] for i, frame in enumerate(frames)])
     palette = Image.fromarray(sample[None]).quantize(256, Image.Quantize.FASTOCTREE)
-    # Without dithering, which would flicker, cost 1.6 dB and take a quarter more bytes
+    # No dithering: it would flicker, cost 1.6 dB, and make the file a quarter larger
     paletted = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first_frame, *later_frames = paletted
     first_frame.save(path, "GIF", save_all=True, append_images=later_frames, duration=round(1000 / fps), loop=0)
@@ -229,9 +229,10 @@ def _write_gif(path: Path, frames: Sequence[BytePicture], fps: float) -> None:
 def _open_writer(
     path: Path, temporary: Path, shape: tuple[int, ...], fps: float
 ) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
-    """Open ``temporary`` for frames of a ``shape`` with the first available encoder; also return the encoding's name.
+    """Open the file ``temporary`` with the first available encoder; return the writer, and the encoding's name.
 
-    The encoder is chosen by the ending of ``path``, which messages name.
+    All frames have ``shape``. ``path`` is the name that the file will get: its ending decides about the encoders, and
+    messages name it.
     """
     height, width, _ = shape
     name, encoder, container, _ = H264
@@ -245,10 +246,9 @@ def _open_writer(
         if writer.isOpened():
             return writer, name
     os.stat(str(temporary))  # if the folder has vanished, this raises an error with the reason
-    names = " and ".join(name for _, name in encoders)
     raise SceneError(
         path,
-        f"this OpenCV has none of the encoders {names}, so it cannot write it",
+        f"this OpenCV has none of the encoders {' and '.join(name for _, name in encoders)}, so it cannot write it",
         f"{FOLDER_HINT}, or install {OPENCV}",
     )
 

