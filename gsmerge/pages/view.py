@@ -124,13 +124,16 @@ def view(
 
 
 def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, float]]:
-    """Return the bounds of the expected gain of new views, dB, by name of each result whose file has them."""
+    """Return the bounds of the expected gain of new views, in dB, of the results whose files store them."""
     known = {name: read_new_views(file.info.comments) for name, file in files.items()}
     return {name: scores.bounds for name, scores in known.items() if scores}
 
 
 def _num_bytes(value: Any) -> int:
-    """Return the bytes of a scene's files, or of a file that was read; for other Gaussians, those of their ``.ply``."""
+    """Return the size in bytes of a scene's files, or of a file that was read.
+
+    Gaussians that come from no file get the size of their ``.ply``.
+    """
     if isinstance(value, GaussianFile):
         return value.info.file_bytes
     if isinstance(value, str | PathLike):
