@@ -1,7 +1,7 @@
 """Compact a scene under bad conditions: with worse views, poses, photos or rows.
 
-A case defines how a scene is changed, which scenes it applies to, and the property that must hold. Every change returns
-a new scene, and moves the views that results are compared with along with it.
+A case defines how a scene is changed, which scenes it applies to, and the property that must hold. A change returns a
+new scene. If it moves the world, it also moves the held-out views.
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ _QUICK = EvaluateOptions(lpips=(), fog=False)
 
 @dataclass(frozen=True)
 class StressScene:
-    """A scene and the views that its results are compared with."""
+    """A scene, and the views in which its results are scored."""
 
     scene: Scene
-    views: Views | None  # held-out views in the scene's world; None: results are compared with the scene's own views
+    views: Views | None  # held-out views in the scene's world; None: the scene's own views
 
 
 def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> StressScene:
-    """Keep the views whose numbers ``choose`` returns; it is called with the number of views."""
+    """Keep only some views of a scene. ``choose`` takes the number of views, and returns the ids of those to keep."""
     return replace(setup, scene=subset(setup.scene, choose(len(setup.scene))))
 
 
 def scale_and_shift(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
-    """Scale the world by ``factor``, and shift it by ``shift``, in units of the scaled scene's size."""
+    """Scale the world by ``factor``, then shift it by ``shift`` times the size that the scene has after scaling."""
     scene, views = setup.scene, setup.views
-    frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)
+    frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)  # leaving it moves the scene
     scene = replace(scene, gaussians=frame.leave(scene.gaussians), cameras=frame.leave_cameras(scene.cameras))
     return StressScene(scene, views and replace(views, cameras=frame.leave_cameras(views.cameras)))
 
@@ -91,7 +91,7 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
 
 
 def break_rows(setup: StressScene) -> StressScene:
-    """Remove 1 % of the rows at random, at least one, as reading does with rows of a file that have NaN."""
+    """Remove 1 % of the rows at random, but at least one. The reader removes rows with NaN in the same manner."""
     count = len(setup.scene.gaussians)
     broken_share = 0.01  # share of the rows that are removed
     broken = np.random.default_rng(SEED).choice(count, max(1, round(broken_share * count)), replace=False)
@@ -149,7 +149,7 @@ class StressOutcome:
 
 @dataclass(frozen=True)
 class _ScoredResult:
-    """A compact result with its figures."""
+    """A compacted scene and its scores."""
 
     gaussians: Gaussians
     count: int  # number of Gaussians, including those that no photo shows
@@ -167,8 +167,8 @@ def stress(
 ) -> tuple[StressOutcome, ...]:
     """Compact a scene under bad conditions, all ``CASES`` or the named ones, and check each result.
 
-    Results are scored on held-out views (``targets``) if there are any, otherwise on the photos of the input views, or
-    without photos on renders of the input. ``progress`` is called with (case, done, total).
+    Results are scored on the held-out views ``targets`` if there are any. Otherwise they are scored on the photos of
+    the input views, or on renders of the input if it has no photos. ``progress`` is called with (case, done, total).
 
     Raises:
         UsageError: If a case is unknown, or the scene has no views.
@@ -200,7 +200,8 @@ def _check_case(
 ) -> tuple[bool | None, str]:
     """Check if the property of a case holds.
 
-    Returns True if it holds, or None if the case does not apply; and the figures, or the reason why it does not apply.
+    Returns True or False, and the measured figures. For a case that does not apply to the scene, returns None and the
+    reason.
     """
     if case.needs != "anything" and not setup.scene.has_own_pixels:
         return None, "needs a Gaussian for each pixel"
@@ -218,16 +219,16 @@ def _check_case(
 
 
 def _compact_and_score(setup: StressScene, options: CompactOptions) -> _ScoredResult:
-    """Compact a scene; return the result, and the PSNR of the input and of the result."""
+    """Compact a scene, and measure the PSNR of the input and of the result."""
     result = compact(setup.scene, options)
     count = len(result.gaussians) + result.report.choices.get("pruned", 0)
     return _ScoredResult(result.gaussians, count, *_measure_psnr(setup, result.gaussians))
 
 
 def _measure_psnr(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
-    """Measure the PSNR (dB) of the input and of a result on the views.
+    """Measure the PSNR (dB) of the input and of a result.
 
-    The input's PSNR is infinite if the views have no photos, because its own renders are then the reference.
+    If there are no photos, renders of the input are the reference, and the PSNR of the input is infinite.
     """
     evaluation = evaluate(setup.scene, {"result": gaussians}, setup.views, replace(_QUICK, context=setup.views is None))
     split = "context" if setup.views is None else "target"
@@ -236,15 +237,15 @@ def _measure_psnr(setup: StressScene, gaussians: Gaussians) -> tuple[float, floa
 
 
 def _fit_slack(options: CompactOptions) -> float:
-    """Return the additional tolerance (dB) of results with these options, which is 0 without a full fit."""
-    fit_slack = 1.0  # dB; rounding changes the thin structures of a full fit, and the PSNR by up to this
+    """Return by how many dB more a result may be worse if ``options`` have a full fit; 0 without one."""
+    fit_slack = 1.0  # dB; after a full fit, thin structures and so the PSNR depend on rounding by up to this
     return fit_slack if options.fit.fit == "full" else 0.0
 
 
 def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack: float) -> tuple[bool, str]:
     """Compare a result with its own input, or with the result ``base`` of the unchanged scene, as the case requires.
 
-    Returns True if the property holds, and the figures.
+    Returns True if the property of the case holds, and the compared figures.
     """
     figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
     with_base = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
@@ -261,9 +262,9 @@ def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack:
 
 
 def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOptions) -> tuple[bool, str]:
-    """Compact the result ``base`` once more, to as many Gaussians as it has, and check that it does not get worse.
+    """Compact the result ``base`` a second time without reducing it, and check that the quality stays.
 
-    Returns True if it does not, and the figures.
+    Returns True if it stays, and the PSNR after and before.
     """
     scene = setup.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)

@@ -1,6 +1,6 @@
 """Train with AdamW on windows of photos, with validation and checkpoints; an interrupted run can be resumed.
 
-Validation uses fixed windows and whole photos of the validation examples, which are read one after another.
+Validation uses the same windows of its examples every time. The examples are read one after another.
 
 Random numbers depend only on seed and step, and the gradients of crops are added in order. So a resumed run ends with
 the same bytes as an uninterrupted run, on any number of threads.
@@ -52,11 +52,13 @@ def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions)
 
 
 def _score_shard(networks: Networks, shard: Shard, number: int, options: TrainOptions) -> Scores:
-    """Score random windows of a shard; the windows depend on its ``number``."""
+    """Score random windows of a shard. A shard of the same ``number`` gets the same windows every time."""
     rng = np.random.default_rng([options.seed, VALIDATION, number])
     example = read_shard(shard)
     windows = [
-        sample_window(draw_random_views(example, options, rng), options.levels, options.window, options.most, 1, rng)
+        sample_window(
+            draw_random_views(example, options, rng), options.levels, options.window, options.most, novel=1, rng=rng
+        )
         for _ in range(options.validation_windows)
     ]
 
@@ -169,7 +171,7 @@ def _save_run(
     figures = {name: value for name, value in rows[-1].items() if name not in ("step", "rate", "loss")}
     training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **head}
     networks = deepcopy(state.smooth)
-    with torch.no_grad():
+    with torch.no_grad():  # checkpoints have the opacity shift in the bias of the heads
         for module in networks.heads.values():
             assert isinstance(module, Head)
             module.out.bias[LOGIT_COLUMN] += options.opacity_shift
@@ -183,9 +185,9 @@ def _save_run(
 
 
 def _load_run(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[LossRow]]:
-    """Load the run in the folder into ``state``; return its step and table of losses, step 0 and no rows without a run.
+    """Load the run in the folder into ``state``; return its step, and the rows of its table of losses.
 
-    Raises SceneError if the run differs from what is ``expected``.
+    Without a run, the step is 0 and there are no rows. Raises SceneError if a fact of the run is not as ``expected``.
     """
     path = out / "state.safetensors"
     if not path.exists():
@@ -235,7 +237,7 @@ def _take_step(
 
 
 def save_training(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
-    """Write weights, running means, moments and facts about the run to a file, replacing it."""
+    """Write weights, running means, moments and ``facts`` about the run to a file, which is replaced."""
     tensors: dict[str, torch.Tensor] = {}
     for name, parameter, mean in state.pairs():
         moments = state.optimizer.state[parameter]
@@ -246,7 +248,7 @@ def save_training(path: Path, state: TrainingState, facts: Mapping[str, Any]) ->
 
 
 def load_training(path: Path, state: TrainingState) -> dict[str, Any]:
-    """Read weights, running means and moments into ``state``; return the facts about the run.
+    """Read a file of :func:`save_training` into ``state``; return the facts about the run.
 
     Raises SceneError if the file is damaged or has other networks.
     """

@@ -1,10 +1,10 @@
 """Encoder, decoder heads, merger and refiner as torch modules, for training (paper sections 4.2 to 4.5).
 
-All of them take tokens and return raw corrections of the results of the analytic stages (fig. architecture). The last
-layers start at zero, so untrained networks change nothing.
+All of them take tokens, and return raw corrections of what the closed formulas of the stages compute (fig.
+architecture). The last layers start at zero, so untrained networks change nothing.
 
-They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded; ``mask`` is True for tokens of
-the set and False for padding. Padded tokens are never attended to.
+They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded to one size. ``mask`` is True
+for tokens of the set and False for padding, which gets no attention.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 def zero_init(layer: nn.Linear) -> nn.Linear:
-    """Set a layer's weights and bias to zero, so that it corrects nothing before training."""
+    """Set a last layer's weights and bias to zero, so that its network corrects nothing before training."""
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer
 
 
 def small_init(layer: nn.Linear) -> nn.Linear:
-    """Make a layer's initial outputs small but different, since siblings with equal outputs would stay equal."""
+    """Make a layer's initial weights small. With zeros, the children of a group would be equal and stay equal."""
     with torch.no_grad():
         for values in layer.parameters():
             values.mul_(0.1)
@@ -71,19 +71,19 @@ class Attention(nn.Module):
 class AttentionBlock(nn.Module):
     """Attention and an MLP, both residual with normalised inputs (paper fig. architecture: SAB).
 
-    With ``first`` only the first token is computed, ``[b,1,w]``.
+    If ``first_only``, the result is the first token alone, ``[b,1,w]``.
     """
 
-    def __init__(self, width: int, heads: int, *, first: bool = False) -> None:
+    def __init__(self, width: int, heads: int, *, first_only: bool = False) -> None:
         super().__init__()
-        self.first = first
+        self.first_only = first_only
         self.before, self.between = nn.LayerNorm(width), nn.LayerNorm(width)
         self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Return the tokens ``[b,n,w]`` after attending to each other."""
         context = self.before(x)
-        if self.first:
+        if self.first_only:
             x = x[:, :1]
         x = x + self.attention(context[:, : x.shape[1]], context, mask)
         return x + self.mlp(self.between(x))
@@ -160,7 +160,7 @@ class Head(nn.Module):
 
 
 class Merger(nn.Module):
-    """Network from the Feature Gaussians of a cluster to corrections of the pooled one and its latent."""
+    """Network from the Feature Gaussians of a cluster to corrections of the pooled Feature Gaussian and its latent."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
@@ -173,14 +173,14 @@ class Merger(nn.Module):
 
 
 class Refiner(nn.Module):
-    """Network from a Feature Gaussian and its nearest neighbours to corrections of it and its latent."""
+    """Network from a Feature Gaussian and its nearest neighbours to corrections of this Feature Gaussian."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
         width, last = options.width, options.refine_blocks - 1
         self.embed = mlp(PART_COLUMNS + 1 + options.latent, width, width)
         self.blocks = nn.ModuleList(
-            AttentionBlock(width, options.heads, first=i == last) for i in range(options.refine_blocks)
+            AttentionBlock(width, options.heads, first_only=i == last) for i in range(options.refine_blocks)
         )
         self.norm, self.join = nn.LayerNorm(width), mlp(width + GROUP_COLUMNS, 2 * width, width)
         self.out = zero_init(nn.Linear(width, FEATURE + options.latent))
@@ -195,7 +195,7 @@ class Refiner(nn.Module):
 
 
 class Networks(nn.Module):
-    """The torch modules of a checkpoint; None for networks that the options leave out."""
+    """The torch modules of a checkpoint. A network that the options leave out is None."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()

@@ -33,7 +33,7 @@ from gsmerge.version import __version__
 LAYOUT = 7  # version of the files and their contents
 EXAMPLE_FORMAT = "gsmerge-example"
 EXAMPLE_REMEDY = "remove it; the next call makes it again"
-# Settings that an example depends on
+# Settings of which an example is made, besides its views
 EXAMPLE_SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
 STORED_PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}  # whose fields are all arrays
 
@@ -155,7 +155,7 @@ def read_shard(shard: Shard) -> Example:
         prefix = f"{name}."
         return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
 
-    black = np.broadcast_to(np.float32(0), arrays["images"].shape)
+    black = np.broadcast_to(np.float32(0), arrays["images"].shape)  # the photos' colours are in ``images``
     return Example(
         name=shard.scene,
         unit=float(facts["unit"]),

@@ -97,7 +97,7 @@ class TrainOptions(Settings):
 
     @property
     def example_views(self) -> tuple[int, ...]:
-        """Numbers of views of the examples made of each scene; 0: all views."""
+        """Numbers of views: each scene gives an example for each number; 0 stands for all views."""
         return (0,) if self.random_views else self.views
 
     def match_options(self) -> MatchOptions:
@@ -167,8 +167,9 @@ PAPER: Mapping[str, Any] = {
     "diversity_weight": 1.0,
     "diversity_steps": 50_000,
 }
-# Settings of the shipped networks. Encoder and merger gained nothing in validation, and colour corrections learnt the
-# exposure of the training photos; docs/internals/networks.md has the figures.
+# Settings of the shipped networks. They have no encoder and no merger, which did not raise the PSNR of validation. They
+# have no corrections of colour, which learnt the exposure of the training photos. docs/internals/networks.md has the
+# figures.
 SHIPPED_TRAINING: Mapping[str, Any] = {
     "encoder": False,
     "merger": False,
@@ -184,7 +185,7 @@ SHIPPED_TRAINING: Mapping[str, Any] = {
     "save_every": 100,
     "validation_windows": 6,
 }
-# The paper's training, shortened to one and a half hours on two processor cores.
+# Settings of the paper with fewer steps: training takes one and a half hours on two processor cores.
 PAPER_SHIPPED: Mapping[str, Any] = {
     **PAPER,
     "recolor": True,
