@@ -253,7 +253,7 @@ FACING = axis_rotation(1, np.pi / 2)  # rotates -z to -x
 def draw_lights(rng: np.random.Generator, lamp_at: Array) -> Light:
     """Draw a direct and an ambient light of random colour and strength.
 
-    The direct light comes from above and from the side of the cameras.
+    The direct light comes from above and from behind the cameras.
     """
     side, up = rng.uniform(-1.2, 1.2), rng.uniform(0.5, 1.3)
     towards = np.array([sin(side), -up, -cos(side)])
