@@ -46,7 +46,7 @@ class CameraPath:
 
 
 def parse_camera_path(text: str) -> CameraPath | None:
-    """Parse a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``; None for a file name.
+    """Parse a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``. Returns None for the name of a file.
 
     Raises:
         ValueError: If the text begins with the kind of a path but is no path, or if a number is out of range.
@@ -65,7 +65,7 @@ def parse_camera_path(text: str) -> CameraPath | None:
 
 
 def _parse_number(text: str | None, expected: str, most: float) -> float | None:
-    """Parse a number above 0 and at most ``most``; None for None.
+    """Parse a number above 0 and at most ``most``. Returns None if there is no text.
 
     Raises ValueError for any other text, with the words ``expected`` for the number.
     """
@@ -156,7 +156,7 @@ def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
 
     Frames are evenly spaced. A rotation counts as the distance by which it moves a point that is ``depth`` away. The
     curve is a centripetal Catmull-Rom spline (Barry and Goldman 1988) of positions and quaternions. Intrinsics change
-    linearly. ValueError if there are fewer than two different cameras.
+    linearly. Raises ValueError if there are fewer than two different cameras.
     """
     poses, is_new = _pose_rows(cameras, depth)
     origin, poses, Ks = poses[0, :3].copy(), poses[is_new], cameras.Ks[is_new].astype(np.float64)

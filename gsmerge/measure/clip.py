@@ -153,7 +153,7 @@ class FfmpegWriter:
 
 
 def find_ffmpeg(encoder: str) -> str | None:
-    """Find the program ffmpeg on the PATH; None if there is none, or if it does not have the ``encoder``."""
+    """Find the program ffmpeg on the PATH. Returns None if it is missing, or does not have the ``encoder``."""
     program = shutil.which("ffmpeg")
     with suppress(OSError):
         if program is not None:
@@ -163,7 +163,7 @@ def find_ffmpeg(encoder: str) -> str | None:
 
 
 def stored_size(path: StrPath, width: int, height: int) -> tuple[int, int]:
-    """Return width and height of the frames in a file; those of videos are even, since two pixels share a colour."""
+    """Return width and height of the frames in a file. Videos have even sides, since two pixels share a colour."""
     if Path(path).suffix.lower() == GIF:
         return width, height
     return width + width % 2, height + height % 2
@@ -176,7 +176,7 @@ def write_clip(path: StrPath, frames: Iterable[BytePicture], fps: float, *, over
     OpenCV has. All frames of a GIF share a palette, and are in memory together. A video takes the memory of a few
     frames. Its frames have the :func:`stored_size`: an odd side gets one more row or column, a copy of the last one.
 
-    SceneError if there is no encoder for the ending of the name, or if the file cannot be written completely.
+    Raises SceneError if there is no encoder for the ending of the name, or if the file cannot be written completely.
     """
     path = Path(path)
     with atomic_output(path, overwrite=overwrite) as temporary:

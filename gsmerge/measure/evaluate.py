@@ -42,7 +42,7 @@ OnImage = Callable[[str, str, int, np.ndarray], None]  # called with result, spl
 
 @dataclass(frozen=True)
 class Quality:
-    """Similarity of an image to a reference; a measure that was not taken is None."""
+    """Similarity of an image to a reference. A measure that was not taken is None."""
 
     psnr: float | None = None  # dB; inf for equal pictures
     ssim: float | None = None  # at most 1
@@ -85,8 +85,8 @@ class ResultScores:
     def mean(self, split: str) -> QualityPair:
         """Average the scores of a split's views.
 
-        Returns the mean scores over all pixels, and over the pixels that the input views have seen. ValueError for
-        another split than "context" and "target".
+        Returns the mean scores over all pixels, and over the pixels that the input views have seen. Raises ValueError
+        if the split is neither "context" nor "target".
         """
         views = self._select_views(split)
         return _average([score.full for score in views]), _average([score.masked for score in views])
@@ -98,7 +98,7 @@ class ResultScores:
         return float(np.mean(shares)) if shares else None, _average([score.covered for score in views])
 
     def _select_views(self, split: str) -> list[ViewScore]:
-        """Return the scores of a split's views; ValueError for an unknown split."""
+        """Return the scores of a split's views, or raise ValueError if the split is unknown."""
         if split not in SPLITS:
             raise ValueError(f"split: expected {' or '.join(SPLITS)}, got {split!r}")
         return [score for score in self.scores if score.split == split]

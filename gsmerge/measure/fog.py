@@ -109,7 +109,7 @@ def measure_fog(
 
 
 def describe_fog(name: str, fog: Fog) -> str | None:
-    """Describe haze and veils that a result shows from outside; None if both are small (``HAZE`` and ``VEILED``)."""
+    """Describe haze and veils that a result shows from outside, or return None if both are small."""
     faults = []
     if (fog.fog_far or 0) > HAZE:
         faults.append(f"haze where the input shows nothing (far fog {fog.fog_far:.2f}; compact --fit none makes less)")

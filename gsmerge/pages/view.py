@@ -46,9 +46,10 @@ class Page:
 
     @check_arguments
     def save(self, path: StrPath, *, overwrite: bool = False) -> Path:
-        """Write the page as an ``.html`` file that opens anywhere; return its path. UsageError for another ending.
+        """Write the page as an ``.html`` file that opens anywhere, and return its path.
 
-        A page that gsmerge made is replaced, as by ``gsmerge view``; with ``overwrite`` any file is.
+        An existing file is replaced if it is a page that gsmerge made, or if ``overwrite``. Raises UsageError if the
+        name does not end in .html.
         """
         check_page_name(Path(path))
         with atomic_output(path, overwrite=overwrite or may_be_replaced(Path(path))) as temporary:

@@ -237,7 +237,7 @@ def _measure_psnr(setup: StressScene, gaussians: Gaussians) -> tuple[float, floa
 
 
 def _fit_slack(options: CompactOptions) -> float:
-    """Return by how many dB more a result may be worse if ``options`` have a full fit; 0 without one."""
+    """Return by how many dB more a result may be worse because its options have a full fit."""
     fit_slack = 1.0  # dB; after a full fit, thin structures and so the PSNR depend on rounding by up to this
     return fit_slack if options.fit.fit == "full" else 0.0
 
@@ -275,7 +275,7 @@ def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOption
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:
-    """Describe a defect of a result; None if it has none."""
+    """Describe the defect of a result, or return None if the result has no defect."""
     if not 1 <= len(gaussians) <= scene.num_gaussians:
         return f"{len(gaussians)} Gaussians of {scene.num_gaussians}"
     columns = [name for name, column in vars(gaussians).items() if not np.isfinite(column).all()]

@@ -90,9 +90,10 @@ def make_figures(results: Results) -> list[Chart]:
 
 
 def _plot_against(results: Results, cost: str, name: str, title: str, cost_words: str, x_label: str) -> Chart | None:
-    """Plot quality against a cost, with a panel for each metric and a table of all points; None without points.
+    """Plot quality against a cost, with a panel for each metric and a table of all points.
 
-    ``cost`` is the name of a value of a record. ``cost_words`` describe it in the caption.
+    ``cost`` is the name of a value of a record, and ``cost_words`` describe the cost in the caption. Returns None if no
+    run has the cost.
     """
     panels = []
     for metric in results.metrics:

@@ -27,7 +27,10 @@ GridRun = tuple[ChartScene, RunRecord, CompactOptions]  # scene, record without 
 
 
 def parse_grid(pairs: Sequence[str]) -> SettingGrid:
-    """Make a grid from pairs NAME=A,B with names of settings of compact; UsageError for other names or no values."""
+    """Make a grid from pairs NAME=A,B with names of settings of compact.
+
+    Raises UsageError if a name is unknown or given twice, or if a pair has no values.
+    """
     grid: dict[str, list[Any]] = {}
     for pair in pairs:
         name, _, text = pair.partition("=")
@@ -67,7 +70,7 @@ def list_settings(grid: SettingGrid, fixed: Mapping[str, Any]) -> list[tuple[str
 
 
 def options_of(method: str, settings: Mapping[str, Any]) -> CompactOptions:
-    """Make the options of a run; UsageError if a setting is invalid.
+    """Make the options of a run, or raise UsageError if a setting is invalid.
 
     By default a run uses all of its budget ("fill"), so that results of one size can be compared.
     """
@@ -110,7 +113,7 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
 def make_runs(
     sources: Sequence[ChartScene], grid: SettingGrid, fixed: Mapping[str, Any], measured: EvaluateOptions
 ) -> list[GridRun]:
-    """Make the runs of a grid, scene by scene; UsageError if a setting is invalid."""
+    """Make the runs of a grid, scene by scene. Raises UsageError if a setting is invalid."""
     combinations = [(method, settings, options_of(method, settings)) for method, settings in list_settings(grid, fixed)]
     runs = []
     for source, (method, settings, options) in product(sources, combinations):

@@ -177,7 +177,7 @@ class Results:
         return make_lines([r for r in self.runs if r.method != INPUT], x, y)
 
     def input_mean(self, name: str, scenes: Iterable[str]) -> float | None:
-        """Average a value of the unmerged input over ``scenes``; None if it was not measured on a scene."""
+        """Average a value of the unmerged input over ``scenes``. Returns None if a scene lacks the value."""
         inputs = {r.scene: r.value(name) for r in self.runs if r.method == INPUT}
         values = [inputs.get(scene) for scene in scenes]
         numbers = [value for value in values if value is not None]

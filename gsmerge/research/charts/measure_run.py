@@ -64,7 +64,7 @@ class RunRecord:
         return 100 * self.count / max(self.num_input, 1)
 
     def value(self, name: str) -> float | None:
-        """Return a score or a number by name; None if it was not measured."""
+        """Return a score or a number by name, or None if it was not measured."""
         return getattr(self, name) if name in ("count", "bytes", "seconds", "percent") else self.scores.get(name)
 
 

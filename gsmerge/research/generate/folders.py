@@ -107,7 +107,7 @@ def scene_facts(seed: int, index: int, options: GenerateOptions) -> dict[str, An
 
 
 def is_complete(folder: Path, facts: Mapping[str, Any]) -> bool:
-    """Return True if a folder has the complete scene with these facts; UsageError if it has other contents."""
+    """Return True if a folder has the complete scene with these facts. Raises UsageError if it has other contents."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):

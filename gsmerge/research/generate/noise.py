@@ -112,7 +112,7 @@ def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) 
 
 
 def edge_mask(depth: Array) -> Float:
-    """Rate pixels ``[h,w]`` by depth edges: 0 on smooth surfaces, also slanted ones, and 1 at clear edges."""
+    """Rate pixels ``[h,w]`` by depth edges, from 0 on smooth surfaces (also if slanted) to 1 at clear edges."""
     inverse = (1 / depth).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
     step = log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
@@ -125,7 +125,7 @@ MEAN_FILTER = np.full(7, 1 / 7, np.float32)  # filter that averages 7 pixels
 
 
 def texture_mask(image: Float) -> Float:
-    """Rate pixels ``[h,w]`` by texture: 0 in flat areas of a photo, 1 in detailed areas."""
+    """Rate pixels ``[h,w]`` by texture, from 0 in flat areas of a photo to 1 in detailed areas."""
     grey = image.mean(2)
     mean, mean_square = (convolve(values, MEAN_FILTER, MEAN_FILTER) for values in (grey, grey * grey))
     deviation = np.sqrt(np.maximum(mean_square - mean * mean, 0))

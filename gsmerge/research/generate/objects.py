@@ -288,15 +288,15 @@ def _build_wall_objects(pal: Palette, half: float, height: float) -> Shapes:
     """Build pictures, windows, shelves and doors at random, side by side on the plane z = 0."""
     rng, out, x = pal.rng, [], -half + 0.3
     while x < half - 0.5:
-        wide, kind = rng.uniform(0.3, 1.2), rng.integers(0, 5)
+        wide, kind = rng.uniform(0.3, 1.2), ("picture", "picture", "window", "shelf", "door")[rng.integers(0, 5)]
         at = (x + wide / 2, 0.0, 0.0)
-        if kind <= 1:
+        if kind == "picture":
             frame = build_picture(pal, wide, min(wide * rng.uniform(0.6, 1.4), 0.45 * height))
             out += place_shapes(frame, (at[0], -rng.uniform(0.35, 0.5) * height, 0))
-        elif kind == 2:
+        elif kind == "window":
             pane = build_window(pal, wide, rng.uniform(0.35, 0.55) * height)
             out += place_shapes(pane, (at[0], -0.35 * height, 0))
-        elif kind == 3:
+        elif kind == "shelf":
             out += place_shapes(build_shelf(pal, wide, rng.uniform(0.4, 0.85) * height), at)
         else:
             out += place_shapes(
@@ -338,10 +338,10 @@ def build_sofa(pal: Palette) -> Shapes:
 
 def _build_furniture(pal: Palette) -> Shapes:
     """Build a chair, a sofa, or a table with small objects and perhaps a chair."""
-    rng, kind = pal.rng, pal.rng.integers(0, 4)
-    if kind == 0:
+    rng, kind = pal.rng, ("chair", "sofa", "table", "table")[pal.rng.integers(0, 4)]
+    if kind == "chair":
         return build_chair(pal)
-    if kind == 1:
+    if kind == "sofa":
         return build_sofa(pal)
     width, depth, height = rng.uniform(0.7, 1.5), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)
     top = spread_objects(pal, int(rng.integers(2, 7)), (0.3 * width, 0.3 * depth), height)

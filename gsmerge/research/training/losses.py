@@ -110,7 +110,7 @@ def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:
 
 
 def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """Average :func:`loss_ssim` of images ``[h,w,3]`` over the pixels of ``mask [h,w]``; 1 if the mask is empty."""
+    """Average :func:`loss_ssim` of images ``[h,w,3]`` over the pixels of ``mask [h,w]``. An empty mask gives 1."""
     if not bool(mask.any()):
         return torch.ones(())
     return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()
@@ -197,12 +197,12 @@ GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of dive
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
-    """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D); 0 to 1.
+    """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D), from 0 to 1.
 
-    ``parents [n]`` of the children are ascending. The result is a mean over pairs of siblings, weighted by their
-    volumes in units of the ``sizes [n]`` of their groups. The weights have no gradient, since a gradient would make
-    siblings small. With volumes in world units, as in the paper, the loss of a million small Gaussians would be almost
-    0.
+    Siblings are children of one group. ``parents [n]`` of the children are ascending. The result is a mean over pairs
+    of siblings, weighted by their volumes in units of the ``sizes [n]`` of their groups. The weights have no gradient,
+    since a gradient would make siblings small. With volumes in world units, as in the paper, the loss of a million
+    small Gaussians would be almost 0.
     """
     left, right = sibling_pairs(parents)
     if len(left) == 0:

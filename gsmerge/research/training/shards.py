@@ -82,7 +82,10 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shar
 
 
 def scene_key(scene: Path, options: TrainOptions) -> str:
-    """Return a hash of a scene's files and the settings that its examples depend on; SceneError without a scene."""
+    """Return a hash of a scene's files, and of the settings of which its examples are made.
+
+    Raises SceneError if there is no scene.
+    """
     head = {"layout": LAYOUT, "gsmerge": __version__, "views": options.example_views}
     head |= {name: getattr(options, name) for name in EXAMPLE_SETTINGS}
     files = find_scene_files(scene)
@@ -93,7 +96,10 @@ def scene_key(scene: Path, options: TrainOptions) -> str:
 
 
 def _read_hashes(path: Path) -> dict[str, str] | None:
-    """Read the hash of each shard from a scene's record; None without a record, or if a shard is missing."""
+    """Read the hash of each shard from a scene's record.
+
+    Returns None if there is no record, or if a shard is missing.
+    """
     try:
         hashes = json.loads(path.read_text())
         return hashes if all(path.with_name(file).is_file() for file in hashes) else None
@@ -102,7 +108,10 @@ def _read_hashes(path: Path) -> dict[str, str] | None:
 
 
 def write_shard(path: Path, example: Example) -> str:
-    """Write an example to a file, replacing it, and return the hash of its arrays; SceneError if that fails."""
+    """Write an example to a file, which is replaced, and return the hash of its arrays.
+
+    Raises SceneError if the file cannot be written.
+    """
     arrays = dict(_example_arrays(example))
     facts = {"layout": LAYOUT, "sha256": hash_arrays(arrays), "unit": example.unit, "eps2d": example.photos.eps2d}
     facts |= {"size": [example.cameras.width, example.cameras.height]}

@@ -210,7 +210,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def preset_options(name: str) -> TrainOptions:
-    """Return the settings of a named preset; ValueError if the name is unknown."""
+    """Return the settings of a named preset, or raise ValueError if the name is unknown."""
     if name not in PRESETS:
         raise ValueError(f"preset: expected {' or '.join(PRESETS)}, got {name!r}")
     return change_settings(TrainOptions(), PRESETS[name])
