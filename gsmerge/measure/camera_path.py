@@ -67,7 +67,7 @@ def parse_camera_path(text: str) -> CameraPath | None:
 def _parse_number(text: str | None, expected: str, most: float) -> float | None:
     """Parse a number above 0 and at most ``most``. Returns None if there is no text.
 
-    Raises ValueError for any other text, with the words ``expected`` for the number.
+    Raises ValueError for any other text. ``expected`` describes the number in the message.
     """
     if text is None:
         return None
@@ -170,8 +170,8 @@ def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
     path_poses = _curve(poses, knots, times, depth)
     rotations = quat_to_rotmat(path_poses[:, 3:]).swapaxes(1, 2)
     pieces, shares = _pieces(knots, times)
-    shares = shares[:, None, None]
-    path_Ks = (1 - shares) * Ks[pieces] + shares * Ks[pieces + 1]
+    weights = shares[:, None, None]
+    path_Ks = (1 - weights) * Ks[pieces] + weights * Ks[pieces + 1]
     return replace(cameras, viewmats=_viewmats(rotations, origin + path_poses[:, :3]), Ks=path_Ks)
 
 

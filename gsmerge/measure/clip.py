@@ -71,6 +71,7 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
     margin, max_width = line_height // 2, width // len(texts) - 2 * line_height
 
     def text_width(text: str) -> int:
+        """Return the width of a text at the present ``scale``, in pixels."""
         return int(cv2.getTextSize(text, FACE, scale, thickness)[0][0])
 
     def widest(rows: Sequence[Sequence[str]]) -> int:
@@ -134,6 +135,7 @@ class FfmpegWriter:
     """Writer of frames with the program ffmpeg. It has the methods of :class:`cv2.VideoWriter`."""
 
     def __init__(self, program: str, path: Path, shape: tuple[int, ...], fps: float) -> None:
+        """Start the ``program``, which writes frames of ``shape [h,w,c]`` to a file."""
         height, width, _ = shape
         frames = ("-f", "rawvideo", "-pix_fmt", "bgr24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-")
         _, encoder, container, encoding = H264
@@ -193,6 +195,7 @@ def write_clip(path: StrPath, frames: Iterable[BytePicture], fps: float, *, over
         written: list[Future[None]] = []
 
         def encode(frame: BytePicture) -> None:
+            """Add a frame in the order of channels that OpenCV takes."""
             writer.write(frame[..., ::-1])
 
         try:

@@ -167,6 +167,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     names = [re.split(r"[\\/]", scene.names[i])[-1] for i in ids]
 
     def draw(_: int) -> Iterator[BytePicture]:
+        """Yield the panel: rows of photos and renders, then a row from outside."""
         named = [(path.name, gaussians) for path, gaussians in group.scenes]
         shown = None if photos is None else [photos[i] if i in pictured else None for i in ids]
         if shown and options.size:
@@ -190,8 +191,9 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
     names = [f"{path.name}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
     def draw(threads: int) -> Iterator[BytePicture]:
-        for drawn in group.draw(views, options, threads):
-            yield contact_sheet([list(zip(names, drawn, strict=True))]) if len(drawn) > 1 else drawn[0]
+        """Yield a picture for each camera. Several scenes are side by side, with their names."""
+        for pictures in group.draw(views, options, threads):
+            yield contact_sheet([list(zip(names, pictures, strict=True))]) if len(pictures) > 1 else pictures[0]
 
     facts = {"width": views.width, "height": views.height, "scenes": group.counts(), "views": ids, "notes": group.notes}
     return Drawing([options.output / f"{stems[i]}.png" for i in ids] if is_folder else [options.output], facts, draw)
@@ -209,6 +211,7 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     ]
 
     def draw(threads: int) -> Iterator[BytePicture]:
+        """Yield the frames of the clip. Several scenes share a frame, and have captions."""
         if len(texts) == 1:
             yield from (picture for (picture,) in group.draw(cameras, options, threads, near))
             return
@@ -357,6 +360,7 @@ def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> d
     total, fps = drawing.facts.get("frames", len(drawing.paths)), drawing.facts.get("fps")
 
     def report_progress(pictures: Iterator[BytePicture]) -> Iterator[BytePicture]:
+        """Yield the pictures, and report each after it was written."""
         for done, picture in enumerate(pictures, 1):
             yield picture
             progress("render", done, total)

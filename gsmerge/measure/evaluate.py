@@ -250,6 +250,7 @@ def evaluate(
         num_pictures, numbers = len(scored) * sum(len(split.views) for split in splits.values()), count(1)
 
         def report_image(name: str, kind: str, view: int, image: np.ndarray) -> None:
+            """Pass a rendered view to the caller, and report the progress."""
             on_image(name, kind, view, image)
             progress(f"evaluate: {name}", next(numbers), num_pictures)
 
@@ -418,10 +419,10 @@ def _measure_qualities(
 
     An empty mask gives no measures.
     """
-    pixels = [None if mask is None or mask.all() else mask for mask in masks]
-    shown = [mask for mask in pixels if mask is None or mask.any()]
-    scores = iter(zip(psnr_within(image, photo, shown), ssim_within(image, photo, shown), strict=True))
-    return [Quality(*next(scores)) if mask is None or mask.any() else Quality() for mask in pixels]
+    masks = [None if mask is None or mask.all() else mask for mask in masks]
+    filled = [mask for mask in masks if mask is None or mask.any()]
+    measures = iter(zip(psnr_within(image, photo, filled), ssim_within(image, photo, filled), strict=True))
+    return [Quality(*next(measures)) if mask is None or mask.any() else Quality() for mask in masks]
 
 
 def _add_lpips(
@@ -435,6 +436,7 @@ def _add_lpips(
     fitting = [net for net in nets if min(image.shape[:2]) >= min_size(net)]
 
     def add(quality: Quality, mask: NDArray[np.bool_] | None) -> Quality:
+        """Add the LPIPS of all networks within a mask; None: all pixels."""
         return replace(quality, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in fitting})
 
     full = add(pair[0], None)

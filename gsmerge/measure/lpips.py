@@ -202,6 +202,7 @@ def _convolve(picture: np.ndarray, layer: Convolution) -> np.ndarray:
     step = max(1, band_pixels // width)
 
     def fill(top: int) -> None:
+        """Compute a band of ``step`` rows of the result, from row ``top`` on."""
         table = np.ascontiguousarray(windows[top : top + step]).reshape(-1, layer.packed[0].shape[1])
         dense(table, *layer.packed, None, PLAIN, out[top : top + step].reshape(len(table), -1))
 

@@ -63,6 +63,7 @@ def shorten_text(text: str, width: int, scale: float, thickness: int) -> str:
     """
 
     def fits(text: str) -> bool:
+        """Return whether OpenCV draws a text within ``width``."""
         return bool(cv2.getTextSize(text, FACE, scale, thickness)[0][0] <= width)
 
     text = text.encode("utf-8", "replace").decode()  # lone surrogates would crash OpenCV

@@ -202,11 +202,11 @@ def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> Vie
 def _list_views(
     splits: Mapping[str, SplitViews], evaluation: Evaluation, stills: Stills, frame: Frame, means: np.ndarray
 ) -> list[PageView]:
-    """List the measured views of all splits. Each has the median depth of the canonical ``means [n,3]`` in it."""
+    """List the measured views of all splits. The ``distance`` of each is the median depth of ``means [n,3]``."""
     views: list[PageView] = []
     for split, (cameras, photos, names) in splits.items():
         encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
-        encoded = encoded or [None] * len(names)
+        encoded = encoded or [None] * len(names)  # without photos
         for i, name in enumerate(short_names(names)):
             camera = frame.enter_cameras(cameras[[i]])
             views.append(PageView(

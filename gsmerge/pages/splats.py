@@ -49,15 +49,15 @@ def pack_splats(
     degrees = (d for d in range(highest + 1) if (row_bytes + _num_harmonics(d)) * count <= MAX_SPZ_BYTES)
     degree = max(degrees, default=0)
     steps, levels = COARSE if count > COARSE_COUNT else EXACT
-    drawn = means.take(rows, 0)
+    drawn_means = means.take(rows, 0)
     position_bits = 11  # bits of a position within the scene; browsers keep 10 bits and the sign
-    fraction = spz.choose_fraction(drawn, position_bits)
+    fraction = spz.choose_fraction(drawn_means, position_bits)
     head: dict[str, Any] = {"count": count, "degree": degree, "fraction": fraction}
     positions = None
     if cameras is not None and homes is not None and (homes >= 0).all():
         positions = _pixel_positions(rows, means, cameras, homes.astype(np.int64, copy=False))
     if positions is None:
-        changes = np.diff(spz.fix_means(drawn, fraction), axis=0, prepend=np.zeros((1, 3), np.int32)).T
+        changes = np.diff(spz.fix_means(drawn_means, fraction), axis=0, prepend=np.zeros((1, 3), np.int32)).T
         positions = np.where(changes < 0, -2 * changes - 1, 2 * changes).astype("<u4")
     elif cameras is not None:
         head |= _camera_head(cameras)
@@ -78,7 +78,7 @@ def _num_harmonics(degree: int) -> int:
 
 
 def _camera_head(cameras: Cameras) -> dict[str, Any]:
-    """Return the cameras for the line of JSON, since positions are stored relative to their pixels."""
+    """Return the entries of the JSON with which the page's script computes positions from pixels and depths."""
     poses = [
         {"viewmat": viewmat.reshape(-1).tolist(), "K": [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()]}
         for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True)

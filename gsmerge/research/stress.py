@@ -82,10 +82,10 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
     scene = setup.scene
     assert scene.images is not None
     gains = np.array([1 + share if view % 2 else 1 - share for view in range(len(scene))], np.float32)
-    rows = gains.repeat(scene.pixels_per_view)[:, None, None]
+    row_gains = gains.repeat(scene.pixels_per_view)[:, None, None]
     g = scene.gaussians
-    sh0 = ((0.5 + SH_C0 * g.sh0) * rows - 0.5) / SH_C0
-    gaussians = replace(g, sh0=sh0, shN=g.shN * rows)
+    sh0 = ((0.5 + SH_C0 * g.sh0) * row_gains - 0.5) / SH_C0
+    gaussians = replace(g, sh0=sh0, shN=g.shN * row_gains)
     images = (scene.images * gains[:, None, None, None]).clip(0, 1)
     return replace(setup, scene=replace(scene, gaussians=gaussians, images=images, large_photos=None))
 

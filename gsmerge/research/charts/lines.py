@@ -151,6 +151,7 @@ class Results:
     """
 
     def __init__(self, records: Iterable[RunRecord]) -> None:
+        """Choose names, views, pixels and metrics for the successful runs of ``records``."""
         self.runs = [record for record in records if record.error is None]
         # Runs of gsmerge come first, then baselines. Of each, runs with fewer settings come first
         own_first = sorted(self.runs, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
@@ -210,11 +211,11 @@ def make_lines(records: Sequence[RunRecord], x: str, y: str) -> list[Line]:
 
 
 def keep_common(scenes_of: Mapping[K, set[str]]) -> dict[K, set[str]]:
-    """Choose the scenes over which the points of a figure are averaged: for all points the same scenes.
+    """Choose over which scenes the points of a figure are averaged: if possible, the same scenes for all points.
 
     ``scenes_of`` are the measured scenes of each point. First, points with less than ``MIN_SHARE`` of all scenes are
-    left out, so that failed runs of one setting do not remove the scenes of others. If no scene is common to the other
-    points, each of them keeps its own scenes.
+    left out, so that failed runs of one setting do not remove scenes of the others. If the remaining points have no
+    scene in common, each keeps its own scenes.
     """
     fewest = MIN_SHARE * len(set().union(*scenes_of.values()))
     kept = {point: scenes for point, scenes in scenes_of.items() if len(scenes) >= fewest}

@@ -309,14 +309,14 @@ def _build_wall_objects(pal: Palette, half: float, height: float) -> Shapes:
 def build_room(pal: Palette) -> Room:
     """Build a furnished room: walls with pictures and shelves, tables, chairs, plants, lamps, cables."""
     rng = pal.rng
-    w, d, h = rng.uniform(4.0, 7.0), rng.uniform(4.5, 7.0), rng.uniform(2.3, 3.2)
+    w, d, h = rng.uniform(4.0, 7.0), rng.uniform(4.5, 7.0), rng.uniform(2.3, 3.2)  # width, depth and height
     shapes = _build_walls(pal, w, d, h)
-    spots = [(x * w, z * d) for x in (-0.3, 0.0, 0.3) for z in (0.05, 0.32)]
+    spots = [(x * w, z * d) for x in (-0.3, 0.0, 0.3) for z in (0.05, 0.32)]  # x and z where furniture may stand
     for i in rng.permutation(len(spots))[: rng.integers(3, 6)]:
         at = spots[i][0] + rng.normal(0, 0.15), 0.0, spots[i][1] + rng.normal(0, 0.15)
         shapes += place_shapes(_build_furniture(pal), at, yaw=rng.normal(0, 0.5))
-    pot = build_plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90)))
-    shapes += place_shapes(pot, (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
+    plant = build_plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90)))
+    shapes += place_shapes(plant, (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
     shapes += place_shapes(
         build_lamp(pal, rng.uniform(1.1, 1.8)), (rng.uniform(-0.4, 0.4) * w, 0, rng.uniform(0, 0.4) * d)
     )
@@ -324,8 +324,8 @@ def build_room(pal: Palette) -> Room:
     shapes += build_wire(pal, a, b, rng.uniform(0.05, 0.4), rng.uniform(0.003, 0.008))
     focus = np.array([rng.normal(0, 0.2), -rng.uniform(0.4, 1.0), rng.uniform(0.15, 0.35) * d])
     lamp_at = np.array([rng.uniform(-0.3, 0.3) * w, -h + 0.1, rng.uniform(-0.3, 0.2) * d])
-    reach = focus[2] + 0.42 * d
-    return Room(tuple(shapes), tuple(pal.textures), draw_lights(rng, lamp_at), focus, (0.6 * reach, reach))
+    farthest = focus[2] + 0.42 * d  # largest distance of cameras from the focus
+    return Room(tuple(shapes), tuple(pal.textures), draw_lights(rng, lamp_at), focus, (0.6 * farthest, farthest))
 
 
 def build_sofa(pal: Palette) -> Shapes:

@@ -260,16 +260,16 @@ def _reflect(lit: LitRoom, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens
     points, normals = hits.points.reshape(-1, 3)[rows], hits.normals.reshape(-1, 3)[rows]
     ids, depth = hits.ids.reshape(-1)[rows], hits.depth.reshape(-1)[rows]
     y, x = np.divmod(rows, hits.depth.shape[1])
-    rays = np.stack([(x + 0.5) / samples - lens.width / 2, (y + 0.5) / samples - lens.height / 2], 1) / lens.focal
-    rays = rotate(np.concatenate([rays, np.ones((len(rays), 1))], 1), c2w[:3, :3])
+    slopes = np.stack([(x + 0.5) / samples - lens.width / 2, (y + 0.5) / samples - lens.height / 2], 1) / lens.focal
+    rays = rotate(np.concatenate([slopes, np.ones((len(slopes), 1))], 1), c2w[:3, :3])  # with the depth 1
     positions = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
-    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    directions = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
     min_cosine = 0.1  # bounds the size of a sample on a surface, which would grow without end at grazing angles
-    cosine = np.maximum(-(normals * rays).sum(1), min_cosine)
+    cosine = np.maximum(-(normals * directions).sum(1), min_cosine)
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
     gamma = 2.2  # exponent from sRGB to linear light
     albedo = power(look_up_colors(lit, ids, points, spread), gamma)
-    return _shade(lit, ids, albedo, positions, normals, rays)
+    return _shade(lit, ids, albedo, positions, normals, directions)
 
 
 def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Float, Float]:
@@ -290,7 +290,10 @@ def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Flo
 
 
 def _shade(lit: LitRoom, ids: NDArray[np.int32], albedo: Float, positions: Float, normals: Float, rays: Float) -> Float:
-    """Compute the linear light ``[n,3]`` that points reflect or emit towards the camera."""
+    """Compute the linear light ``[n,3]`` that points of shapes ``ids [n]`` reflect or emit towards the camera.
+
+    ``rays`` are unit vectors from the camera to the points.
+    """
     light, shapes = lit.room.light, lit.shapes.shapes
     direct, indirect = _incoming_light(lit, positions, normals)
     gloss = np.array([s.material.gloss for s in shapes], np.float32)[ids]

@@ -212,7 +212,7 @@ def _shrink_lens(lens: Pinhole) -> Pinhole:
 
 
 def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitRoom, PathFunction]:
-    """Draw a room and a path on which all views are usable; after too many tries, return the last ones."""
+    """Draw a room and a path on which all views are usable. After too many tries, return the last room and path."""
     power = int(1.6 * max(lens.width, lens.height)).bit_length() - 1
     side = 2 ** min(max(power, 7), 10)  # of textures, pixels: a power of two near the side of a photo, 128 to 1024
     path_tries, room_tries = 6, 6  # most paths per room, and most rooms

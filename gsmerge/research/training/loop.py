@@ -145,8 +145,8 @@ def _train(
     state = TrainingState(networks, deepcopy(networks).requires_grad_(False), optimizer)
     losses = list[Tensor]()
     hashes = {kind: [shard.sha256 for shard in part] for kind, part in (("data", shards), ("validation", validation))}
-    head = {"options": options.to_dict(), **hashes}
-    step, rows = _load_run(out, state, head)
+    facts = {"options": options.to_dict(), **hashes}
+    step, rows = _load_run(out, state, facts)
     resumed = step
     read = lru_cache(options.buffer)(read_shard)
     while step < options.steps:
@@ -158,18 +158,22 @@ def _train(
             mean = float(torch.stack(losses).mean())
             rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
             losses = []
-            _save_run(out, state, rows, head, options)
+            _save_run(out, state, rows, facts, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
     best_psnr = max(row["psnr_learned"] for row in rows)
     return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], best_psnr, resumed)
 
 
 def _save_run(
-    out: Path, state: TrainingState, rows: Sequence[LossRow], head: Mapping[str, Any], options: TrainOptions
+    out: Path, state: TrainingState, rows: Sequence[LossRow], facts: Mapping[str, Any], options: TrainOptions
 ) -> None:
-    """Write the checkpoints, the table of losses, and the state for resuming the run."""
+    """Write the checkpoints, the table of losses, and the state for resuming the run.
+
+    ``facts`` are options and hashes of the run, which all files but the table contain. The best checkpoint is replaced
+    if the last row has the highest PSNR.
+    """
     figures = {name: value for name, value in rows[-1].items() if name not in ("step", "rate", "loss")}
-    training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **head}
+    training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **facts}
     networks = deepcopy(state.smooth)
     with torch.no_grad():  # checkpoints have the opacity shift in the bias of the heads
         for module in networks.heads.values():
@@ -181,7 +185,7 @@ def _save_run(
     lines = [",".join(rows[0]), *(",".join(f"{value:.8g}" for value in row.values()) for row in rows)]
     with atomic_output(out / "losses.csv", overwrite=True) as temporary:
         temporary.write_bytes("\n".join([*lines, ""]).encode())
-    save_training(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
+    save_training(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **facts})
 
 
 def _load_run(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[LossRow]]:

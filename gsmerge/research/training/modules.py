@@ -56,6 +56,7 @@ class Attention(nn.Module):
     """Multi-head attention from ``x [b,q,w]`` to ``context [b,n,w]`` with ``mask [b,n]``."""
 
     def __init__(self, width: int, heads: int) -> None:
+        """Make the layers for tokens of ``width`` numbers."""
         super().__init__()
         self.heads = heads
         self.query, self.pair, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
@@ -75,6 +76,7 @@ class AttentionBlock(nn.Module):
     """
 
     def __init__(self, width: int, heads: int, *, first_only: bool = False) -> None:
+        """Make the layers for tokens of ``width`` numbers."""
         super().__init__()
         self.first_only = first_only
         self.before, self.between = nn.LayerNorm(width), nn.LayerNorm(width)
@@ -93,6 +95,7 @@ class Pooling(nn.Module):
     """Reduce a set to one token by attention from a learned query (paper fig. architecture: PMA)."""
 
     def __init__(self, width: int, heads: int) -> None:
+        """Make the layers for tokens of ``width`` numbers, and the query."""
         super().__init__()
         self.seed = nn.Parameter(torch.randn(1, 1, width) / width**0.5)
         self.before, self.between = nn.LayerNorm(width), nn.LayerNorm(width)
@@ -111,15 +114,16 @@ class SetNetwork(nn.Module):
     Tokens pass through an MLP, attention blocks and pooling. The result is joined with the group's numbers in an MLP.
     """
 
-    def __init__(self, token: int, out: int, options: NetworkOptions) -> None:
+    def __init__(self, token_width: int, out: int, options: NetworkOptions) -> None:
+        """Make the layers for tokens of ``token_width`` numbers, and a result of ``out`` numbers."""
         super().__init__()
         width, heads = options.width, options.heads
-        self.embed = mlp(token, width, width)
+        self.embed = mlp(token_width, width, width)
         self.blocks = nn.ModuleList(AttentionBlock(width, heads) for _ in range(options.blocks))
         self.pool, self.join = Pooling(width, heads), mlp(width + GROUP_COLUMNS, 2 * width, out)
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
-        """Compute ``[b,out]`` from ``tokens [b,n,token]``, ``mask [b,n]`` and ``group [b,GROUP_COLUMNS]``."""
+        """Compute ``[b,out]`` from ``tokens [b,n,token_width]``, ``mask [b,n]`` and ``group [b,GROUP_COLUMNS]``."""
         x = self.embed(tokens)
         for block in self.blocks:
             x = block(x, mask)
@@ -130,6 +134,7 @@ class Encoder(nn.Module):
     """Network from a group's members to the group's latent and a shift of its mean."""
 
     def __init__(self, options: NetworkOptions) -> None:
+        """Make the layers. An untrained encoder shifts no mean."""
         super().__init__()
         self.set = SetNetwork(MEMBER_COLUMNS, options.width, options)
         self.latent, self.shift = nn.Linear(options.width, options.latent), zero_init(nn.Linear(options.width, 3))
@@ -144,6 +149,7 @@ class Head(nn.Module):
     """Network from a Feature Gaussian and its K analytic children to corrections of the children."""
 
     def __init__(self, slots: int, options: NetworkOptions) -> None:
+        """Make the layers of the head for at most ``slots`` children of a Feature Gaussian."""
         super().__init__()
         self.slots, width = slots, options.width
         self.numbers = list(options.head_numbers)
@@ -163,6 +169,7 @@ class Merger(nn.Module):
     """Network from the Feature Gaussians of a cluster to corrections of the pooled Feature Gaussian and its latent."""
 
     def __init__(self, options: NetworkOptions) -> None:
+        """Make the layers. An untrained merger corrects nothing."""
         super().__init__()
         self.set = SetNetwork(PART_COLUMNS + options.latent, options.width, options)
         self.out = zero_init(nn.Linear(options.width, FEATURE + options.latent))
@@ -176,6 +183,7 @@ class Refiner(nn.Module):
     """Network from a Feature Gaussian and its nearest neighbours to corrections of this Feature Gaussian."""
 
     def __init__(self, options: NetworkOptions) -> None:
+        """Make the layers. The last block computes only the token of the Feature Gaussian itself."""
         super().__init__()
         width, last = options.width, options.refine_blocks - 1
         self.embed = mlp(PART_COLUMNS + 1 + options.latent, width, width)
@@ -198,6 +206,7 @@ class Networks(nn.Module):
     """The torch modules of a checkpoint. A network that the options leave out is None."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
+        """Make the networks that the options ask for, with random weights."""
         super().__init__()
         self.options = chosen = options or NetworkOptions()
         self.encoder = Encoder(chosen) if chosen.encoder else None

@@ -89,7 +89,8 @@ class TrainOptions(Settings):
     seed: int = setting(0, "Seed of all random numbers.", **FROM_0_LIMITS)
 
     def __post_init__(self) -> None:
-        for name in LIST_OPTIONS:  # JSON and TOML have lists
+        """Convert lists to tuples, since JSON and TOML have lists, and check all settings."""
+        for name in LIST_OPTIONS:
             object.__setattr__(self, name, tuple(getattr(self, name)))
         super().__post_init__()
         if self.random_views and (len(self.random_views) != 2 or self.random_views[0] > self.random_views[1]):
