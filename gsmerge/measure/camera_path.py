@@ -58,7 +58,7 @@ def parse_camera_path(text: str) -> CameraPath | None:
     if match is None:
         form = f"{kind}{'[:DEGREES]' if kind == 'orbit' else ''}[,back:SHARE]"
         raise ValueError(f"path: expected {form}, got {text}")
-    max_turn, max_back = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
+    max_turn, max_back = 90.0, 10.0  # largest degrees to each side, and largest share of the depth
     turn = _parse_number(match["turn"], "orbit: expected degrees", max_turn)
     back = _parse_number(match["back"], "back: expected a share of the depth", max_back)
     return CameraPath(kind, turn, back or 0.0)
@@ -138,7 +138,8 @@ def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None)
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)
     offsets = np.abs(matmul(camera_centres(cameras.viewmats) - camera_centres(viewmat), viewmat[:3, :3].T))
-    sines = (lower_median(offsets)[:2] / depth).clip(*np.transpose([HORIZONTAL, VERTICAL]))  # of the default turns
+    # Sines of the default turns
+    sines = (lower_median(offsets)[:2] / depth).clip(*np.transpose([HORIZONTAL, VERTICAL]))
     turns = np.degrees(arctan2(sines, np.sqrt(1 - sines**2))) if turn is None else turn * np.array([1, 0.5])
 
     def turn_middle(angles: np.ndarray) -> np.ndarray:
@@ -221,7 +222,8 @@ def _pieces(knots: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -> np.ndarray:
     """Return the times at which a curve with ``points [m,d]`` at ``times [m]`` has run ``shares`` of its length."""
-    distances = np.concatenate([np.zeros(1), _lengths(np.diff(points, axis=0)).cumsum()])  # along the curve
+    # Distances of the points from the start, along the curve
+    distances = np.concatenate([np.zeros(1), _lengths(np.diff(points, axis=0)).cumsum()])
     return np.interp(shares * distances[-1], distances, times)
 
 

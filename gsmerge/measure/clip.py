@@ -35,7 +35,7 @@ H264 = ("H.264", "libx264", "mp4", (
     "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
 ))  # fmt: skip
 MAX_VIDEO_PIXELS = 1 << 23  # per frame, a little more than 3840 x 2160; encoders take 150 bytes per pixel
-MAX_GIF_PIXELS = 1 << 27  # of all frames together; more take over 400 MB of memory, and give files too large to send
+MAX_GIF_PIXELS = 1 << 27  # in all frames; more take over 400 MB of memory, and make files too large to send
 GIF_SAMPLE = 1 << 20  # approximate number of pixels from which the palette of a GIF is made
 OPENCV = "opencv-contrib-python-headless"
 FOLDER_HINT = "name a folder instead, for one picture a frame"
@@ -54,7 +54,7 @@ class Caption:
         """Draw the caption into a picture."""
         height, width = self.text.shape[:2]
         box = picture[self.top : self.top + height, self.left : self.left + width]
-        text = self.text[: box.shape[0], : box.shape[1]]  # a tiny frame cuts it off
+        text = self.text[: box.shape[0], : box.shape[1]]  # the part inside a tiny frame
         shade, text_level = 0.35, 245  # brightness of the picture behind a caption, and level of its text
         box[:] = (shade * box * (1 - text) + text_level * text).round()
 
@@ -145,7 +145,7 @@ class FfmpegWriter:
     def write(self, frame: np.ndarray) -> None:
         """Add a frame ``[h,w,c]`` in the order blue, green, red."""
         assert self.process.stdin is not None
-        with suppress(BrokenPipeError):  # ffmpeg has ended too early; _check_frames will miss frames
+        with suppress(BrokenPipeError):  # ffmpeg has ended too early, which _check_frames reports
             self.process.stdin.write(np.ascontiguousarray(frame).tobytes())
 
     def release(self) -> None:
@@ -205,7 +205,8 @@ def write_clip(path: StrPath, frames: Iterable[BytePicture], fps: float, *, over
                         written[-1].result()
                     written.append(encoder.submit(encode, frame))
         except BaseException:
-            closing = Thread(target=writer.release, daemon=True)  # takes seconds, although the file is then removed
+            # Closing takes seconds, and need not be waited for, since the file is removed
+            closing = Thread(target=writer.release, daemon=True)
             closing.start()
             if os.name == "nt":  # Windows cannot remove an open file
                 closing.join()
@@ -265,7 +266,7 @@ def _check_frames(path: Path, temporary: Path, count: int) -> None:
             readable += 1
         reader.release()
     if readable != count:
-        os.stat(str(temporary))  # as in _open_writer
+        os.stat(str(temporary))  # if the folder has vanished, this raises an error with the reason
         problem = f"could not be written completely, {readable} of {count} frames can be read"
         raise SceneError(path, problem, "free some space, or write elsewhere")
 

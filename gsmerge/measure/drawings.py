@@ -316,7 +316,7 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     scene = scene if inside else subset(scene, range(len(scene) // 2))
     scene = replace(scene, cameras=fill_cameras(scene.cameras, *PLACED_SIZE))
     placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
-    notes = (placed if text == NO_VIEWS else text for text in record.notes)  # NO_VIEWS speaks of results
+    notes = (placed if text == NO_VIEWS else text for text in record.notes)  # NO_VIEWS is about results
     return replace(load, scene=scene, notes=(*load.notes, *notes))
 
 

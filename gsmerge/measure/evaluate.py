@@ -74,7 +74,7 @@ class ResultScores:
 
     name: str  # as the caller gave it
     num_gaussians: int
-    ratio: float  # of the number of Gaussians to that of the input
+    ratio: float  # number of Gaussians, divided by that of the input
     render_seconds: float  # median wall time of one view with all threads
     scores: tuple[ViewScore, ...]  # one for each view
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty for the input, or if not measured
@@ -306,7 +306,7 @@ def _describe_scores(splits: Mapping[str, _Split], scores: Sequence[ResultScores
         losses = (describe_loss(name, psnrs[INPUT], psnr, OWN_PHOTOS) for name, psnr in psnrs.items())
         yield from (Doubt(loss) for loss in losses if loss is not None)
     yield from filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog))
-    min_seen_share = 0.1  # if the input views have seen less of the held-out views, these may be in another world
+    min_seen_share = 0.1  # if the input views have seen a smaller share of the held-out views, worlds may differ
     if "target" not in splits:
         yield "no held-out views were given; on input views, fitted results score better than on new views"
     elif (share := splits["target"].visible.mean()) < min_seen_share:
@@ -326,7 +326,7 @@ def _make_splits(
     """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
-    sources = scene.cameras if scene.has_own_pixels else cameras  # the points come from the pixels of these cameras
+    sources = scene.cameras if scene.has_own_pixels else cameras  # cameras whose pixels give the points
     points = context_points(scene, renderer.near, sources)
 
     def make_split(views: Views, words: str, masks: np.ndarray | None = None) -> _Split:

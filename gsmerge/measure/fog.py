@@ -27,7 +27,7 @@ VIEWS = 3  # evenly spread input views from which the cameras start
 # Cameras by kind. Each steps back from an input view, by a share of the view's median depth. Then it turns about the
 # point in the view's middle, by degrees
 FOG_CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
-ALL = "all"  # name for all these cameras together
+ALL = "all"  # kind that stands for all of these cameras
 FOG_PIXELS = 480  # longer side of the pictures is at most this, pixels
 # Opacities. The input is empty below FOG_EMPTY and solid above FOG_SOLID. A solid pixel of the input is a hole of a
 # result whose opacity is below FOG_OPEN there

@@ -58,7 +58,7 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
         seen = hit > 0
         side = _choose_mark_side(Ks[view], sources)
-        first = len(points) * view // len(cameras)  # here the view's own points begin in most scenes; they mark most
+        first = len(points) * view // len(cameras)  # in most scenes the view's own points begin here
         for start in (*range(first, len(points), _CHUNK), *range(0, first, _CHUNK)):
             mark_pixels(points[start : start + _CHUNK], viewmats[view], Ks[view], near, hit)
             seen = cv2.dilate(hit, np.ones((side, side), np.uint8)) > 0

@@ -56,7 +56,7 @@ class PageView:
     name: str
     place: int  # index among all views, of which the input views are first
     held_out: bool
-    camera: Cameras  # one, in the page's frame
+    camera: Cameras  # one camera, in the page's frame
     distance: float  # median depth of the scene, in units of that frame
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side

@@ -45,7 +45,7 @@ def view_page(data: ViewData) -> bytes:
     start_stills[left] = start_stills[right] = None  # the page holds these two stills once
 
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
-    result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # sides that are results; a single scene is one
+    result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # the results, or the scene if it is alone
     results = [_result_entry(data, i) for i in result_ids]
     by_size = sorted(result_ids, key=lambda i: data.sides[i].num_gaussians)
     own = reference_words(data)[1]

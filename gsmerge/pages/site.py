@@ -26,7 +26,7 @@ SITE_POLICY = (
     "default-src 'none'; img-src data:; style-src {style}; script-src {script} blob: 'wasm-unsafe-eval';"
     " worker-src data: blob:; connect-src data: blob:"
 )
-NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}  # of the files in the page
+NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}  # of files in the page
 MAX_VIEWPOINTS = 64  # largest number of viewpoints in the page
 LICENSED = ("spark", "three", "fflate")  # parts of the viewer that have a licence
 

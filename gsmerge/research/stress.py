@@ -30,7 +30,7 @@ from gsmerge.types import SH_C0, Gaussians, Scene, Views
 Needs = Literal["anything", "pixels", "photos"]
 Check = Literal["better", "same", "near", "once", "again"]
 
-UTM = (4.0e5, 5.0e6, 100.0)  # metres, as in map coordinates
+UTM = (4.0e5, 5.0e6, 100.0)  # shift in metres, as large as coordinates of maps
 
 PROPERTIES: dict[Check, str] = {  # of the result
     "better": "not more than {worse:g} dB below its own input",
@@ -43,7 +43,7 @@ PROPERTIES: dict[Check, str] = {  # of the result
 SEED = 7  # seed of all random choices
 MAX_WORSE = 0.1  # dB by which a result may be below its input
 MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that the result of a changed scene may lose compared with the unchanged scene
-SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # of counts: largest relative difference for "same", largest ratio for "once"
+SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference of counts for "same", and largest ratio for "once"
 _QUICK = EvaluateOptions(lpips=(), fog=False)
 
 
@@ -63,7 +63,8 @@ def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> St
 def scale_and_shift(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
     """Scale the world by ``factor``, then shift it by ``shift`` times the size that the scene has after scaling."""
     scene, views = setup.scene, setup.views
-    frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)  # leaving it moves the scene
+    # The scene is moved from this frame to the world
+    frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)
     scene = replace(scene, gaussians=frame.leave(scene.gaussians), cameras=frame.leave_cameras(scene.cameras))
     return StressScene(scene, views and replace(views, cameras=frame.leave_cameras(views.cameras)))
 

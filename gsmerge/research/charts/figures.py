@@ -31,8 +31,8 @@ LINE_COLORS = (
     "#7B4173",
     "#8C6D31",
 )  # Okabe, Ito 2008
-MARKERS = "osD^vPX"  # their number is coprime to the number of colours
-DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # each cycle through the colours takes the next dash
+MARKERS = "osD^vPX"  # 7 markers and 8 colours, so each pair of both comes once in 56 lines
+DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # the first 8 lines have the first dash, and so on
 RC: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.grid": True,

@@ -61,7 +61,7 @@ class Point:
     """Values of one method at one size over all scenes."""
 
     label: str  # size
-    x: float  # mean cost over the scenes (geometric)
+    x: float  # geometric mean of the cost over the scenes
     y: Interval  # mean quality with its interval
     by_scene: ByScene
 

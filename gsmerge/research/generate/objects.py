@@ -172,12 +172,12 @@ def build_plant(pal: Palette, height: float, leaves: int) -> Shapes:
 
 def random_rotation(rng: np.random.Generator) -> Array:
     """Draw a random rotation ``[3,3]``."""
-    first, second, third = rng.normal(size=(3, 3)).T  # Gram and Schmidt's
+    first, second, third = rng.normal(size=(3, 3)).T
     x = first / norm(first)
     y = second - (x * second).sum() * x
     y /= norm(y)
     z = np.cross(x, y)
-    sign = 1.0 if (z * third).sum() > 0 else -1.0  # an axis of a left-handed set is reversed
+    sign = 1.0 if (z * third).sum() > 0 else -1.0  # axes of Gram and Schmidt that are left-handed are all reversed
     return np.stack([sign * x, sign * y, z], 1)
 
 

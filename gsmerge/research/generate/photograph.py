@@ -21,7 +21,7 @@ from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, half_siz
 from gsmerge.research.generate.textures import Texture, make_mipmaps
 
 NO_SURFACE_DEPTH = 1e6  # depth of pixels without a surface, metres
-SAMPLE_RAYS = 2  # rays per pixel and axis for the colours; depth is measured at the pixel's centre
+SAMPLE_RAYS = 2  # rays per pixel and axis for colours; depth has one ray through the pixel's centre
 KEY_MAPS, KEY_SIZE = 5, 640  # number of shadow maps of the direct light, for soft shadows, and their side in pixels
 AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # number and side of the shadow maps of the light from all sides
 GLOW = 0.7  # brightness of glowing shapes, relative to a white wall in full light
@@ -111,11 +111,11 @@ def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
     corners = matmul(half[:, None] * signs, shapes.rotations.swapaxes(1, 2)) + shapes.centres[:, None]
     local = matmul(corners - c2w[:3, 3], c2w[:3, :3])
-    # Corners whose numbers differ in one bit share an edge
+    # The numbers of two corners of an edge differ in one bit
     edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
     near_plane = 1e-3  # depth in metres at which edges that reach behind the camera are cut
-    with np.errstate(divide="ignore", invalid="ignore"):  # edges that are parallel to the plane do not cross it
+    with np.errstate(divide="ignore", invalid="ignore"):  # edges parallel to the plane are not used
         crossing = a + (b - a) * ((near_plane - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
     crosses = (a[..., 2] < near_plane) != (b[..., 2] < near_plane)
     points = np.concatenate([local, np.where(crosses[..., None], crossing, 0.0)], 1)
@@ -193,7 +193,7 @@ def texture_coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Flo
     """
     kinds, half = shapes.kinds[ids], shapes.sizes[ids, :3].astype(np.float32)
     x, y, z = points.T
-    share_x, share_y, share_z = (np.abs(points) / np.maximum(half, 1e-9)).T  # the largest one is the axis of a face
+    share_x, share_y, share_z = (np.abs(points) / np.maximum(half, 1e-9)).T  # 1 on a face across this axis
     is_round = (kinds == ELLIPSOID) | (kinds == BLOB) | ((kinds == CONE) & (share_y < 1 - 1e-5))
     radius = np.maximum(half[:, 0], half[:, 2])
     is_side = (kinds == BOX) & (share_x >= share_y) & (share_x >= share_z)  # faces across x
@@ -264,7 +264,7 @@ def _reflect(lit: LitRoom, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens
     rays = rotate(np.concatenate([slopes, np.ones((len(slopes), 1))], 1), c2w[:3, :3])  # with the depth 1
     positions = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
     directions = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    min_cosine = 0.1  # bounds the size of a sample on a surface, which would grow without end at grazing angles
+    min_cosine = 0.1  # at smaller cosines, that is at grazing angles, a sample would cover too much of a surface
     cosine = np.maximum(-(normals * directions).sum(1), min_cosine)
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
     gamma = 2.2  # exponent from sRGB to linear light
@@ -276,7 +276,7 @@ def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Flo
     """Compute the direct and the ambient light ``[n]`` that arrives at points, with shadows."""
     light, half_side = lit.room.light, lit.radius
     direct, indirect = np.zeros((2, len(positions)), np.float32)
-    key_texels, ambient_texels = 2.0, 1.2  # by which a surface may lie behind its shadow map's depth and be lit
+    key_texels, ambient_texels = 2.0, 1.2  # texels by which a lit surface may lie behind the shadow map's depth
     key_bias, ambient_bias = key_texels * 2 * half_side / KEY_SIZE, ambient_texels * 2 * half_side / AMBIENT_SIZE
     key_axes, ambient_axes = lit.axes[:KEY_MAPS], lit.axes[KEY_MAPS:]
     equal = np.full(KEY_MAPS, 1 / KEY_MAPS)

@@ -18,7 +18,7 @@ Vector: TypeAlias = Sequence[float] | Array  # of length 3
 Pair: TypeAlias = tuple[float, float]
 NUM_WAVES = 4  # number of waves that bend the surface of a shape
 NO_WAVES = np.zeros((NUM_WAVES, 5))  # waves with the amplitude 0, for a smooth surface
-TAPER, AMPLITUDE = 3, 4  # column of the taper in a shape's size, and of the amplitude in its waves
+TAPER, AMPLITUDE = 3, 4  # columns: the taper in a shape's size, and the amplitude in its waves
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def ball(centre: Vector, radii: Vector, material: Material) -> Shape:
 def column(foot: Vector, height: float, radius: float, material: Material, *, top: float = 1.0) -> Shape:
     """Make an upright cylinder or cone on the point ``foot``. Its top radius is ``top`` times ``radius``."""
     x, y, z = foot
-    size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel takes the radii at -y, which is up
+    size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel takes the radii of the top, which is at -y
     return Shape(CONE, size, material, np.array([x, y - height / 2, z]))
 
 

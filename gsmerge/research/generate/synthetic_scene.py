@@ -37,7 +37,7 @@ from gsmerge.settings.setting import Settings, setting
 from gsmerge.types import Cameras, Gaussians
 
 FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
-SWING = 35  # largest angle between -z and a camera, seen from the focus, degrees
+SWING = 35  # largest angle, at the focus, between -z and the direction to a camera, degrees
 CAMERA_HEIGHTS = 0.9, 1.8  # range of the height of cameras above the ground, metres
 PathFunction = Callable[[float], Array]  # from a position along the path, 0 to 1, to a camera-to-world matrix [4,4]
 
@@ -67,7 +67,7 @@ def draw_path(room: Room, rng: np.random.Generator, num_views: int) -> PathFunct
     start = rng.uniform(-SWING, SWING - span)
     distance, height = rng.uniform(*room.distance), rng.uniform(*CAMERA_HEIGHTS)
     sway = rng.uniform(0, 0.4) * (CAMERA_HEIGHTS[1] - CAMERA_HEIGHTS[0])  # largest change of the height, metres
-    phase, growth = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)  # of the sway; of the distance along the path
+    phase, growth = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)  # phase of the sway, growth of the distance
 
     def pose(s: float) -> Array:
         """Return the camera-to-world matrix at a position along the path, 0 to 1."""
@@ -207,14 +207,14 @@ def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoS
 
 def _shrink_lens(lens: Pinhole) -> Pinhole:
     """Return a smaller camera for previews. They show if views are usable, and how bright they are."""
-    divisor = 8  # divides the sides of views
+    divisor = 8  # the sides of previews are those of views divided by this
     return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
 
 def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitRoom, PathFunction]:
     """Draw a room and a path on which all views are usable. After too many tries, return the last room and path."""
     power = int(1.6 * max(lens.width, lens.height)).bit_length() - 1
-    side = 2 ** min(max(power, 7), 10)  # of textures, pixels: a power of two near the side of a photo, 128 to 1024
+    side = 2 ** min(max(power, 7), 10)  # side of textures, pixels: a power of two near the photo's side
     path_tries, room_tries = 6, 6  # most paths per room, and most rooms
     for _ in range(room_tries):
         lit = light_room(build_room(Palette(rng, side)))
@@ -233,7 +233,7 @@ def _take_photo(lit: LitRoom, pose: Array, lens: Pinhole, noise: Noise, gain: fl
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     square_radius = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
-    vignette = 0.3  # loss of light at a distance of one diagonal from the middle of a photo; grows with its square
+    vignette = 0.3  # share of light lost at one diagonal from the middle; it grows with the squared distance
     linear = linear * gains.astype(np.float32) * (1 - vignette * square_radius)[..., None].astype(np.float32)
     image = blur(tone_map(linear), noise.blur)
     sensor_noise = 0.004  # standard deviation of the noise of a photo, sRGB

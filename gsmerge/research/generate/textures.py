@@ -257,7 +257,7 @@ def draw_bark(rng: np.random.Generator, size: int) -> Texture:
 def draw_foliage(rng: np.random.Generator, size: int) -> Texture:
     """Draw one leaf: veins from a middle rib."""
     base = draw_color(rng, hue=(0.2, 0.38), strength=(0.4, 0.85), light=(0.2, 0.6))
-    if rng.random() < 0.25:  # petals
+    if rng.random() < 0.25:  # a petal instead
         base = draw_color(rng, hue=(0.8, 1.12), strength=(0.4, 0.9), light=(0.6, 0.95))
     low, high = draw_shades(rng, base, 0.45)
     x, y = pixel_places(size)

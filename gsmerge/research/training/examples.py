@@ -40,7 +40,7 @@ from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Pixels
 class ColorMap:
     """A linear change of colours that is applied to a scene and its photos."""
 
-    order: tuple[int, ...] = (0, 1, 2)  # source channel of each channel
+    order: tuple[int, ...] = (0, 1, 2)  # for each channel, the old channel from which it is taken
     gain: float = 1.0  # factor; negative if colours are inverted
     offset: float = 0.0  # added after the gain, sRGB in [0, 1]
 
@@ -61,7 +61,7 @@ class Example:
     name: str  # name of the scene
     unit: float  # unit of length of the scene, the median depth of the Feature Gaussians, in canonical units
     members: Members  # the Gaussians of v views
-    cameras: Cameras  # these views
+    cameras: Cameras  # cameras of these v views
     features: FeatureGaussians  # g analytic Feature Gaussians before merging
     base: Gaussians  # g Gaussians, one for each Feature Gaussian
     photos: Photos  # p photos without colours: first those of the views, then those of novel views

@@ -38,7 +38,8 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 
 VALIDATION = 2**32  # replaces the step in the seed of the random numbers of validation
 LossRow = dict[str, float]  # a row of the table of losses, by column
-Scores = list[tuple[float, float, float]]  # of each window: PSNR (dB) without and with networks, share merged
+# For each window: PSNR (dB) without and with networks, and share of merged Feature Gaussians
+Scores = list[tuple[float, float, float]]
 OnTrainingStep = Callable[[int, int, float], None]  # called with step, number of steps, loss
 RUN_FORMAT = "gsmerge-training"
 RUN_REMEDY = "choose another --output, or remove it to start again"
@@ -233,7 +234,8 @@ def _take_step(
     for group in state.optimizer.param_groups:
         group["lr"] = options.rate_at(step)
     state.optimizer.step()
-    share = min(options.average, (1 + step) / (10 + step))  # less at first, so that the start is soon forgotten
+    # The share is small at first, so that the mean forgets the first weights soon
+    share = min(options.average, (1 + step) / (10 + step))
     with torch.no_grad():
         for _, parameter, smooth in state.pairs():
             smooth.lerp_(parameter, 1 - share)

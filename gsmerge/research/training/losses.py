@@ -169,7 +169,7 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     cosines = (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
     angles = torch.atan2(
         (skew_vectors(rotations).square().sum(1) + 1e-12).sqrt(), cosines
-    )  # finite gradients at 0, too
+    )  # the gradient is also finite at 0
     sizes = gaussian_sizes(scales)
     distances = (g.means - teacher.means).abs() / sizes[:, None]
     stretches = (torch.log(g.scales) - torch.log(scales)).abs()

@@ -214,7 +214,7 @@ class Networks(nn.Module):
         self.refiner = Refiner(chosen) if chosen.refiner else None
         self.heads = nn.ModuleDict({str(slots): Head(slots, chosen) for slots in SLOTS})
 
-    in_parallel = False  # tables of groups run one after another, because gradients are recorded
+    in_parallel = False  # gradients are recorded, so tables of groups have to run one after another
 
     def run(self, name: str, *inputs: Array) -> Tensor:
         """Run the module ``name`` like :meth:`NetworkWeights.run`, with gradients."""

@@ -46,7 +46,7 @@ from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take_features
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 from gsmerge.values.arrays import Array, as_array, as_tensor
 
-TINY = 1e-12  # world units
+TINY = 1e-12  # least length whose logarithm is taken, world units
 CONSTANT = slice(6, 8)  # columns of ``group`` without a gradient: log of the number of members, and their mean weight
 
 
@@ -193,7 +193,7 @@ def move_feature_tensors(group_features: GroupFeatures, residuals: Tensor) -> Fe
     stretches = torch.eye(3) + (axes * torch.expm1(log_stretches)[:, None]) @ axes.transpose(1, 2)
     changes = rotations @ stretches
     covars = changes @ f.covars @ changes.transpose(1, 2)
-    log_areas = log_stretches[:, 1] + log_stretches[:, 2]  # of the change of the disc of the two largest scales
+    log_areas = log_stretches[:, 1] + log_stretches[:, 2]  # change of the area of the two largest scales
     return replace(
         f,
         means=f.means + rotate_vectors(g.frames, residuals[:, MEAN_COLUMNS] * gaussian_sizes(g.base.scales)[:, None]),
@@ -325,7 +325,7 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
     example = crop.example
     context = TrainingContext(networks, example.members, example.cameras, seed)
     encoded = context.encode(features_to_tensors(take_features(example.features, crop.rows)))
-    encoded = replace(encoded, latents=as_tensor(encoded.latents))  # they are an array if there is no encoder
+    encoded = replace(encoded, latents=as_tensor(encoded.latents))  # without an encoder they are an array of zeros
     matches = match(features_to_arrays(encoded), options.match_options())
     refined = context.refine(_merge(encoded, matches, context))
     return RefinedCrop(context, context.describe(refined), matches)

@@ -35,7 +35,7 @@ EXAMPLE_FORMAT = "gsmerge-example"
 EXAMPLE_REMEDY = "remove it; the next call makes it again"
 # Settings of which an example is made, besides its views
 EXAMPLE_SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
-STORED_PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}  # whose fields are all arrays
+STORED_PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}  # all their fields are arrays
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def scene_key(scene: Path, options: TrainOptions) -> str:
     head |= {name: getattr(options, name) for name in EXAMPLE_SETTINGS}
     files = find_scene_files(scene)
     targets = files.ply.parent / "targets"
-    # Held-out photos have a hash of their own, because the names in a hash are relative to the folder
+    # Held-out photos get a hash of their own, because a hash contains names relative to one folder
     held_out = content_hash([targets]) if targets.is_dir() else None
     return digest({**head, "content": content_hash(list_files(files)), "held_out": held_out})
 
@@ -118,7 +118,7 @@ def write_shard(path: Path, example: Example) -> str:
     with atomic_output(path, overwrite=True) as temporary:
         temporary.write_bytes(
             save(arrays, {EXAMPLE_FORMAT: json.dumps(facts)})
-        )  # save_file would change the file's mode
+        )  # ``save_file`` would change the rights of the file
     return str(facts["sha256"])
 
 

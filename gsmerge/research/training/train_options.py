@@ -174,7 +174,7 @@ PAPER: Mapping[str, Any] = {
 SHIPPED_TRAINING: Mapping[str, Any] = {
     "encoder": False,
     "merger": False,
-    "color": 0.0,  # the bound of corrections
+    "color": 0.0,  # bound of the corrections of colour
     "recolor": True,
     "views": (3, 0),
     "steps": 2_600,

@@ -22,7 +22,7 @@ class Crop:
     """A subset of an example's Feature Gaussians, which are decoded into K children each."""
 
     example: Example
-    k: int  # K
+    k: int  # number of children of each Feature Gaussian
     rows: np.ndarray  # [r] rows of the example's Feature Gaussians, ascending
 
 
@@ -89,7 +89,7 @@ def sample_window(
     height, width = example.images.shape[1:3]
     w, h = min(side, width), min(side, height)
     left, top = max(0, pixel % width - w // 2), max(0, pixel // width - h // 2)
-    box = Box(min(left, width - w), min(top, height - h), w, h)  # moved inside the photo
+    box = Box(min(left, width - w), min(top, height - h), w, h)  # moved so that it lies inside the photo
     rows = _reaching_rows(example, photo, box)
     while len(rows) > most and box.halved() != box:
         box = box.halved()
