@@ -167,9 +167,8 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     scales = (scales[:, None] @ orders.abs())[:, 0]
     rotations = quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats) @ orders
     cosines = (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
-    angles = torch.atan2(
-        (skew_vectors(rotations).square().sum(1) + 1e-12).sqrt(), cosines
-    )  # the gradient is also finite at 0
+    # The small number makes the gradient finite at an angle of 0
+    angles = torch.atan2((skew_vectors(rotations).square().sum(1) + 1e-12).sqrt(), cosines)
     sizes = gaussian_sizes(scales)
     distances = (g.means - teacher.means).abs() / sizes[:, None]
     stretches = (torch.log(g.scales) - torch.log(scales)).abs()

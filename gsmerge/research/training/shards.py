@@ -116,9 +116,8 @@ def write_shard(path: Path, example: Example) -> str:
     facts = {"layout": LAYOUT, "sha256": hash_arrays(arrays), "unit": example.unit, "eps2d": example.photos.eps2d}
     facts |= {"size": [example.cameras.width, example.cameras.height]}
     with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(
-            save(arrays, {EXAMPLE_FORMAT: json.dumps(facts)})
-        )  # ``save_file`` would change the rights of the file
+        # ``save_file`` would change the rights of the file
+        temporary.write_bytes(save(arrays, {EXAMPLE_FORMAT: json.dumps(facts)}))
     return str(facts["sha256"])
 
 
