@@ -440,6 +440,7 @@ def _add_lpips(
         return replace(quality, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in fitting})
 
     full = add(pair[0], None)
+    # Without seen pixels there is no LPIPS over them
     return full, full if seen.all() else add(pair[1], seen) if seen.any() else pair[1]
 
 

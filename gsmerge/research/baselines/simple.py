@@ -31,7 +31,8 @@ def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Run the full fit on the unmerged input, with as many steps or as much time as gsmerge's own fit has.
 
-    The fit replaces Gaussians that no photo shows by new ones, so the number of Gaussians stays. ``count`` is ignored.
+    The result shows what the fit gains without a merge. The fit replaces Gaussians that no photo shows by new ones, so
+    the number of Gaussians stays. ``count`` is ignored.
     """
     gaussians = prepared.scene.file_gaussians
     start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")

@@ -50,6 +50,7 @@ def build_table(pal: Palette, width: float, depth: float, height: float) -> Shap
 def build_chair(pal: Palette) -> Shapes:
     """Build a chair with a slatted or closed back."""
     rng, seat, wood = pal.rng, pal.material("cloth", "wood", "plain"), pal.material("wood", "plain")
+    # Width and height of the seat, and height of the back
     w, h, back = rng.uniform(0.38, 0.5), rng.uniform(0.42, 0.5), rng.uniform(0.8, 1.05)
     out = [box((-w / 2, -h, -w / 2), (w / 2, 0.05 - h, w / 2), seat)]
     for x in (-w / 2 + 0.02, w / 2 - 0.02):

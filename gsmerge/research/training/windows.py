@@ -86,10 +86,11 @@ def sample_window(
     k = levels[int(rng.integers(len(levels)))]
     photo, pixels = _choose_photo(example, novel, rng)
     pixel = int(pixels[rng.integers(len(pixels))]) if len(pixels) else 0
-    height, width = example.images.shape[1:3]
-    w, h = min(side, width), min(side, height)
-    left, top = max(0, pixel % width - w // 2), max(0, pixel // width - h // 2)
-    box = Box(min(left, width - w), min(top, height - h), w, h)  # moved so that it lies inside the photo
+    photo_height, photo_width = example.images.shape[1:3]
+    width, height = min(side, photo_width), min(side, photo_height)
+    left, top = max(0, pixel % photo_width - width // 2), max(0, pixel // photo_width - height // 2)
+    # The box is moved so that it lies inside the photo
+    box = Box(min(left, photo_width - width), min(top, photo_height - height), width, height)
     rows = _reaching_rows(example, photo, box)
     while len(rows) > most and box.halved() != box:
         box = box.halved()
