@@ -197,7 +197,9 @@ class Totals:
 
         rows = [TABLE_HEADER, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
         lines = (
-            text_table(rows, columns=columns, least=list(map(TABLE_HEADER.index, OMITTED_FIRST))) if self.rows else []
+            text_table(rows, letters=columns, omitted_first=list(map(TABLE_HEADER.index, OMITTED_FIRST)))
+            if self.rows
+            else []
         )
         lines += [f"... and {self.counts[DONE] - len(self.rows):,} more"] * (self.counts[DONE] > len(self.rows))
         for name, (word, noun) in REASONS.items():

@@ -25,8 +25,8 @@ from gsmerge.types import Cameras
 PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
 CURVE_PIECES = 64  # straight pieces of a curve between two cameras, along which its length is measured
 ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
-# Least and largest extent of an orbit to each side, and up and down, as shares of the distance to its centre. With the
-# least, a scene of a single photo still looks right. The largest turns the view by 14 degrees to each side
+# Least and largest extent of an orbit, to each side and upwards, as shares of the distance to its centre. The least
+# shows few of the gaps in a scene of a single photo. The largest turns the view by 14 degrees to each side
 HORIZONTAL, VERTICAL = (0.06, 0.25), (0.03, 0.125)
 
 
@@ -37,7 +37,7 @@ class CameraPath:
     Args:
         kind: "orbit" or "spline".
         turn: Degrees that an orbit turns to each side; None: chosen from the scene's cameras, see :func:`orbit`.
-        back: Distance behind the path, as a share of the viewing depth.
+        back: How far all cameras of the path step back, as a share of the depth of what they look at.
     """
 
     kind: str
@@ -46,7 +46,7 @@ class CameraPath:
 
 
 def parse_camera_path(text: str) -> CameraPath | None:
-    """Parse a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``; None for a file name.
+    """Parse a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``. Returns None for the name of a file.
 
     Raises:
         ValueError: If the text begins with the kind of a path but is no path, or if a number is out of range.
@@ -58,14 +58,17 @@ def parse_camera_path(text: str) -> CameraPath | None:
     if match is None:
         form = f"{kind}{'[:DEGREES]' if kind == 'orbit' else ''}[,back:SHARE]"
         raise ValueError(f"path: expected {form}, got {text}")
-    max_turn, max_back = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
+    max_turn, max_back = 90.0, 10.0  # largest degrees to each side, and largest share of the depth
     turn = _parse_number(match["turn"], "orbit: expected degrees", max_turn)
     back = _parse_number(match["back"], "back: expected a share of the depth", max_back)
     return CameraPath(kind, turn, back or 0.0)
 
 
 def _parse_number(text: str | None, expected: str, most: float) -> float | None:
-    """Parse a number above 0 and at most ``most``; None without a text. ValueError for others, as ``expected`` says."""
+    """Parse a number above 0 and at most ``most``. Returns None if there is no text.
+
+    Raises ValueError for any other text. ``expected`` describes the number in the message.
+    """
     if text is None:
         return None
     try:
@@ -81,8 +84,8 @@ def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) ->
     """Make the ``count`` cameras of a path, which leads through the cameras of a scene or around their middle.
 
     Args:
-        path: Kind of the path, and its distance from the cameras.
-        cameras: c >= 1 cameras of the scene; a spline passes them in this order.
+        path: Kind and size of the path.
+        cameras: At least one camera of the scene; a spline passes the cameras in this order.
         depth: Distance of the surfaces that the cameras show, see :func:`viewing_depth`.
         count: Number of frames.
 
@@ -106,8 +109,8 @@ def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
 def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]:
     """Make a camera outside the capture: turn the middle camera about a point in front of it, and step back.
 
-    The point is at the depth of ``means [n,3]``. Returns the camera, which is one of those of
-    :mod:`gsmerge.measure.fog`, and its distance from the point in world units.
+    The point is at the median depth of the ``means [n,3]``. Returns the camera, and its distance from the point in
+    world units. The fog of a result is measured from such cameras as well, see :mod:`gsmerge.measure.fog`.
     """
     back, turn = FOG_CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
@@ -116,7 +119,7 @@ def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]
 
 
 def viewing_depth(cameras: Cameras, means: np.ndarray) -> float:
-    """Return the median depth, in world units, of those of the points ``means [n,3]`` that the middle camera shows."""
+    """Return the median depth, in world units, of the ``means [n,3]`` that the middle camera shows."""
     return middle_depth(means, cameras[[median_camera(cameras)]])
 
 
@@ -135,17 +138,18 @@ def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None)
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)
     offsets = np.abs(matmul(camera_centres(cameras.viewmats) - camera_centres(viewmat), viewmat[:3, :3].T))
+    # Sines of the default turns
     sines = (lower_median(offsets)[:2] / depth).clip(*np.transpose([HORIZONTAL, VERTICAL]))
     turns = np.degrees(arctan2(sines, np.sqrt(1 - sines**2))) if turn is None else turn * np.array([1, 0.5])
 
     def turn_middle(angles: np.ndarray) -> np.ndarray:
         """Return the viewmats ``[n,4,4]`` at angles along the loop."""
-        vectors = turns * np.stack([sin(angles), cos(angles)], 1)
-        return np.stack([step_outside(viewmat, depth, 0, *vector) for vector in vectors])
+        degrees = turns * np.stack([sin(angles), cos(angles)], 1)  # [n,2] to the side, and up
+        return np.stack([step_outside(viewmat, depth, 0, *side_and_up) for side_and_up in degrees])
 
     angles = np.linspace(0, 2 * np.pi, ORBIT_PIECES + 1)
-    even = _at_equal_steps(camera_centres(turn_middle(angles)), angles, np.arange(count) / count)
-    return replace(cameras[[middle] * count], viewmats=turn_middle(even))
+    even_angles = _at_equal_steps(camera_centres(turn_middle(angles)), angles, np.arange(count) / count)
+    return replace(cameras[[middle] * count], viewmats=turn_middle(even_angles))
 
 
 def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
@@ -153,30 +157,31 @@ def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
 
     Frames are evenly spaced. A rotation counts as the distance by which it moves a point that is ``depth`` away. The
     curve is a centripetal Catmull-Rom spline (Barry and Goldman 1988) of positions and quaternions. Intrinsics change
-    linearly. ValueError if there are fewer than two different cameras.
+    linearly. Raises ValueError if there are fewer than two different cameras.
     """
-    rows, distinct = _pose_rows(cameras, depth)
-    origin, rows, Ks = rows[0, :3].copy(), rows[distinct], cameras.Ks[distinct].astype(np.float64)
-    if len(rows) < 2:
+    poses, is_new = _pose_rows(cameras, depth)
+    origin, poses, Ks = poses[0, :3].copy(), poses[is_new], cameras.Ks[is_new].astype(np.float64)
+    if len(poses) < 2:
         raise ValueError("spline: expected at least 2 different cameras, got 1; use an orbit, which needs one")
-    rows[:, :3] -= origin
-    knots = np.concatenate([np.zeros(1), np.sqrt(_lengths(np.diff(rows, axis=0))).cumsum()])
-    fine = np.interp(np.arange(CURVE_PIECES * (len(rows) - 1) + 1) / CURVE_PIECES, np.arange(len(rows)), knots)
-    times = _at_equal_steps(_curve(rows, knots, fine, depth), fine, np.arange(count) / (count - 1))
-    poses = _curve(rows, knots, times, depth)
-    rotations = quat_to_rotmat(poses[:, 3:]).swapaxes(1, 2)
+    poses[:, :3] -= origin
+    knots = np.concatenate([np.zeros(1), np.sqrt(_lengths(np.diff(poses, axis=0))).cumsum()])
+    fine_times = np.interp(np.arange(CURVE_PIECES * (len(poses) - 1) + 1) / CURVE_PIECES, np.arange(len(poses)), knots)
+    fine_poses = _curve(poses, knots, fine_times, depth)
+    times = _at_equal_steps(fine_poses, fine_times, np.arange(count) / (count - 1))
+    path_poses = _curve(poses, knots, times, depth)
+    rotations = quat_to_rotmat(path_poses[:, 3:]).swapaxes(1, 2)
     pieces, shares = _pieces(knots, times)
-    shares = shares[:, None, None]
-    path_Ks = (1 - shares) * Ks[pieces] + shares * Ks[pieces + 1]
-    return replace(cameras, viewmats=_viewmats(rotations, origin + poses[:, :3]), Ks=path_Ks)
+    weights = shares[:, None, None]
+    path_Ks = (1 - weights) * Ks[pieces] + weights * Ks[pieces + 1]
+    return replace(cameras, viewmats=_viewmats(rotations, origin + path_poses[:, :3]), Ks=path_Ks)
 
 
 def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
     """Return poses as rows ``[c,7]``, and a mask ``[c]`` of the poses that differ from the one before.
 
-    The distance of two rows measures how much their poses differ. A row has the camera's position, and its quaternion
-    times twice the depth, so that a small rotation changes a row by the angle times the depth. Of the two signs of a
-    quaternion, the one nearer to the row before is used.
+    The distance of two rows measures how much their poses differ. A row has the camera's position, and the camera's
+    quaternion times twice the depth. So a small rotation changes a row by the angle times the depth. A quaternion has
+    the sign with which it is nearer to the row before.
     """
     quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64).swapaxes(1, 2))
     opposite = (quats[1:] * quats[:-1]).sum(1) < 0
@@ -188,7 +193,10 @@ def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float) -> np.ndarray:
-    """Return the poses ``[m,7]`` at ``times`` of the spline that passes ``rows [c,7]`` at the times ``knots [c]``."""
+    """Evaluate a spline that passes the poses ``rows [c,7]`` at the times ``knots [c]``.
+
+    Returns its poses ``[m,7]`` at ``times [m]``.
+    """
     steps = np.diff(knots)[:, None]
     slopes = np.diff(rows, axis=0) / steps
     inner = (steps[1:] * slopes[:-1] + steps[:-1] * slopes[1:]) / (steps[1:] + steps[:-1])
@@ -203,15 +211,19 @@ def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float)
 
 
 def _pieces(knots: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the piece ``[m]`` of a spline that contains each time, and the place ``[m]`` within the piece, 0 to 1."""
+    """Find the piece of a spline that contains each of the ``times [m]``.
+
+    Returns the pieces ``[m]``, and the times ``[m]`` as shares of their piece's duration, 0 to 1.
+    """
     pieces = np.searchsorted(knots, times, side="right") - 1
     pieces = pieces.clip(0, len(knots) - 2)
     return pieces, (times - knots[pieces]) / np.diff(knots)[pieces]
 
 
 def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return when a curve with ``points [m,d]`` at ``times [m]`` has reached the given ``shares`` of its length."""
-    distances = np.concatenate([np.zeros(1), _lengths(np.diff(points, axis=0)).cumsum()])  # along the curve
+    """Return the times at which a curve with ``points [m,d]`` at ``times [m]`` has run ``shares`` of its length."""
+    # Distances of the points from the start, along the curve
+    distances = np.concatenate([np.zeros(1), _lengths(np.diff(points, axis=0)).cumsum()])
     return np.interp(shares * distances[-1], distances, times)
 
 

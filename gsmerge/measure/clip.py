@@ -27,16 +27,15 @@ from gsmerge.settings.pictures import GIF
 from gsmerge.types import StrPath
 
 # Code and name of the encoders for each ending. The first one that OpenCV has is used. Browsers play all but MPEG-4.
-# VP8 takes a third of the time of VP9 and 1.6 times the space
+# VP8 takes a third of the time of VP9, and its files are 1.6 times as large
 ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
-# Name of an encoding, and the encoder, container and options with which the program ffmpeg makes it. Nearly every
-# program plays H.264
+# Name, encoder, container and options of the encoding that the program ffmpeg makes. Nearly every program plays H.264
 H264 = ("H.264", "libx264", "mp4", (
     "-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709",  # the colours that players expect of large frames
     "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
 ))  # fmt: skip
 MAX_VIDEO_PIXELS = 1 << 23  # per frame, a little more than 3840 x 2160; encoders take 150 bytes per pixel
-MAX_GIF_PIXELS = 1 << 27  # of all frames together; more take over 400 MB of memory, and give files too large to send
+MAX_GIF_PIXELS = 1 << 27  # in all frames; more take over 400 MB of memory, and make files too large to send
 GIF_SAMPLE = 1 << 20  # approximate number of pixels from which the palette of a GIF is made
 OPENCV = "opencv-contrib-python-headless"
 FOLDER_HINT = "name a folder instead, for one picture a frame"
@@ -55,7 +54,7 @@ class Caption:
         """Draw the caption into a picture."""
         height, width = self.text.shape[:2]
         box = picture[self.top : self.top + height, self.left : self.left + width]
-        text = self.text[: box.shape[0], : box.shape[1]]  # a tiny frame cuts it off
+        text = self.text[: box.shape[0], : box.shape[1]]  # the part inside a tiny frame
         shade, text_level = 0.35, 245  # brightness of the picture behind a caption, and level of its text
         box[:] = (shade * box * (1 - text) + text_level * text).round()
 
@@ -64,18 +63,19 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
     """Place the captions of scenes side by side at the bottom of a frame, from left to right.
 
     ``texts`` are the name, the count and the size of each scene. If there is room, count and size share a line.
-    Otherwise each has its own line, or each word of the count has one. A name may be shortened. Other lines that do not
-    fit are left out.
+    Otherwise each has its own line. If the count is still too wide, it is broken between its words. A name may be
+    shortened. Other lines that do not fit are left out.
     """
     scale, thickness = max(0.45, height / 900), max(1, round(height / 600))
     line_height = round(LINE * scale)
     margin, max_width = line_height // 2, width // len(texts) - 2 * line_height
 
     def text_width(text: str) -> int:
+        """Return the width of a text at the present ``scale``, in pixels."""
         return int(cv2.getTextSize(text, FACE, scale, thickness)[0][0])
 
     def widest(rows: Sequence[Sequence[str]]) -> int:
-        """Return the width of the widest text but the names, which may be shortened."""
+        """Return the largest width of a text, except for the names, which may be shortened."""
         return max(text_width(text) for row in rows for text in row[1:])
 
     rows: list[tuple[str, ...]] = [(name, f"{count}, {size}") for name, count, size in texts]
@@ -98,10 +98,11 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
     return captions
 
 
-def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[int]]:
-    """Return the borders of ``count`` scenes in each frame: ``[frames,count+1]`` columns of pixels from 0 to ``width``.
+def swipe_borders(count: int, frames: int, fps: float, width: int) -> list[list[int]]:
+    """Return where the borders of ``count`` scenes are in each frame of a clip that is ``width`` pixels wide.
 
-    The inner borders begin evenly spread, and move together to the right, to the left, and back.
+    Element ``[frame][i]`` is the left border of scene i, and the right border of scene i - 1: a column of pixels. The
+    inner borders begin evenly spread. They move together to the right, to the left, and back.
     """
     swipe_seconds = 6  # time in which a border moves to both sides and back
     rounds = max(1, round(frames / fps / swipe_seconds))
@@ -115,8 +116,8 @@ def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[i
 def draw_swipe(pictures: Sequence[BytePicture], borders: Sequence[int], captions: Sequence[Caption]) -> BytePicture:
     """Make a frame from columns of pictures of several scenes, each with its caption, and draw lines between them.
 
-    All pictures are from one camera. ``borders`` are the frame's row of :func:`swipe_places`. The captions are drawn
-    into the pictures themselves.
+    All pictures are from one camera. ``borders`` are those of the frame, see :func:`swipe_borders`. The captions are
+    drawn into the pictures themselves.
     """
     frame = np.empty_like(pictures[0])
     lines_per_width = 480  # a line is as wide as a frame divided by this
@@ -131,9 +132,10 @@ def draw_swipe(pictures: Sequence[BytePicture], borders: Sequence[int], captions
 
 
 class FfmpegWriter:
-    """Writes frames with the program ffmpeg. It has the methods of :class:`cv2.VideoWriter`."""
+    """Writer of frames with the program ffmpeg. It has the methods of :class:`cv2.VideoWriter`."""
 
     def __init__(self, program: str, path: Path, shape: tuple[int, ...], fps: float) -> None:
+        """Start the ``program``, which writes frames of ``shape [h,w,c]`` to a file."""
         height, width, _ = shape
         frames = ("-f", "rawvideo", "-pix_fmt", "bgr24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-")
         _, encoder, container, encoding = H264
@@ -143,7 +145,7 @@ class FfmpegWriter:
     def write(self, frame: np.ndarray) -> None:
         """Add a frame ``[h,w,c]`` in the order blue, green, red."""
         assert self.process.stdin is not None
-        with suppress(BrokenPipeError):  # ffmpeg has ended too early; _check_frames will miss frames
+        with suppress(BrokenPipeError):  # ffmpeg has ended too early, which _check_frames reports
             self.process.stdin.write(np.ascontiguousarray(frame).tobytes())
 
     def release(self) -> None:
@@ -153,7 +155,7 @@ class FfmpegWriter:
 
 
 def find_ffmpeg(encoder: str) -> str | None:
-    """Find the program ffmpeg on the PATH; None if there is none, or if it does not have the ``encoder``."""
+    """Find the program ffmpeg on the PATH. Returns None if it is missing, or does not have the ``encoder``."""
     program = shutil.which("ffmpeg")
     with suppress(OSError):
         if program is not None:
@@ -163,7 +165,7 @@ def find_ffmpeg(encoder: str) -> str | None:
 
 
 def stored_size(path: StrPath, width: int, height: int) -> tuple[int, int]:
-    """Return width and height of the frames in a file; those of videos are even, since two pixels share a colour."""
+    """Return width and height of the frames in a file. Videos have even sides, since two pixels share a colour."""
     if Path(path).suffix.lower() == GIF:
         return width, height
     return width + width % 2, height + height % 2
@@ -176,7 +178,7 @@ def write_clip(path: StrPath, frames: Iterable[BytePicture], fps: float, *, over
     OpenCV has. All frames of a GIF share a palette, and are in memory together. A video takes the memory of a few
     frames. Its frames have the :func:`stored_size`: an odd side gets one more row or column, a copy of the last one.
 
-    SceneError if there is no encoder for the ending of the name, or if the file cannot be written completely.
+    Raises SceneError if there is no encoder for the ending of the name, or if the file cannot be written completely.
     """
     path = Path(path)
     with atomic_output(path, overwrite=overwrite) as temporary:
@@ -193,6 +195,7 @@ def write_clip(path: StrPath, frames: Iterable[BytePicture], fps: float, *, over
         written: list[Future[None]] = []
 
         def encode(frame: BytePicture) -> None:
+            """Add a frame in the order of channels that OpenCV takes."""
             writer.write(frame[..., ::-1])
 
         try:
@@ -202,7 +205,8 @@ def write_clip(path: StrPath, frames: Iterable[BytePicture], fps: float, *, over
                         written[-1].result()
                     written.append(encoder.submit(encode, frame))
         except BaseException:
-            closing = Thread(target=writer.release, daemon=True)  # takes seconds, although the file is then removed
+            # Closing takes seconds, and need not be waited for, since the file is removed
+            closing = Thread(target=writer.release, daemon=True)
             closing.start()
             if os.name == "nt":  # Windows cannot remove an open file
                 closing.join()
@@ -220,7 +224,7 @@ def _write_gif(path: Path, frames: Sequence[BytePicture], fps: float) -> None:
     step = 1 + len(frames) * frames[0].shape[0] * frames[0].shape[1] // GIF_SAMPLE
     sample = np.concatenate([frame.reshape(-1, 3)[i % step :: step] for i, frame in enumerate(frames)])
     palette = Image.fromarray(sample[None]).quantize(256, Image.Quantize.FASTOCTREE)
-    # Without dithering, which would flicker, cost 1.6 dB and take a quarter more bytes
+    # No dithering: it would flicker, cost 1.6 dB, and make the file a quarter larger
     paletted = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first_frame, *later_frames = paletted
     first_frame.save(path, "GIF", save_all=True, append_images=later_frames, duration=round(1000 / fps), loop=0)
@@ -229,9 +233,10 @@ def _write_gif(path: Path, frames: Sequence[BytePicture], fps: float) -> None:
 def _open_writer(
     path: Path, temporary: Path, shape: tuple[int, ...], fps: float
 ) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
-    """Open ``temporary`` for frames of a ``shape`` with the first available encoder; also return the encoding's name.
+    """Open the file ``temporary`` with the first available encoder; return the writer, and the encoding's name.
 
-    The encoder is chosen by the ending of ``path``, which messages name.
+    All frames have ``shape``. ``path`` is the name that the file will get: its ending decides about the encoders, and
+    messages name it.
     """
     height, width, _ = shape
     name, encoder, container, _ = H264
@@ -245,10 +250,9 @@ def _open_writer(
         if writer.isOpened():
             return writer, name
     os.stat(str(temporary))  # if the folder has vanished, this raises an error with the reason
-    names = " and ".join(name for _, name in encoders)
     raise SceneError(
         path,
-        f"this OpenCV has none of the encoders {names}, so it cannot write it",
+        f"this OpenCV has none of the encoders {' and '.join(name for _, name in encoders)}, so it cannot write it",
         f"{FOLDER_HINT}, or install {OPENCV}",
     )
 
@@ -262,7 +266,7 @@ def _check_frames(path: Path, temporary: Path, count: int) -> None:
             readable += 1
         reader.release()
     if readable != count:
-        os.stat(str(temporary))  # as in _open_writer
+        os.stat(str(temporary))  # if the folder has vanished, this raises an error with the reason
         problem = f"could not be written completely, {readable} of {count} frames can be read"
         raise SceneError(path, problem, "free some space, or write elsewhere")
 

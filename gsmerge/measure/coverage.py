@@ -18,7 +18,7 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
     Returns:
         ``box_low`` and ``box_high``: percentiles 1 and 99 of the positions, for each axis. ``diagonal``: length of this
         box's diagonal. ``share_outliers``: share of positions outside the box enlarged ten times. ``share_floaters``:
-        share of isolated Gaussians and outliers. ``scale_median``: median of each Gaussian's largest scale.
+        share of isolated Gaussians and outliers. ``scale_median``: median of the Gaussians' largest scales.
         ``scale_max``: largest scale of all. ``share_huge``: share of Gaussians whose largest scale is above a tenth of
         the diagonal. All are 0 if there are no Gaussians.
     """
@@ -39,27 +39,29 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def coverage(scene: Scene) -> list[dict[str, Any]]:
-    """Measure how much of each view the Gaussians cover; each layer counts as a view.
+    """Measure how much of each view the Gaussians cover. If a photo has two layers, each layer is a view.
 
-    Returns three entries for each view: its ``name``; ``share_of_pixels``, the share of the pixels that have a visible
-    Gaussian of their own, None if views have no Gaussians of their own; and ``share_of_gaussians``, the share of all
-    Gaussians whose centre is inside the picture.
+    Returns three entries for each view. ``name`` is its name. ``share_of_pixels`` is the share of the pixels that have
+    a visible Gaussian of their own, or None if the scene does not have one Gaussian per pixel. ``share_of_gaussians``
+    is the share of all Gaussians whose mean is inside the picture.
     """
     if len(scene) == 0:
         return []
     shares = shares_inside(scene, VISIBILITY_GAUSSIANS)
     pixels: list[float | None] = [None] * len(scene)
     if scene.has_own_pixels:
-        grid, covered = scene.get_pixels(), scene.covered
-        with_row = grid.shown if covered is None else covered
-        visible = with_row & (scene.gaussians.opacities >= LEAST_OPACITY)[grid.fronts]
+        pixel_rows, covered = scene.get_pixels(), scene.covered
+        has_row = pixel_rows.shown if covered is None else covered
+        visible = has_row & (scene.gaussians.opacities >= LEAST_OPACITY)[pixel_rows.fronts]
         pixels = [float(view.mean()) for view in visible]
-    keys = ("name", "share_of_pixels", "share_of_gaussians")
-    return [dict(zip(keys, view, strict=True)) for view in zip(scene.names, pixels, shares, strict=True)]
+    return [
+        {"name": name, "share_of_pixels": pixel_share, "share_of_gaussians": share}
+        for name, pixel_share, share in zip(scene.names, pixels, shares, strict=True)
+    ]
 
 
 def shares_inside(scene: Scene, most: int) -> list[float]:
-    """Return, for each view, the share of Gaussians whose centres it shows, from a sample of at most ``most``."""
+    """Return, for each view, the share of the Gaussians whose means are inside it. At most ``most`` are tested."""
     rows = np.arange(0, scene.num_gaussians, max(1, -(-scene.num_gaussians // most)))
     points = scene.file_gaussians.means[rows].astype(np.float64)
     return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]

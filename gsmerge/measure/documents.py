@@ -40,12 +40,12 @@ def note_entries(notes: Iterable[str]) -> dict[str, Any]:
 
 
 def note_lines(notes: Iterable[str]) -> list[str]:
-    """Return a line for each note, with the word "warning" before doubts and "note" before others."""
+    """Return a line for each note. It begins with "warning" if the note is a doubt, and otherwise with "note"."""
     return [f"{'warning' if isinstance(note, Doubt) else 'note':11}{note}" for note in notes]
 
 
 def to_json(document: Mapping[str, Any]) -> str:
-    """Format a document as strict, indented JSON with a closing newline; infinities become null."""
+    """Format a document as indented JSON with a closing newline. Infinities become null, as JSON has none."""
     return json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
 
 
@@ -77,21 +77,21 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def text_table(
-    rows: Sequence[Sequence[str]], indent: str = "", *, columns: int | None = None, least: Sequence[int] = ()
+    rows: Sequence[Sequence[str]], indent: str = "", *, letters: int | None = None, omitted_first: Sequence[int] = ()
 ) -> list[str]:
     """Format rows as lines of text, with the first column left-aligned and the others right-aligned.
 
-    ``columns`` is the width of the terminal in letters; None: unlimited. A table that is too wide is reduced until it
-    fits. First the columns with the numbers ``least`` are left out, in this order. Then the texts of the first column
-    are shortened to ``MIN_NAME``. Then other columns are left out from the last on, except the first two.
+    ``letters`` is the width of the terminal; None: unlimited. A table that is too wide is reduced until it fits. First
+    the columns with the numbers ``omitted_first`` are left out, in this order. Then the texts of the first column are
+    shortened to ``MIN_NAME``. Then other columns are left out from the last on, except the first two.
     """
     max_width = 10_000  # width of a table that is not printed on a terminal
-    widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (columns or max_width) - len(indent)
+    widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (letters or max_width) - len(indent)
     shown = list(range(len(widths)))
-    for place in (*least, *reversed(shown[2:])):
-        name = widths[0] if place in least else min(widths[0], MIN_NAME)
-        if place in shown and name + sum(widths[i] + 2 for i in shown[1:]) > room:
-            shown.remove(place)
+    for column in (*omitted_first, *reversed(shown[2:])):
+        name_width = widths[0] if column in omitted_first else min(widths[0], MIN_NAME)
+        if column in shown and name_width + sum(widths[i] + 2 for i in shown[1:]) > room:
+            shown.remove(column)
     widths[0] = min(widths[0], max(MIN_NAME, room - sum(widths[i] + 2 for i in shown[1:])))
     cells = [[_cut(row[0], widths[0]).ljust(widths[0]), *(row[i].rjust(widths[i]) for i in shown[1:])] for row in rows]
     return [indent + "  ".join(line) for line in cells]
@@ -106,7 +106,7 @@ def _cut(text: str, width: int) -> str:
 def wrap_line(line: str, columns: int | None, hang: int = 2) -> list[str]:
     """Break a line between words into lines of at most ``columns`` letters, and indent all but the first by ``hang``.
 
-    With None the line is not broken.
+    If ``columns`` is None, the line is not broken.
     """
     if columns is None or len(line) <= columns:
         return [line]

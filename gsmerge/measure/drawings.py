@@ -25,7 +25,7 @@ from gsmerge.measure.clip import (
     draw_swipe,
     make_captions,
     stored_size,
-    swipe_places,
+    swipe_borders,
     write_clip,
 )
 from gsmerge.measure.preview import (
@@ -59,7 +59,7 @@ PLACED_SIZE = 1280, 720  # width and height of pictures from placed cameras, pix
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """Options of a drawing: scenes, hints for reading, kind of pictures, and output."""
+    """Options of a drawing: which scenes to read and how, what to draw, and where to write it."""
 
     files: SceneFiles  # files of the first scene
     paths: Sequence[Path]  # paths of all scenes, as the user named them
@@ -74,7 +74,7 @@ class DrawOptions:
     background: float = 0.0  # grey level in [0, 1]
 
     def choose(self, names: Sequence[str], most: int | None = None) -> list[int]:
-        """Choose the ids of the views to draw: those of the option ``views``, or else at most ``most``, or else all."""
+        """Choose the ids of the views to draw: as the option ``views`` says, otherwise at most ``most``, or all."""
         if isinstance(self.views, str):
             return [find_view(self.views, names)]
         return pick_views(len(names), self.views or most or len(names))
@@ -85,7 +85,7 @@ class DrawOptions:
         return GIF_FPS if self.output.suffix.lower() == GIF else FPS
 
     def resize(self, cameras: Cameras) -> Cameras:
-        """Return the cameras with images, resized and cropped, of the size of the pictures."""
+        """Resize and crop the images of cameras to the size of the pictures."""
         if self.size is not None:
             return fill_cameras(cameras, *self.size)
         return shrink_cameras(cameras, GIF_SIDE) if self.output.suffix.lower() == GIF else cameras
@@ -103,12 +103,12 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class DrawnScenes:
-    """Scenes to draw together, and the scene whose frame and views they share."""
+    """Scenes to draw together. All are in the frame of one scene, and are drawn in its views."""
 
     scenes: list[tuple[Path, Gaussians]]
     sizes: list[int]  # bytes of their files
     notes: list[str]
-    load: Loaded  # the scene whose frame and views they share
+    load: Loaded  # the scene with this frame and these views
 
     def counts(self) -> dict[str, int]:
         """Return the number of Gaussians of every scene by its path."""
@@ -120,12 +120,12 @@ class DrawnScenes:
         options: DrawOptions,
         threads: int,
         near: float = 0.01,
-        places: Sequence[Sequence[int]] | None = None,
+        borders: Sequence[Sequence[int]] | None = None,
     ) -> Iterator[tuple[BytePicture, ...]]:
         """Yield, for each camera, the 8-bit pictures of all scenes, with one view per thread in memory.
 
-        ``places`` has a row of borders for each picture, see :func:`gsmerge.measure.clip.swipe_places`. Scene i is
-        shown between the borders i and i + 1, so other columns of its picture may show the background only.
+        ``borders`` are those of each picture, see :func:`gsmerge.measure.clip.swipe_borders`. Scene i is shown between
+        the borders i and i + 1. Other columns of its picture need not be drawn, and may show the background only.
         """
         settings: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
         drawn = (
@@ -133,7 +133,7 @@ class DrawnScenes:
                 gaussians,
                 cameras,
                 options.background,
-                columns=None if places is None else [(row[i], row[i + 1]) for row in places],
+                columns=None if borders is None else [(row[i], row[i + 1]) for row in borders],
                 **settings,
             )
             for i, (_, gaussians) in enumerate(self.scenes)
@@ -142,9 +142,10 @@ class DrawnScenes:
 
 
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
-    """Find the scene into whose frame the cameras are moved: the source of a compacted scene, or the scene itself.
+    """Find the files of the scene that defines the frame of the cameras.
 
-    The source lies beside the compacted scene. ``cameras`` and ``images`` are the options of the user.
+    For a compacted scene this is its source ``NAME.ply``, if that lies beside it. Otherwise it is the scene itself.
+    ``cameras`` and ``images`` are the options of the user.
     """
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if match is None or not (source := files.ply.with_name(f"{match[1]}.ply")).is_file():
@@ -166,12 +167,13 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     names = [re.split(r"[\\/]", scene.names[i])[-1] for i in ids]
 
     def draw(_: int) -> Iterator[BytePicture]:
+        """Yield the panel: rows of photos and renders, then a row from outside."""
         named = [(path.name, gaussians) for path, gaussians in group.scenes]
         shown = None if photos is None else [photos[i] if i in pictured else None for i in ids]
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         rows = view_pictures(named, cameras[ids], shown, names, background=options.background)
-        # Placed views, of a scene without cameras, are around it in the first half, and inside it in the second
+        # A scene without cameras has placed views: the first half is around the scene, and the second half inside it
         outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
         outside = outside_pictures(named, outer_cameras, photos=shown is not None, background=options.background)
         yield contact_sheet([*rows, outside])
@@ -181,7 +183,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
 
 
 def prepare_pictures(options: DrawOptions) -> Drawing:
-    """Prepare a picture for each camera, with the scenes side by side; for one camera if the output is no folder."""
+    """Prepare a picture for each camera, with the scenes side by side. An output that is no folder gets one camera."""
     group = _read_scenes(options, photos=False)
     is_folder = options.output.suffix.lower() not in PICTURES
     ids = options.choose(group.load.scene.names) if is_folder or options.views else [0]
@@ -189,15 +191,16 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
     names = [f"{path.name}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
     def draw(threads: int) -> Iterator[BytePicture]:
-        for drawn in group.draw(views, options, threads):
-            yield contact_sheet([list(zip(names, drawn, strict=True))]) if len(drawn) > 1 else drawn[0]
+        """Yield a picture for each camera. Several scenes are side by side, with their names."""
+        for pictures in group.draw(views, options, threads):
+            yield contact_sheet([list(zip(names, pictures, strict=True))]) if len(pictures) > 1 else pictures[0]
 
     facts = {"width": views.width, "height": views.height, "scenes": group.counts(), "views": ids, "notes": group.notes}
     return Drawing([options.output / f"{stems[i]}.png" for i in ids] if is_folder else [options.output], facts, draw)
 
 
 def prepare_clip(options: DrawOptions) -> Drawing:
-    """Prepare a clip along a path, with moving lines between the scenes; for a folder, prepare its frames."""
+    """Prepare a clip along a path, with moving lines between the scenes. An output folder gets single frames."""
     group, cameras, near, ids = _make_path(options)
     cameras = options.resize(cameras)
     paths = [path.absolute() for path, _ in group.scenes]
@@ -208,13 +211,14 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     ]
 
     def draw(threads: int) -> Iterator[BytePicture]:
+        """Yield the frames of the clip. Several scenes share a frame, and have captions."""
         if len(texts) == 1:
             yield from (picture for (picture,) in group.draw(cameras, options, threads, near))
             return
         captions = make_captions(texts, cameras.width, cameras.height)
-        places = swipe_places(len(texts), len(cameras), options.fps, cameras.width)
-        for drawn, borders in zip(group.draw(cameras, options, threads, near, places), places, strict=True):
-            yield draw_swipe(drawn, borders, captions)
+        borders = swipe_borders(len(texts), len(cameras), options.fps, cameras.width)
+        for pictures, row in zip(group.draw(cameras, options, threads, near, borders), borders, strict=True):
+            yield draw_swipe(pictures, row, captions)
 
     facts = {"views": ids, "notes": group.notes, "scenes": group.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
@@ -241,21 +245,21 @@ def _check_frames(output: Path, width: int, height: int, count: int) -> None:
 
 
 def _make_path(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
-    """Read the scenes and make the cameras of a path.
+    """Read the scenes and make the cameras of a path, or read these cameras from a file.
 
-    Returns the scenes, the cameras, the near plane, and the ids of the views through which the path leads.
+    Returns the scenes, the cameras, the near plane (world units), and the ids of the views from which the path is made.
     """
     assert options.path is not None
     path = parse_camera_path(options.path)
     file = None if path else Path(options.path)
     framing = options.framing
     has_own = framing.cameras is not None or framing.images is not None or read_sharp_camera(framing.ply) is not None
-    is_only_source = file is not None and not has_own  # then the file of the path is also the scene's camera file
-    if is_only_source:
+    is_scene_file = file is not None and not has_own  # the scene has no other cameras than those of the path's file
+    if is_scene_file:
         options = replace(options, framing=replace(options.framing, cameras=file))
     group = _read_scenes(options, photos=False)
     scene_cameras = group.load.scene.cameras
-    cameras = scene_cameras if file is None or is_only_source else _place_file(file, group.load)
+    cameras = scene_cameras if file is None or is_scene_file else _place_file(file, group.load)
     assert not isinstance(options.views, str)
     ids = pick_views(len(cameras), options.views or len(cameras))
     cameras = cameras[ids]
@@ -271,7 +275,10 @@ def _make_path(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[
 
 
 def _place_file(file: Path, load: Loaded) -> Cameras:
-    """Read the cameras of a path from a file into the frame of a scene; those without a size get the scene's size."""
+    """Read the cameras of a path from a file into the frame of a scene.
+
+    If the file has no image sizes, the cameras get the scene's size.
+    """
     cameras = load.scene.cameras
     stored = read_cameras(file) if load.cameras is None else read_into_frame(load, file)[0]
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
@@ -281,9 +288,9 @@ DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_c
 
 
 def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
-    """Read the scenes, and the cameras of ``options.framing`` for all of them; with ``photos``, also read its photos.
+    """Read the scenes, and the cameras of ``options.framing``, which show them; if ``photos``, also read its photos.
 
-    Without cameras, views are placed around the scene, and with ``photos`` also inside it.
+    If there are no cameras, views are placed around the scene, and if ``photos`` also inside it.
     """
     files, framing, paths = options.files, options.framing, options.paths
     first_ply = read_gaussian_file(files, opacity=options.opacity, hints=options.hints)
@@ -301,7 +308,7 @@ def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
 
 
 def _with_views(load: Loaded, *, inside: bool) -> Loaded:
-    """Place views around a scene without views; if ``inside``, also place views inside it."""
+    """Place views around a scene that has no views, and if ``inside`` also inside the scene."""
     if len(load.scene):
         return load
     with record_run() as record:
@@ -309,12 +316,15 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     scene = scene if inside else subset(scene, range(len(scene) // 2))
     scene = replace(scene, cameras=fill_cameras(scene.cameras, *PLACED_SIZE))
     placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
-    notes = (placed if text == NO_VIEWS else text for text in record.notes)  # NO_VIEWS speaks of results
+    notes = (placed if text == NO_VIEWS else text for text in record.notes)  # NO_VIEWS is about results
     return replace(load, scene=scene, notes=(*load.notes, *notes))
 
 
 def find_view(view: str, names: Sequence[str]) -> int:
-    """Find a view by its name, with or without folders, ending and leading zeros; UsageError for none or several."""
+    """Return the id of the view of this name, with or without folders, ending and leading zeros.
+
+    Raises UsageError if no view or several views have the name.
+    """
     stems, number = picture_stems(names), picture_stems([view])[0].lstrip("0")
     ids = [i for i, name in enumerate(names) if view in (name, Path(name).name, stems[i])]
     ids = ids or [i for i, stem in enumerate(stems) if stem.lstrip("0") == number]
@@ -327,7 +337,8 @@ def find_view(view: str, names: Sequence[str]) -> int:
 def picture_stems(names: Sequence[str]) -> list[str]:
     """Choose a file name without ending for each view, all different.
 
-    They are the names of the images. If two are equal, they are whole paths joined by ``_``, and otherwise numbers.
+    The names of the images are used if all differ, otherwise whole paths joined by ``_``. If these are equal as well,
+    views are numbered.
     """
     paths = []
     for name in names:
@@ -345,10 +356,11 @@ def picture_stems(names: Sequence[str]) -> list[str]:
 
 
 def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> dict[str, Any]:
-    """Draw and write the pictures, and make folders as needed; return facts that are known only then."""
+    """Draw and write the pictures, and make folders as needed; return the facts that only writing gives."""
     total, fps = drawing.facts.get("frames", len(drawing.paths)), drawing.facts.get("fps")
 
     def report_progress(pictures: Iterator[BytePicture]) -> Iterator[BytePicture]:
+        """Yield the pictures, and report each after it was written."""
         for done, picture in enumerate(pictures, 1):
             yield picture
             progress("render", done, total)
@@ -364,7 +376,7 @@ def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> d
 
 
 def drawing_line(document: Mapping[str, Any]) -> str:
-    """Describe in one line the finished drawing of a report."""
+    """Describe a finished drawing in one line, from the report of the command."""
     if "frames" in document:
         line = f"{document['frames']} frames of {document['width']} x {document['height']}"
         line += f", {document['frames'] / document['fps']:.1f} s" if "fps" in document else ""

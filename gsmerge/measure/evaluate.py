@@ -29,7 +29,7 @@ from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_ga
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.arrays import ArrayFields, as_pictures
 
-# Note for photos that compact would change before it uses them
+# Note on photos whose colours or pixels compact changes before it fits a scene to them
 MENDED = (
     "the photos of the input views differ from their Gaussians, or from each other, in tone, exposure or by objects"
     " that cover them; compact mends this, but the scores here use the photos as they are"
@@ -42,7 +42,7 @@ OnImage = Callable[[str, str, int, np.ndarray], None]  # called with result, spl
 
 @dataclass(frozen=True)
 class Quality:
-    """Similarity of an image to a reference; a measure that was not taken is None."""
+    """Similarity of an image to a reference. A measure that was not taken is None."""
 
     psnr: float | None = None  # dB; inf for equal pictures
     ssim: float | None = None  # at most 1
@@ -62,8 +62,8 @@ class ViewScore:
     visible: float  # share of the pixels that the input views have seen
     full: Quality  # over all pixels
     masked: Quality  # over the pixels that the input views have seen (supplement A)
-    # Share of the pixels that the input covers, with a row of its own or an opacity above a half; None if the input was
-    # not measured
+    # Share of the pixels that the input covers: they have a Gaussian of their own, or an opacity above a half. None if
+    # the input was not measured
     covered_share: float | None = None
     covered: Quality = Quality()  # PSNR and SSIM over these pixels
 
@@ -74,7 +74,7 @@ class ResultScores:
 
     name: str  # as the caller gave it
     num_gaussians: int
-    ratio: float  # of the number of Gaussians to that of the input
+    ratio: float  # number of Gaussians, divided by that of the input
     render_seconds: float  # median wall time of one view with all threads
     scores: tuple[ViewScore, ...]  # one for each view
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty for the input, or if not measured
@@ -85,20 +85,20 @@ class ResultScores:
     def mean(self, split: str) -> QualityPair:
         """Average the scores of a split's views.
 
-        Returns the mean scores over all pixels, and over the pixels that the input views have seen. ValueError for
-        another split than "context" and "target".
+        Returns the mean scores over all pixels, and over the pixels that the input views have seen. Raises ValueError
+        if the split is neither "context" nor "target".
         """
         views = self._select_views(split)
         return _average([score.full for score in views]), _average([score.masked for score in views])
 
     def mean_covered(self, split: str) -> tuple[float | None, Quality]:
-        """Average, over a split's views, the share of the pixels that the input covers, and the scores over these."""
+        """Return two means over a split's views: the share of the pixels that the input covers, and their scores."""
         views = self._select_views(split)
         shares = [score.covered_share for score in views if score.covered_share is not None]
         return float(np.mean(shares)) if shares else None, _average([score.covered for score in views])
 
     def _select_views(self, split: str) -> list[ViewScore]:
-        """Return the scores of a split's views; ValueError for an unknown split."""
+        """Return the scores of a split's views, or raise ValueError if the split is unknown."""
         if split not in SPLITS:
             raise ValueError(f"split: expected {' or '.join(SPLITS)}, got {split!r}")
         return [score for score in self.scores if score.split == split]
@@ -133,7 +133,7 @@ class Evaluation(ArrayFields):
 
     @property
     def doubts(self) -> list[str]:
-        """The notes that say that a result is worse than the input, or that the figures mean little."""
+        """The notes that warn: of a result that is worse than the input, or of figures that may mislead."""
         return list_doubts(self.notes)
 
     def __repr__(self) -> str:
@@ -159,20 +159,20 @@ class _Split:
 
     views: Views
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
-    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: those where its renders are opaque
-    reference: str  # words for the pictures with which results are compared: photos, or their replacement
+    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: where renders of it are opaque
+    reference: str  # words for the pictures with which results are compared, such as "photos"
     scored: Sequence[int]  # ids of the views that are scored
     drawn: Gaussians | None = None  # the input, if its renders replace photos; otherwise None
 
     def move_to(self, cameras: Cameras | None) -> _Split:
-        """Return the split with the cameras of a result; it stays as it is for None, and if the input was drawn."""
+        """Return the split with a result's own cameras. Renders of the input keep the cameras that drew them."""
         view_cameras = self.views.cameras if cameras is None or self.drawn is not None else cameras
         return replace(self, views=replace(self.views, cameras=view_cameras))
 
 
 @dataclass(frozen=True, eq=False)
 class _Renderer:
-    """Renders views, always with the same settings, so that equal Gaussians give equal images."""
+    """Renderer of views. It has the same settings for all scenes, so that equal Gaussians give equal images."""
 
     near: float  # near plane, world units
     options: EvaluateOptions
@@ -183,7 +183,7 @@ class _Renderer:
         return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED_TRANSMITTANCE)
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
-        """Render one view ``[h,w,3]``, and leave the mask out."""
+        """Render one view ``[h,w,3]``."""
         return self.draw(gaussians, cameras, view)[0]
 
 
@@ -205,8 +205,8 @@ def evaluate(
         results: Results of :func:`gsmerge.compact`, or Gaussians, by name, in the scene's world.
         targets: Held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`.
         options: Settings; None: the defaults, with LPIPS if its weights are installed.
-        cameras: Cameras of the input views, by name of each result that was made with other poses, as
-            ``CompactResult.cameras``.
+        cameras: Cameras of the input views, by name of a result, if the result was made with other poses than the
+            scene has. They are ``CompactResult.cameras``.
         progress: Called with (name of the step, number done, total); the step of a result is "evaluate: NAME".
         on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
 
@@ -250,6 +250,7 @@ def evaluate(
         num_pictures, numbers = len(scored) * sum(len(split.views) for split in splits.values()), count(1)
 
         def report_image(name: str, kind: str, view: int, image: np.ndarray) -> None:
+            """Pass a rendered view to the caller, and report the progress."""
             on_image(name, kind, view, image)
             progress(f"evaluate: {name}", next(numbers), num_pictures)
 
@@ -283,7 +284,7 @@ def _without_missing(options: EvaluateOptions) -> tuple[EvaluateOptions, tuple[s
 
 
 def _name_reference(splits: Mapping[str, _Split]) -> str:
-    """Say in words with which pictures results are compared: photos, or in the input views their replacement."""
+    """Return words for the pictures with which results are compared, in held-out views first."""
     names = list(dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits))
     return f"{names[0]}, and {names[1]} in its own views" if len(names) > 1 else names[0]
 
@@ -296,7 +297,8 @@ def near_plane(scene: Scene) -> float:
 def _describe_scores(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mended: bool) -> Iterator[str]:
     """Yield notes on results that are clearly worse than the input, and on figures that may mislead.
 
-    ``mended``: compact changes the photos before it uses them, but they are scored unchanged.
+    ``mended`` is True if compact changes the photos before it fits a scene to them. Scores use the unchanged photos, so
+    a result may then differ from them for a good reason.
     """
     photos = "context" in splits and splits["context"].reference == PHOTOS
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
@@ -304,7 +306,7 @@ def _describe_scores(splits: Mapping[str, _Split], scores: Sequence[ResultScores
         losses = (describe_loss(name, psnrs[INPUT], psnr, OWN_PHOTOS) for name, psnr in psnrs.items())
         yield from (Doubt(loss) for loss in losses if loss is not None)
     yield from filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog))
-    min_seen_share = 0.1  # if the input views have seen less of the held-out views, these may be in another world
+    min_seen_share = 0.1  # if the input views have seen a smaller share of the held-out views, worlds may differ
     if "target" not in splits:
         yield "no held-out views were given; on input views, fitted results score better than on new views"
     elif (share := splits["target"].visible.mean()) < min_seen_share:
@@ -319,20 +321,21 @@ def _make_splits(
 ) -> dict[str, _Split]:
     """Return the input views and the held-out views by the name of the split, with the pixels that count.
 
-    The pictures of input views are those of the scene, for which ``reference`` is the word, or renders of the input.
+    Input views have the scene's pictures, which ``reference`` describes. A scene without pictures gets renders of the
+    Gaussians ``inputs`` in their place.
     """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
-    sources = scene.cameras if scene.has_own_pixels else cameras  # the points come from the pixels of these cameras
+    sources = scene.cameras if scene.has_own_pixels else cameras  # cameras whose pixels give the points
     points = context_points(scene, renderer.near, sources)
 
-    def make_split(views: Views, source: str, masks: np.ndarray | None = None) -> _Split:
-        """Return a split of views whose pictures are called ``source``; pixels outside ``masks`` do not count."""
+    def make_split(views: Views, words: str, masks: np.ndarray | None = None) -> _Split:
+        """Return a split; ``words`` describe the pictures of its views, and pixels outside ``masks`` do not count."""
         visible, scored = visible_pixels(points, views.cameras, renderer.near, sources), list(range(len(views.names)))
         if masks is not None:
             visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
             scored = [view for view in scored if masks[view].any()] or scored
-        return _Split(views, visible, None, source, scored)
+        return _Split(views, visible, covered=None, reference=words, scored=scored)
 
     held_out = {} if targets is None else {"target": make_split(targets, PHOTOS)}
     if targets is not None and not renderer.options.context:
@@ -359,8 +362,8 @@ def _score_split(
 ) -> dict[str, list[tuple[float, ViewScore]]]:
     """Draw and score all results, one view after the other.
 
-    Returns, for each result, the seconds of drawing and the score of each view. ``cameras`` are those of results with
-    other poses.
+    Returns, for each result, the seconds of drawing and the score of each view. ``cameras`` has the cameras of the
+    results that were made with other poses than the scene has.
     """
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))
@@ -371,11 +374,11 @@ def _score_split(
         nets = options.lpips if view in lpips_views else ()
         for name, gaussians in results.items():
             start = time.perf_counter()
-            image, opaque = renderer.draw(gaussians, moved[name].views.cameras, view)
+            image, is_opaque = renderer.draw(gaussians, moved[name].views.cameras, view)
             seconds = time.perf_counter() - start
             on_image(name, kind, view, image)
             if name == INPUT and covered is None:
-                covered = opaque
+                covered = is_opaque
             score = ViewScore(kind, names[view], float(split.visible[view].mean()), Quality(), Quality())
             if view in split.scored:
                 score = _add_qualities(score, image, split, view, covered, nets)
@@ -394,8 +397,8 @@ def _add_qualities(
     """Add to a view's score the quality of a render over all pixels, over seen pixels, and over ``covered`` pixels."""
     photo, seen = split.views.images[view], split.visible[view]
     share = None if covered is None else float(covered.mean())
-    covered_mask = covered if share is not None and share < WHOLE_SHARE else None  # None: all pixels
-    full, masked, covered_quality = _measure_qualities(image, photo, (None, seen, covered_mask))
+    covered_mask = covered if share is not None and share < WHOLE_SHARE else None
+    full, masked, covered_quality = _measure_qualities(image, photo, (None, seen, covered_mask))  # None: all pixels
     full, masked = _add_lpips((full, masked), image, photo, seen, nets)
     score = replace(score, full=full, masked=masked)
     return score if share is None else replace(score, covered_share=share, covered=covered_quality)
@@ -404,22 +407,22 @@ def _add_qualities(
 def _list_scores(
     name: str, split_scores: Sequence[Mapping[str, Sequence[tuple[float, ViewScore]]]]
 ) -> tuple[float, tuple[ViewScore, ...]]:
-    """Return the median seconds of drawing and the scores of a result in the views of all splits."""
-    rows = [row for scores in split_scores for row in scores[name]]
-    return float(np.median([seconds for seconds, _ in rows])), tuple(score for _, score in rows)
+    """Join what :func:`_score_split` returns for one result: the median seconds of drawing, and all its scores."""
+    all_views = [view for scores in split_scores for view in scores[name]]
+    return float(np.median([seconds for seconds, _ in all_views])), tuple(score for _, score in all_views)
 
 
 def _measure_qualities(
     image: np.ndarray, photo: np.ndarray, masks: Sequence[NDArray[np.bool_] | None]
 ) -> list[Quality]:
-    """Measure PSNR and SSIM of an image over the pixels in each mask, where None stands for all pixels.
+    """Measure PSNR and SSIM of an image over the pixels in each mask. None stands for all pixels.
 
-    For an empty mask no measure is taken.
+    An empty mask gives no measures.
     """
-    pixels = [None if mask is None or mask.all() else mask for mask in masks]
-    shown = [mask for mask in pixels if mask is None or mask.any()]
-    scores = iter(zip(psnr_within(image, photo, shown), ssim_within(image, photo, shown), strict=True))
-    return [Quality(*next(scores)) if mask is None or mask.any() else Quality() for mask in pixels]
+    masks = [None if mask is None or mask.all() else mask for mask in masks]
+    filled = [mask for mask in masks if mask is None or mask.any()]
+    measures = iter(zip(psnr_within(image, photo, filled), ssim_within(image, photo, filled), strict=True))
+    return [Quality(*next(measures)) if mask is None or mask.any() else Quality() for mask in masks]
 
 
 def _add_lpips(
@@ -433,9 +436,11 @@ def _add_lpips(
     fitting = [net for net in nets if min(image.shape[:2]) >= min_size(net)]
 
     def add(quality: Quality, mask: NDArray[np.bool_] | None) -> Quality:
+        """Add the LPIPS of all networks within a mask; None: all pixels."""
         return replace(quality, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in fitting})
 
     full = add(pair[0], None)
+    # Without seen pixels there is no LPIPS over them
     return full, full if seen.all() else add(pair[1], seen) if seen.any() else pair[1]
 
 

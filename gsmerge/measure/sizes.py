@@ -19,14 +19,17 @@ SomeViews = TypeVar("SomeViews", bound=Views)
 
 
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
-    """Shrink the image size of cameras to at most ``side`` pixels on the longer side; 0: do not shrink."""
+    """Shrink the image size of cameras to at most ``side`` pixels on the longer side. If ``side`` is 0, it stays."""
     size = cameras.width, cameras.height
     smaller = limit_size(size, side or max(size))
     return cameras if smaller == size else resize_cameras(cameras, *smaller)
 
 
 def fill_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """Resize the images of cameras until they fill ``[height,width]``, and crop what is outside evenly at both ends."""
+    """Return cameras whose images ``[height,width]`` are resized and cropped, like those of :func:`fill_photo`.
+
+    The old image is resized until it covers the new size. The rest is cropped evenly at both ends.
+    """
     new_width, new_height = _filling_size(cameras.width, cameras.height, width, height)
     resized = resize_cameras(cameras, new_width, new_height)
     Ks = resized.Ks.astype(np.float64)
@@ -35,20 +38,20 @@ def fill_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
 
 
 def fill_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize and crop a photo ``[h,w,3]`` as :func:`fill_cameras` does with its camera."""
+    """Resize and crop a photo ``[h,w,3]`` to ``[height,width,3]``; :func:`fill_cameras` changes its camera likewise."""
     new_width, new_height = _filling_size(photo.shape[1], photo.shape[0], width, height)
     top, left = (new_height - height) // 2, (new_width - width) // 2
     return resize_photo(photo, new_width, new_height)[top : top + height, left : left + width]
 
 
 def _filling_size(old_width: int, old_height: int, width: int, height: int) -> tuple[int, int]:
-    """Return the least width and height with the old aspect ratio that cover ``width`` x ``height``."""
+    """Return the smallest width and height that cover ``width`` x ``height`` and keep the old aspect ratio."""
     scale = max(width / old_width, height / old_height)
     return max(width, round(scale * old_width)), max(height, round(scale * old_height))
 
 
 def shrink_views(views: SomeViews, side: int) -> SomeViews:
-    """Shrink photos and cameras together to at most ``side`` pixels on the longer side; 0: do not shrink."""
+    """Shrink photos and cameras to at most ``side`` pixels on the longer side. If ``side`` is 0, they stay."""
     cameras = shrink_cameras(views.cameras, side)
     if cameras is views.cameras:
         return views
@@ -68,19 +71,18 @@ def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
     """Resize a mask ``[h,w]`` to ``[height,width]``; a new pixel is True if it lies completely inside the mask."""
-    # Number of pixels outside the mask above and to the left of each corner
-    holes = np.pad(np.cumsum(np.cumsum(~mask, 0, dtype=np.int64), 1), ((1, 0), (1, 0)))
-    (top, bottom), (left, right) = (
-        _overlapped(old, new) for old, new in zip(mask.shape, (height, width), strict=True)
-    )  # fmt: skip
-    num_holes = holes[bottom][:, right] - holes[top][:, right] - holes[bottom][:, left] + holes[top][:, left]
-    return np.asarray(num_holes == 0)
+    # A summed-area table [h+1,w+1]: element [y,x] counts the pixels outside the mask in the rows < y and columns < x
+    sums = np.pad(np.cumsum(np.cumsum(~mask, 0, dtype=np.int64), 1), ((1, 0), (1, 0)))
+    top, bottom = _overlapped_range(mask.shape[0], height)
+    left, right = _overlapped_range(mask.shape[1], width)
+    num_outside = sums[bottom][:, right] - sums[top][:, right] - sums[bottom][:, left] + sums[top][:, left]
+    return np.asarray(num_outside == 0)
 
 
-def _overlapped(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and the last + 1 of the old pixels that each new pixel overlaps.
+def _overlapped_range(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return which pixels of a line of ``old`` pixels each pixel overlaps after the line is resized to ``new`` pixels.
 
-    A line of ``old`` pixels is resized to ``new`` pixels.
+    Two arrays ``[new]`` have the first old pixel, and the one after the last.
     """
     pixel = np.arange(new)
     return pixel * old // new, -(-(pixel + 1) * old // new)

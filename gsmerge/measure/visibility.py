@@ -23,8 +23,8 @@ _CHUNK = 1 << 16  # number of points that are processed at a time; often the fir
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
     """Return the surface points ``[n,3]``, in world units, that the pixels of the input views show.
 
-    If views have Gaussians of their own, the points are the centres of these. Otherwise they follow from depths that
-    are rendered beyond ``near`` (world units) in ``cameras``, by default the scene's cameras.
+    If each view has Gaussians of its own, the points are the means of these Gaussians. Otherwise the points follow from
+    depths, rendered beyond ``near`` (world units) in ``cameras``. By default these are the scene's cameras.
     """
     if scene.has_own_pixels:
         return scene.file_gaussians.means.astype(np.float64)
@@ -45,35 +45,40 @@ def _render_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
-    """Return masks ``[c,h,w]`` of the pixels at or next to the projection of a point ``[n,3]``, hidden or not.
+    """Return masks ``[c,h,w]`` of the pixels that show one of the ``points [n,3]``, or are next to such a pixel.
 
-    Points nearer than ``near`` (world units) do not count. ``sources`` are the cameras from which the points are. If
-    the views have smaller pixels than these, a point marks more pixels in proportion, so that there are no gaps.
+    A point also counts if a surface hides it, but not if it is nearer than ``near`` (world units). ``sources`` are the
+    cameras whose pixels gave the points. If the views have smaller pixels than ``sources``, a point marks more pixels
+    in proportion, so that there are no gaps.
     """
     viewmats, Ks = cameras.viewmats.astype(np.float64, "C"), cameras.Ks.astype(np.float64, "C")
 
-    def find_seen(view: int) -> NDArray[np.bool_]:
+    def mark_view(view: int) -> NDArray[np.bool_]:
+        """Return the mask ``[h,w]`` of one view."""
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
         seen = hit > 0
         side = _choose_mark_side(Ks[view], sources)
-        own = len(points) * view // len(cameras)  # in most scenes the view's own points begin here, so start with them
-        for start in (*range(own, len(points), _CHUNK), *range(0, own, _CHUNK)):
+        first = len(points) * view // len(cameras)  # in most scenes the view's own points begin here
+        for start in (*range(first, len(points), _CHUNK), *range(0, first, _CHUNK)):
             mark_pixels(points[start : start + _CHUNK], viewmats[view], Ks[view], near, hit)
             seen = cv2.dilate(hit, np.ones((side, side), np.uint8)) > 0
             if seen.all():
                 break
         return seen
 
-    return np.stack(parallel_map(find_seen, range(len(cameras))))
+    return np.stack(parallel_map(mark_view, range(len(cameras))))
 
 
 def _choose_mark_side(K: np.ndarray, sources: Cameras | None) -> int:
-    """Choose the side (odd, pixels) of the square that a point marks in a view with intrinsics ``K [3,3]``."""
-    mark_side = 3  # side of this square in the views from which the points are, pixels
+    """Choose the side of the square that a point marks in a view with intrinsics ``K [3,3]``: an odd number of pixels.
+
+    The square covers the same angle as ``min_side`` pixels of ``sources``, if that is larger.
+    """
+    min_side = 3  # least side of the square, pixels
     if sources is None:
-        return mark_side
-    focals = [np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64))]  # pixels
-    return max(mark_side, 2 * round((mark_side * float(focals[0] / median(focals[1])) - 1) / 2) + 1)
+        return min_side
+    focal, source_focals = (np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64)))
+    return max(min_side, 2 * round((min_side * float(focal / median(source_focals)) - 1) / 2) + 1)
 
 
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:

@@ -56,7 +56,7 @@ class PageView:
     name: str
     place: int  # index among all views, of which the input views are first
     held_out: bool
-    camera: Cameras  # one, in the page's frame
+    camera: Cameras  # one camera, in the page's frame
     distance: float  # median depth of the scene, in units of that frame
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side
@@ -80,14 +80,15 @@ class ViewData:
 
     @property
     def shown(self) -> tuple[PageView, ...]:
-        """The views, followed by the outside view."""
+        """All views that the page can jump to: the measured ones, then the view from outside."""
         return (*self.views, self.outside)
 
     @property
     def start(self) -> int:
-        """Index of the view with which the page opens: the view with the median score; without scores, the first one.
+        """Index of the view with which the page opens.
 
-        Held-out views are preferred, as in the figures at the top; among them, views with LPIPS.
+        It is the view with the median score, or the first one if no view has scores. Only held-out views are considered
+        if there are any, and of these only views with LPIPS if there are any.
         """
         views = list(enumerate(self.views))
         held_out = [(i, view) for i, view in views if view.held_out] or views
@@ -122,8 +123,8 @@ def collect_page_data(
 
     ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes`` are the file sizes of the
     scene and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's
-    cameras. ``new_gains`` are the bounds of the expected gain of new views, dB, by result; the gain of a result that is
-    worse than the scene is left out. If ``light``, the scene itself is shown in stills only.
+    cameras. ``new_gains`` says, by result, how much better new views are expected to be: a lower and an upper bound in
+    dB. A result that is worse than the scene gets no gain. If ``light``, the scene itself is shown in stills only.
     """
     stills: Stills = {}
 
@@ -162,7 +163,7 @@ def _fill_page(
         _collect_side(result, size, split, canonical[result.name], scene, scene_cameras, light=light)
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
-    means = canonical[evaluation.results[:2][-1].name].means  # of the first result; without results, of the scene
+    means = canonical[next(iter(results), INPUT)].means  # of the first result; without results, of the scene
     splits: dict[str, SplitViews] = {"context": (scene.cameras.numpy(), pictures, scene.names)}
     if held_out is not None:
         splits["target"] = held_out.cameras.numpy(), held_out.images, held_out.names
@@ -181,9 +182,9 @@ def _fill_page(
 
 
 def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> ViewData:
-    """Return the content with the expected gains of results; a result that is worse than the scene gets a note instead.
+    """Return the content with the expected gains of results.
 
-    A result is worse if it shows the photos of the fit worse than the scene does.
+    A result that shows the photos of the fit worse than the scene does gets a note in place of a gain.
     """
     sides, notes = [], list[str]()
     for side in data.sides:
@@ -201,11 +202,11 @@ def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> Vie
 def _list_views(
     splits: Mapping[str, SplitViews], evaluation: Evaluation, stills: Stills, frame: Frame, means: np.ndarray
 ) -> list[PageView]:
-    """List the measured views of all splits; the canonical ``means [n,3]`` define how far away the scene is."""
+    """List the measured views of all splits. The ``distance`` of each is the median depth of ``means [n,3]``."""
     views: list[PageView] = []
     for split, (cameras, photos, names) in splits.items():
         encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
-        encoded = encoded or [None] * len(names)
+        encoded = encoded or [None] * len(names)  # without photos
         for i, name in enumerate(short_names(names)):
             camera = frame.enter_cameras(cameras[[i]])
             views.append(PageView(
@@ -222,7 +223,10 @@ def _list_views(
 
 
 def _draw_outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
-    """Draw the scene and the results from outside the capture; ``named`` are their Gaussians in the scene's world."""
+    """Draw the scene and its results from outside the capture.
+
+    ``named`` are the Gaussians of the scene and of the results, in the scene's world.
+    """
     camera, distance = outside_camera(scene.cameras.numpy(), named[INPUT].means)
     renders = (render(gaussians, camera, near=NEAR_PLANE * frame.unit) for gaussians in named.values())
     return PageView(
@@ -253,10 +257,10 @@ def encode_still(picture: BytePicture) -> bytes:
 def _pack_side(
     gaussians: Gaussians, name: str, scene: Scene, cameras: Cameras, light: bool
 ) -> tuple[bytes | None, int, int]:
-    """Pack one side's Gaussians for the page; return the bytes, and the SH degrees of the page and of the file.
+    """Pack one side's Gaussians for the page; return the bytes, the SH degree in the page, and that in the file.
 
-    Gaussians and ``cameras`` are canonical. In a ``light`` page the Gaussians of the scene itself are left out, and the
-    bytes are None.
+    ``gaussians`` and ``cameras`` are in the canonical frame. A ``light`` page leaves out the Gaussians of the scene
+    itself, and the bytes are then None.
     """
     highest = highest_degree(gaussians.shN)
     if name != INPUT:
@@ -266,7 +270,7 @@ def _pack_side(
     homes = None
     if scene.has_own_pixels:
         homes = scene.get_pixels().homes
-        homes = homes if scene.filled is None else homes[~scene.filled]
+        homes = homes if scene.filled is None else homes[~scene.filled]  # without rows that the file does not have
     return *pack_splats(gaussians, cameras, homes), highest
 
 
@@ -280,24 +284,33 @@ def _collect_side(
     *,
     light: bool,
 ) -> Side:
-    """Collect the data of one side of a page: scores and packed Gaussians. Gaussians and cameras are canonical."""
-    packed = _pack_side(gaussians, result.name, scene, cameras, light)
-    mean, covered = result.mean(split)[1], result.mean_covered(split)
+    """Collect the data of one side of a page: scores and packed Gaussians.
+
+    ``gaussians`` and ``cameras`` are in the canonical frame.
+    """
+    splats, sh_degree, file_sh_degree = _pack_side(gaussians, result.name, scene, cameras, light)
+    covered_share, covered = result.mean_covered(split)
     return Side(
-        result.name, result.num_gaussians, file_bytes, mean, *packed, *covered, result.render_seconds
-    )  # fmt: skip
+        name=result.name,
+        num_gaussians=result.num_gaussians,
+        file_bytes=file_bytes,
+        mean=result.mean(split)[1],
+        splats=splats,
+        sh_degree=sh_degree,
+        file_sh_degree=file_sh_degree,
+        covered_share=covered_share,
+        covered=covered,
+        seconds=result.render_seconds,
+    )
 
 
 def _choose_shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
-    """Choose ``MAX_SHOWN_VIEWS`` views and the worst view; return them worst first.
-
-    Views are compared by the scores of the first result, or of the scene without results.
-    """
+    """Choose ``MAX_SHOWN_VIEWS`` views and the worst view; return them worst first."""
 
     def quality(view: PageView) -> float:
-        """Return the PSNR of a view, or infinity without one."""
-        score = view.scores[:2][-1].psnr
-        return np.inf if score is None else score
+        """Return a view's PSNR of the first result, or of the scene if it is alone; infinity if it was not measured."""
+        psnr = view.scores[min(1, len(view.scores) - 1)].psnr
+        return np.inf if psnr is None else psnr
 
     ids = set(even_views(len(views), min(len(views), MAX_SHOWN_VIEWS)))
     ids.add(min(range(len(views)), key=lambda i: quality(views[i])))

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Content security policy: a page may run only its own scripts and styles, which the policy names by their hashes
 PICTURES_POLICY = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
-# The 3D viewer Spark decodes in WebAssembly and sorts in a worker, which its script holds as data: and blob: addresses
+# The 3D viewer Spark needs WebAssembly and a worker. Its script holds both, as data: and blob: addresses
 SOLID_POLICY = f"{PICTURES_POLICY} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY_MARK = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
@@ -42,10 +42,10 @@ def view_page(data: ViewData) -> bytes:
     stills = [[None if picture is None else data_uri(picture, "image/webp") for picture in row] for row in pictures]
     start_stills = stills[data.start]
     first = {source: start_stills[source] for source in (left, right)}  # shown by the HTML itself, so they appear first
-    start_stills[left] = start_stills[right] = None
+    start_stills[left] = start_stills[right] = None  # the page holds these two stills once
 
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
-    result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # sides that are results; a single scene is one
+    result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # the results, or the scene if it is alone
     results = [_result_entry(data, i) for i in result_ids]
     by_size = sorted(result_ids, key=lambda i: data.sides[i].num_gaussians)
     own = reference_words(data)[1]
@@ -82,7 +82,7 @@ def view_page(data: ViewData) -> bytes:
 
 
 def _list_sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:
-    """List what either side of a page can show: the photos if there are any, the scene itself, and each result."""
+    """List what can be chosen for each half of the page: the photos if there are any, the scene itself, each result."""
     picture = "own colours" if data.reference == ROW_COLORS else "photo"
     sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if has_photos else []
     return sources + [
@@ -93,15 +93,17 @@ def _list_sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _result_entry(data: ViewData, place: int) -> dict[str, Any]:
-    """Return the headline, speed, words and figures of a result, for the template and the page's script."""
+def _result_entry(data: ViewData, side_id: int) -> dict[str, Any]:
+    """Return the headline, speed, words and figures of a side, for the template and the page's script."""
     return {
-        "headline": _unbroken(headline(data, place)), "speed": speed(data, place), "words": size_words(data, place),
-        "figures": list_figures(data, place),
-    }  # fmt: skip
+        "headline": _unbroken(headline(data, side_id)),
+        "speed": speed(data, side_id),
+        "words": size_words(data, side_id),
+        "figures": list_figures(data, side_id),
+    }
 
 
-def headline(data: ViewData, place: int = 1) -> str:
+def headline(data: ViewData, side_id: int = 1) -> str:
     """Return the headline of a result: its share of the Gaussians, and its change of quality.
 
     The headline of a single scene has the number of Gaussians and the quality.
@@ -111,7 +113,7 @@ def headline(data: ViewData, place: int = 1) -> str:
         quality = before.mean.psnr
         has_quality = quality is not None and np.isfinite(quality)
         return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if has_quality else "")
-    after, reference = data.sides[place], PHOTOS if data.held_out else data.reference
+    after, reference = data.sides[side_id], PHOTOS if data.held_out else data.reference
     old, new = before.mean.psnr, after.mean.psnr
     share = after.num_gaussians / max(before.num_gaussians, 1)
     share_text = f"{human_share(share, 1 if share >= 0.01 else 2)} of the Gaussians"
@@ -145,15 +147,15 @@ def agreement_words(data: ViewData) -> str:
     return data.agreement.advice or f"{100 * data.agreement.confirmed:.0f} % of the depth is confirmed by other views"
 
 
-def speed(data: ViewData, place: int = 1) -> float | None:
-    """Return how many times faster a result draws than the scene, on this processor; None for a single scene."""
-    if len(data.sides) == 1 or not data.sides[place].seconds:
+def speed(data: ViewData, side_id: int = 1) -> float | None:
+    """Return how many times faster a result is drawn than the scene on this processor, or None for a single scene."""
+    if len(data.sides) == 1 or not data.sides[side_id].seconds:
         return None
-    return round(data.sides[0].seconds / data.sides[place].seconds, 2)
+    return round(data.sides[0].seconds / data.sides[side_id].seconds, 2)
 
 
 def speed_words(ratio: float | None) -> str:
-    """Return the end of the headline, which says how much faster a result draws; "" if it is not clearly faster."""
+    """Return the end of the headline, which says how much faster a result is drawn; "" if it is not clearly faster."""
     min_ratio = 1.2  # the headline mentions a ratio of drawing times from this value on
     if ratio is None or ratio < min_ratio:
         return ""
@@ -161,9 +163,9 @@ def speed_words(ratio: float | None) -> str:
     return f", {times}\u00a0\u00d7\u00a0faster to draw"
 
 
-def size_words(data: ViewData, place: int) -> str:
-    """Describe the size of a result: share, bytes, quality."""
-    side = data.sides[place]
+def size_words(data: ViewData, side_id: int) -> str:
+    """Return a side's share of the scene's Gaussians, its bytes and its PSNR, for the list of sizes to choose from."""
+    side = data.sides[side_id]
     share = human_share(side.num_gaussians / max(data.sides[0].num_gaussians, 1), 1)
     quality = _format_number(side.mean.psnr, 1)
     words = [share, human_bytes(side.file_bytes), *([f"{quality} dB"] if quality != MISSING else [])]
@@ -180,10 +182,10 @@ class Figure:
     mark: str  # CSS class: "up" if better than the scene, "own" if the figure is over photos of the fit, otherwise ""
 
 
-def list_figures(data: ViewData, place: int) -> list[Figure]:
-    """List the figures at the top of the page for one side: its size, mean quality, and expected gain."""
-    before, after = data.sides[0], data.sides[place]
-    sizes = [
+def list_figures(data: ViewData, side_id: int) -> list[Figure]:
+    """List the figures at the top of the page for one side: its size, expected gain, and mean quality."""
+    before, after = data.sides[0], data.sides[side_id]
+    figures = [
         Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", ""),
         Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), ""),
     ]
@@ -198,18 +200,18 @@ def list_figures(data: ViewData, place: int) -> list[Figure]:
     for label, name, old_quality, new_quality in qualities:
         if any(getattr(side.mean, name) is not None for side in data.sides[1:] or data.sides):
             old, new = getattr(old_quality, name), getattr(new_quality, name)
-            scores.append(_score_figure(label, name, old, new, own=own, is_result=place > 0))
+            scores.append(_score_figure(label, name, old, new, own=own, is_result=side_id > 0))
     if is_expected:
         gain = after.new_gain
         words = MISSING if gain is None else "{:+.1f} to {:+.1f} dB".format(*gain)
-        sizes.append(Figure("New views, expected", "", words, "up" if gain is not None and gain[0] > 0 else ""))
-    return sizes + (scores if data.scored else [])
+        figures.append(Figure("New views, expected", "", words, "up" if gain is not None and gain[0] > 0 else ""))
+    return figures + (scores if data.scored else [])
 
 
 def _score_figure(label: str, name: str, old: float | None, new: float | None, *, own: bool, is_result: bool) -> Figure:
-    """Make the figure of a mean score: ``old`` of the scene itself, and ``new`` of one side.
+    """Make the figure of a mean score, which is ``old`` for the scene itself and ``new`` for one side of the page.
 
-    ``own`` is True if the scores are over the photos of the fit, and ``is_result`` if the side is not the scene itself.
+    ``own`` is True if scores are over the photos of the fit. ``is_result`` is True if the side is not the scene itself.
     """
     digits, unit = (2, " dB") if name == "psnr" else (3, "")
     is_better = is_result and old is not None and new is not None and old < new
@@ -222,7 +224,7 @@ def _score_figure(label: str, name: str, old: float | None, new: float | None, *
 
 
 def reference_words(data: ViewData) -> tuple[str, bool]:
-    """Return words for the reference of the scores, and True if it is the scene's own photos, which fits have seen."""
+    """Return words for the pictures with which scores compare, and True if a fit may have used the same pictures."""
     if data.held_out:
         return "held-out photos", False
     return ("its own photos", True) if data.reference == PHOTOS else (data.reference, False)
@@ -270,7 +272,7 @@ def _view_entry(view: PageView) -> dict[str, Any]:
 
 
 def page_camera(camera: Cameras, distance: float) -> dict[str, Any]:
-    """Convert a camera to JSON types for a page's script; ``distance`` is the distance of what it looks at."""
+    """Convert a camera to JSON types for a page's script; ``distance`` is how far away the scene is from the camera."""
     return {
         "viewmat": camera.viewmats[0].reshape(-1).tolist(),
         "K": [float(camera.Ks[0, row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],

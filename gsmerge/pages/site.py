@@ -20,25 +20,25 @@ from gsmerge.photos.views import even_views
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
-# Content security policy: only the page's own scripts run. The 3D viewer Spark has data: addresses and a worker in its
-# script
+# Content security policy: only the page's own scripts run. The script of the 3D viewer Spark starts a worker, and loads
+# data: addresses that it holds itself
 SITE_POLICY = (
     "default-src 'none'; img-src data:; style-src {style}; script-src {script} blob: 'wasm-unsafe-eval';"
     " worker-src data: blob:; connect-src data: blob:"
 )
-NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}  # of the files in the page
+NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}  # of files in the page
 MAX_VIEWPOINTS = 64  # largest number of viewpoints in the page
 LICENSED = ("spark", "three", "fflate")  # parts of the viewer that have a licence
 
 
 def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write a page as a :data:`gsmerge.io.formats.table.WriteOutput`."""
+    """Write the page of a result. The table of formats calls it as :data:`gsmerge.io.formats.table.WriteOutput`."""
     page.write_bytes(make_page(contents.levels[0], contents.cameras, contents.title, contents.comments).encode())
     return {path: [page]}
 
 
 def least_bytes() -> int:
-    """Return the least number of bytes of a page without its Gaussians."""
+    """Return the number of bytes that every page has at least, besides its Gaussians."""
     page_bytes = 43_000  # least bytes of scripts, licences, and the picture and textures of one Gaussian
     return int(4 / 3 * VIEWER.stat().st_size) + page_bytes
 
@@ -57,18 +57,18 @@ def _read_licences() -> bytes:
 
 
 def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str]) -> str:
-    """Make the HTML of a page. Without cameras, viewpoints are placed, and the user may look from any side."""
+    """Make the HTML of a page. Without cameras, gsmerge places viewpoints, and the user may look from any side."""
     expected = read_new_views(comments)
     is_free = len(cameras) == 0
     viewpoints = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
     start = 0 if is_free else median_camera(viewpoints)  # the first of the placed viewpoints is outside the scene
     poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
     views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWPOINTS)), start})
-    inside = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, comments)}
+    files = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, comments)}
     return render_template(
         "site.html", policy=SITE_POLICY, title=title, count=len(gaussians), names=NAMES,
         poster=data_uri(poster, "image/webp"), licences=data_uri(_read_licences(), "text/plain"),
-        inside={NAMES[name]: base64_text(content) for name, content in inside.items()},
+        inside={NAMES[name]: base64_text(content) for name, content in files.items()},
         gain=None if expected is None else describe_gain(*expected.bounds),
         download=f"{title}.sog",
         json_data={

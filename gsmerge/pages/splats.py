@@ -18,8 +18,8 @@ from gsmerge.types import SH_C0, Cameras, Gaussians
 MAX_GAUSSIANS = 2_000_000  # larger scenes have only stills, since a page gets too large and loads too slowly
 MAX_SPZ_BYTES = 40_000_000  # before compression; enough for 2 million Gaussians without harmonics
 COARSE_COUNT = 300_000  # Gaussians of larger scenes are as small as pixels and may be less exact
-# Step sizes of the numbers of a .spz (opacity, colour, logarithm of the scale), and number of levels of a rotation by
-# half a turn. With COARSE, pictures are at 50 dB from pictures of the exact scene
+# Step sizes of opacity, colour and logarithm of the scale, in steps of a .spz, and the number of steps of a rotation
+# from 0 to half a turn. With COARSE, pictures have a PSNR of 50 dB against pictures of the exact scene
 EXACT, COARSE = ((1, 1, 1), 255), ((16, 2, 2), 31)
 PIXEL_PARTS, DEPTH_PARTS = 8, 1024  # steps per pixel of a shift within it, and steps per unit of a logarithm of depth
 
@@ -31,12 +31,14 @@ def pack_splats(
 
     The bytes are None, and the degree 0, if there are more than ``MAX_GAUSSIANS``.
 
-    The bytes are a gzip stream of a line of JSON and of columns. A column has the numbers of a ``.spz`` in steps. Each
-    number is the difference from the row before, with the sign as the lowest bit. All low bytes of a column come first,
-    then the higher bytes. Neighbouring rows are similar, so this takes 40 to 70 % of the ``.spz``, which the page's
-    script restores. If all rows have ``homes [n]``, pixels numbered over all ``cameras``, they store a depth and a
-    shift within their pixel in place of a position. ``gaussians`` and ``cameras`` are in the page's frame. The scene
-    has a size of about 1 in this frame, since browsers keep means in 16 bits.
+    The page's script unpacks the bytes to a ``.spz``. They are a gzip stream of a line of JSON and of columns. A column
+    has one number of each Gaussian, as the difference from the Gaussian before. The lowest bit is the sign. All low
+    bytes of a column come first, then the higher bytes. Neighbouring rows are similar, so the bytes take 40 to 70 % of
+    the ``.spz``.
+
+    ``homes [n]`` is the pixel of each Gaussian, numbered over the pictures of all ``cameras``, or -1. If all Gaussians
+    have one, a depth and a shift within the pixel are stored in place of a position. ``gaussians`` and ``cameras`` are
+    in the page's frame. The scene has a size of about 1 in this frame, since browsers keep means in 16 bits.
     """
     rows, means = drawn_rows(gaussians), np.ascontiguousarray(gaussians.means, np.float32)
     count = len(rows)
@@ -44,18 +46,18 @@ def pack_splats(
         return None, 0
     highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREE)
     row_bytes = 20  # bytes of a Gaussian in a .spz, besides one for each harmonic
-    fitting = (d for d in range(highest + 1) if (row_bytes + _num_harmonics(d)) * count <= MAX_SPZ_BYTES)
-    degree = max(fitting, default=0)
+    degrees = (d for d in range(highest + 1) if (row_bytes + _num_harmonics(d)) * count <= MAX_SPZ_BYTES)
+    degree = max(degrees, default=0)
     steps, levels = COARSE if count > COARSE_COUNT else EXACT
-    drawn = means.take(rows, 0)
+    drawn_means = means.take(rows, 0)
     position_bits = 11  # bits of a position within the scene; browsers keep 10 bits and the sign
-    fraction = spz.choose_fraction(drawn, position_bits)
+    fraction = spz.choose_fraction(drawn_means, position_bits)
     head: dict[str, Any] = {"count": count, "degree": degree, "fraction": fraction}
     positions = None
     if cameras is not None and homes is not None and (homes >= 0).all():
         positions = _pixel_positions(rows, means, cameras, homes.astype(np.int64, copy=False))
     if positions is None:
-        changes = np.diff(spz.fix_means(drawn, fraction), axis=0, prepend=np.zeros((1, 3), np.int32)).T
+        changes = np.diff(spz.fix_means(drawn_means, fraction), axis=0, prepend=np.zeros((1, 3), np.int32)).T
         positions = np.where(changes < 0, -2 * changes - 1, 2 * changes).astype("<u4")
     elif cameras is not None:
         head |= _camera_head(cameras)
@@ -71,12 +73,12 @@ def pack_splats(
 
 
 def _num_harmonics(degree: int) -> int:
-    """Return the number of higher harmonics, of three channels, of a Gaussian."""
+    """Return the number of values of shN at a degree: three channels of each harmonic."""
     return 3 * ((degree + 1) ** 2 - 1)
 
 
 def _camera_head(cameras: Cameras) -> dict[str, Any]:
-    """Return the cameras for the line of JSON, since positions are stored relative to their pixels."""
+    """Return the entries of the JSON with which the page's script computes positions from pixels and depths."""
     poses = [
         {"viewmat": viewmat.reshape(-1).tolist(), "K": [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()]}
         for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True)
@@ -86,7 +88,7 @@ def _camera_head(cameras: Cameras) -> dict[str, Any]:
 
 
 def _pack_column(column: np.ndarray) -> tuple[int, bytes]:
-    """Pack a column ``[m]``; return the bytes per number, and the low bytes of all numbers before the higher bytes."""
+    """Pack a column ``[m]``; return the bytes per number, and the packed bytes: low bytes of all numbers come first."""
     size = max(1, -(-int(column.max(initial=0)).bit_length() // 8))
     return size, column.astype("<u4").view(np.uint8).reshape(-1, 4)[:, :size].T.tobytes()
 
@@ -100,16 +102,16 @@ def drawn_rows(gaussians: Gaussians) -> np.ndarray:
     return np.flatnonzero(drawn)
 
 
-def _pixel_positions(rows: np.ndarray, means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:
-    """Return the positions of ``rows [m]`` relative to their pixels; ``ids [n]`` are the pixels of all rows.
+def _pixel_positions(rows: np.ndarray, means: np.ndarray, cameras: Cameras, homes: np.ndarray) -> np.ndarray | None:
+    """Return the positions of ``rows [m]`` relative to their pixels; ``homes [n]`` are the pixels of all rows.
 
-    Row 0 of the result ``[4,m]`` has the pixel, rows 1 and 2 the shift in it, row 3 the logarithm of the depth. None if
-    a Gaussian cannot be stored like this, as when it is behind its camera.
+    Row 0 of the result ``[4,m]`` has the pixels, rows 1 and 2 the shifts within them, and row 3 the logarithms of the
+    depths. The result is None if a Gaussian cannot be stored like this, for example if it is behind its camera.
     """
     positions = np.empty((4, len(rows)), np.uint32)
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     sizes = (cameras.width, cameras.height, PIXEL_PARTS, DEPTH_PARTS)
-    num_packed = pack_pixels(rows, ids, means, viewmats, Ks, *sizes, positions)
+    num_packed = pack_pixels(rows, homes, means, viewmats, Ks, *sizes, positions)
     return positions if num_packed == len(rows) else None
 
 

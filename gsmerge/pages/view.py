@@ -46,9 +46,10 @@ class Page:
 
     @check_arguments
     def save(self, path: StrPath, *, overwrite: bool = False) -> Path:
-        """Write the page as an ``.html`` file that opens anywhere; return its path. UsageError for another ending.
+        """Write the page as an ``.html`` file that opens anywhere, and return its path.
 
-        A page that gsmerge made is replaced, as by ``gsmerge view``; with ``overwrite`` any file is.
+        An existing file is replaced if it is a page that gsmerge made, or if ``overwrite``. Raises UsageError if the
+        name does not end in .html.
         """
         check_page_name(Path(path))
         with atomic_output(path, overwrite=overwrite or may_be_replaced(Path(path))) as temporary:
@@ -97,7 +98,7 @@ def view(
     """
     with record_run(progress):
         input_scene = as_scene(scene).numpy()
-        shown_scene = add_views(input_scene, shown=True)  # a scene without views gets some
+        shown_scene = add_views(input_scene, shown=True)  # viewpoints are placed for a scene without views
     named = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
     files = {name: read_gaussians(path) for name, path in named.items() if isinstance(path, str | PathLike)}
     loaded: dict[str, Any] = {**named, **files}
@@ -124,13 +125,16 @@ def view(
 
 
 def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, float]]:
-    """Return the bounds of the expected gain of new views, dB, by name of each result whose file has them."""
+    """Return the bounds of the expected gain of new views, in dB, of the results whose files store them."""
     known = {name: read_new_views(file.info.comments) for name, file in files.items()}
     return {name: scores.bounds for name, scores in known.items() if scores}
 
 
 def _num_bytes(value: Any) -> int:
-    """Return the bytes of a scene's files, or of a file that was read; for other Gaussians, those of their ``.ply``."""
+    """Return the size in bytes of a scene's files, or of a file that was read.
+
+    Gaussians that come from no file get the size of their ``.ply``.
+    """
     if isinstance(value, GaussianFile):
         return value.info.file_bytes
     if isinstance(value, str | PathLike):

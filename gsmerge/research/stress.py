@@ -1,7 +1,7 @@
 """Compact a scene under bad conditions: with worse views, poses, photos or rows.
 
-A case defines how a scene is changed, which scenes it applies to, and the property that must hold. Every change returns
-a new scene, and moves the views that results are compared with along with it.
+A case defines how a scene is changed, which scenes it applies to, and the property that must hold. A change returns a
+new scene. If it moves the world, it also moves the held-out views.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gsmerge.types import SH_C0, Gaussians, Scene, Views
 Needs = Literal["anything", "pixels", "photos"]
 Check = Literal["better", "same", "near", "once", "again"]
 
-UTM = (4.0e5, 5.0e6, 100.0)  # metres, as in map coordinates
+UTM = (4.0e5, 5.0e6, 100.0)  # shift in metres, as large as coordinates of maps
 
 PROPERTIES: dict[Check, str] = {  # of the result
     "better": "not more than {worse:g} dB below its own input",
@@ -43,26 +43,27 @@ PROPERTIES: dict[Check, str] = {  # of the result
 SEED = 7  # seed of all random choices
 MAX_WORSE = 0.1  # dB by which a result may be below its input
 MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that the result of a changed scene may lose compared with the unchanged scene
-SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # of counts: largest relative difference for "same", largest ratio for "once"
+SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference of counts for "same", and largest ratio for "once"
 _QUICK = EvaluateOptions(lpips=(), fog=False)
 
 
 @dataclass(frozen=True)
 class StressScene:
-    """A scene and the views that its results are compared with."""
+    """A scene, and the views in which its results are scored."""
 
     scene: Scene
-    views: Views | None  # held-out views in the scene's world; None: results are compared with the scene's own views
+    views: Views | None  # held-out views in the scene's world; None: the scene's own views
 
 
 def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> StressScene:
-    """Keep the views whose numbers ``choose`` returns; it is called with the number of views."""
+    """Keep only some views of a scene. ``choose`` takes the number of views, and returns the ids of those to keep."""
     return replace(setup, scene=subset(setup.scene, choose(len(setup.scene))))
 
 
 def scale_and_shift(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
-    """Scale the world by ``factor``, and shift it by ``shift``, in units of the scaled scene's size."""
+    """Scale the world by ``factor``, then shift it by ``shift`` times the size that the scene has after scaling."""
     scene, views = setup.scene, setup.views
+    # The scene is moved from this frame to the world
     frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)
     scene = replace(scene, gaussians=frame.leave(scene.gaussians), cameras=frame.leave_cameras(scene.cameras))
     return StressScene(scene, views and replace(views, cameras=frame.leave_cameras(views.cameras)))
@@ -82,16 +83,16 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
     scene = setup.scene
     assert scene.images is not None
     gains = np.array([1 + share if view % 2 else 1 - share for view in range(len(scene))], np.float32)
-    rows = gains.repeat(scene.pixels_per_view)[:, None, None]
+    row_gains = gains.repeat(scene.pixels_per_view)[:, None, None]
     g = scene.gaussians
-    sh0 = ((0.5 + SH_C0 * g.sh0) * rows - 0.5) / SH_C0
-    gaussians = replace(g, sh0=sh0, shN=g.shN * rows)
+    sh0 = ((0.5 + SH_C0 * g.sh0) * row_gains - 0.5) / SH_C0
+    gaussians = replace(g, sh0=sh0, shN=g.shN * row_gains)
     images = (scene.images * gains[:, None, None, None]).clip(0, 1)
     return replace(setup, scene=replace(scene, gaussians=gaussians, images=images, large_photos=None))
 
 
 def break_rows(setup: StressScene) -> StressScene:
-    """Remove 1 % of the rows at random, at least one, as reading does with rows of a file that have NaN."""
+    """Remove 1 % of the rows at random, but at least one. The reader removes rows with NaN in the same manner."""
     count = len(setup.scene.gaussians)
     broken_share = 0.01  # share of the rows that are removed
     broken = np.random.default_rng(SEED).choice(count, max(1, round(broken_share * count)), replace=False)
@@ -149,7 +150,7 @@ class StressOutcome:
 
 @dataclass(frozen=True)
 class _ScoredResult:
-    """A compact result with its figures."""
+    """A compacted scene and its scores."""
 
     gaussians: Gaussians
     count: int  # number of Gaussians, including those that no photo shows
@@ -167,8 +168,8 @@ def stress(
 ) -> tuple[StressOutcome, ...]:
     """Compact a scene under bad conditions, all ``CASES`` or the named ones, and check each result.
 
-    Results are scored on held-out views (``targets``) if there are any, otherwise on the photos of the input views, or
-    without photos on renders of the input. ``progress`` is called with (case, done, total).
+    Results are scored on the held-out views ``targets`` if there are any. Otherwise they are scored on the photos of
+    the input views, or on renders of the input if it has no photos. ``progress`` is called with (case, done, total).
 
     Raises:
         UsageError: If a case is unknown, or the scene has no views.
@@ -200,7 +201,8 @@ def _check_case(
 ) -> tuple[bool | None, str]:
     """Check if the property of a case holds.
 
-    Returns True if it holds, or None if the case does not apply; and the figures, or the reason why it does not apply.
+    Returns True or False, and the measured figures. For a case that does not apply to the scene, returns None and the
+    reason.
     """
     if case.needs != "anything" and not setup.scene.has_own_pixels:
         return None, "needs a Gaussian for each pixel"
@@ -218,16 +220,16 @@ def _check_case(
 
 
 def _compact_and_score(setup: StressScene, options: CompactOptions) -> _ScoredResult:
-    """Compact a scene; return the result, and the PSNR of the input and of the result."""
+    """Compact a scene, and measure the PSNR of the input and of the result."""
     result = compact(setup.scene, options)
     count = len(result.gaussians) + result.report.choices.get("pruned", 0)
     return _ScoredResult(result.gaussians, count, *_measure_psnr(setup, result.gaussians))
 
 
 def _measure_psnr(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
-    """Measure the PSNR (dB) of the input and of a result on the views.
+    """Measure the PSNR (dB) of the input and of a result.
 
-    The input's PSNR is infinite if the views have no photos, because its own renders are then the reference.
+    If there are no photos, renders of the input are the reference, and the PSNR of the input is infinite.
     """
     evaluation = evaluate(setup.scene, {"result": gaussians}, setup.views, replace(_QUICK, context=setup.views is None))
     split = "context" if setup.views is None else "target"
@@ -236,15 +238,15 @@ def _measure_psnr(setup: StressScene, gaussians: Gaussians) -> tuple[float, floa
 
 
 def _fit_slack(options: CompactOptions) -> float:
-    """Return the additional tolerance (dB) of results with these options, which is 0 without a full fit."""
-    fit_slack = 1.0  # dB; rounding changes the thin structures of a full fit, and the PSNR by up to this
+    """Return by how many dB more a result may be worse because its options have a full fit."""
+    fit_slack = 1.0  # dB; after a full fit, thin structures and so the PSNR depend on rounding by up to this
     return fit_slack if options.fit.fit == "full" else 0.0
 
 
 def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack: float) -> tuple[bool, str]:
     """Compare a result with its own input, or with the result ``base`` of the unchanged scene, as the case requires.
 
-    Returns True if the property holds, and the figures.
+    Returns True if the property of the case holds, and the compared figures.
     """
     figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
     with_base = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
@@ -261,9 +263,9 @@ def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack:
 
 
 def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOptions) -> tuple[bool, str]:
-    """Compact the result ``base`` once more, to as many Gaussians as it has, and check that it does not get worse.
+    """Compact the result ``base`` a second time without reducing it, and check that the quality stays.
 
-    Returns True if it does not, and the figures.
+    Returns True if it stays, and the PSNR after and before.
     """
     scene = setup.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)
@@ -274,7 +276,7 @@ def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOption
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:
-    """Describe a defect of a result; None if it has none."""
+    """Describe the defect of a result, or return None if the result has no defect."""
     if not 1 <= len(gaussians) <= scene.num_gaussians:
         return f"{len(gaussians)} Gaussians of {scene.num_gaussians}"
     columns = [name for name, column in vars(gaussians).items() if not np.isfinite(column).all()]

@@ -13,7 +13,7 @@ from gsmerge.settings.setting import flat_settings
 
 FULL_FIT_SETTINGS = ("effort", "poses", *(name for name in flat_settings(FitOptions) if name != "fit"))
 
-_baseline = partial(Method, prepare=partial(prepare, fill=False))  # works on the Gaussians of the file alone
+_baseline = partial(Method, prepare=partial(prepare, fill=False))  # uses only the Gaussians of the file
 
 UNMERGED = _baseline("unmerged", simple.unmerged, uses=())
 UNMERGED_FIT = _baseline("unmerged-fit", simple.unmerged_fit, needs_photos=True, uses=FULL_FIT_SETTINGS)

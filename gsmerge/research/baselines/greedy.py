@@ -2,9 +2,10 @@
 
 Each round builds a graph of nearest neighbours and computes the cost of merging each connected pair. It selects
 disjoint pairs by cost, and replaces each pair by the Gaussian with its moments, see :mod:`gsmerge.stages.pair_merge`.
-Masses are opacity times the area of the ellipsoid. They add up, and the final opacity follows from them, at most 1 (as
-in splat-transform). The cost is Runnalls' bound on the Kullback-Leibler divergence (2007), per unit of mass, plus the
-squared distance of the harmonics. It does not depend on size, so a far pair costs as much as a near one.
+As in splat-transform, the mass of a Gaussian is its opacity times the area of its ellipsoid. A merged Gaussian has the
+sum of the masses, and an opacity of at most 1 that follows from the sum. The cost is Runnalls' bound on the
+Kullback-Leibler divergence (2007), per unit of mass, plus the squared distance of the harmonics. The cost does not
+depend on the scale of the scene, so pairs far from the cameras cost as much as near pairs.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from gsmerge.types import Gaussians
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-GREEDY_NEIGHBORS = 10  # with 16 a real capture gains 0.03 dB, in 1.5 times the time
+GREEDY_NEIGHBORS = 10  # 16 neighbours would gain 0.03 dB on a real capture, and take 1.5 times as long
 CHUNK_GAUSSIANS = 65536  # Gaussians per piece of work
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # rows and columns of the upper triangle of a covariance
 
 
 def areas(scales: np.ndarray) -> Floats:
     """Compute the surface areas ``[n]`` of ellipsoids with half axes ``[n,3]``, within 1 % (Knud Thomsen's formula)."""
-    area_exponent = 1.6075  # of Thomsen's formula for the area of an ellipsoid
+    area_exponent = 1.6075  # the exponent of Thomsen's formula
     a, b, c = power(np.maximum(scales, FLATNESS * scales.max(1, keepdims=True)).astype(np.float64), area_exponent).T
     return np.asarray(4 * np.pi * power((a * b + a * c + b * c) / 3, 1 / area_exponent))
 
@@ -48,12 +49,12 @@ def log_determinants(covars: Floats) -> Floats:
 def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
     """Compute the costs ``[m]`` of merging pairs: Runnalls' bound per mass plus the squared distance of harmonics."""
     masses, covars = cloud.masses.astype(np.float64), cloud.covars.astype(np.float64)
-    share = (masses[left] / (masses[left] + masses[right]))[:, None]  # of the pair's mass in its left Gaussian
+    share = (masses[left] / (masses[left] + masses[right]))[:, None]  # share of the left Gaussian in the pair's mass
     offsets = cloud.means[left] - cloud.means[right]
     outer = np.stack([offsets[:, i] * offsets[:, j] for i, j in UPPER], 1)
     merged = share * covars[left] + (1 - share) * covars[right] + share * (1 - share) * outer
     before = share[:, 0] * log_determinants(covars[left]) + (1 - share[:, 0]) * log_determinants(covars[right])
-    color_weight = 1.0  # weight of squared distances of harmonics against nats
+    color_weight = 1.0  # weight of the distance of harmonics; the other term is in nats
     return 0.5 * (log_determinants(merged) - before) + color_weight * ((cloud.sh[left] - cloud.sh[right]) ** 2).sum(1)
 
 
@@ -67,14 +68,18 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
     nearest = nearest.astype(np.int32)
 
     def chunk_pairs(start: int) -> tuple[Ints, Ints, Floats]:
-        """List the pairs of the rows from ``start`` on; a pair of mutual neighbours is listed by its lower row."""
+        """List the pairs of the rows from ``start`` on.
+
+        If two rows are neighbours of each other, only the lower row lists the pair. A row is also its own neighbour,
+        which is no pair.
+        """
         chunk = nearest[start : start + CHUNK_GAUSSIANS]
         rows = np.repeat(np.arange(start, start + len(chunk)), chunk.shape[1])
         neighbors = chunk.reshape(-1).astype(np.int64)
-        candidates = (neighbors <= rows).nonzero()[0]  # may be the row itself, or a pair that the lower row lists too
-        is_repeat = (nearest[neighbors[candidates]] == rows[candidates, None]).any(1)
+        lower = (neighbors <= rows).nonzero()[0]  # places with a neighbour that is the row itself or a lower row
+        is_repeat = (nearest[neighbors[lower]] == rows[lower, None]).any(1)
         keep = np.ones(len(rows), bool)
-        keep[candidates[is_repeat | (neighbors[candidates] == rows[candidates])]] = False
+        keep[lower[is_repeat | (neighbors[lower] == rows[lower])]] = False
         left, right = np.minimum(rows, neighbors)[keep], np.maximum(rows, neighbors)[keep]
         return left, right, pair_costs(cloud, left, right)
 
@@ -87,8 +92,8 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
     """Choose at most ``limit`` disjoint pairs greedily, by ascending cost ``[m]``.
 
     A pair that is the cheapest pair of both its Gaussians is always chosen. So all such pairs are chosen at once, and
-    the search is repeated among the remaining pairs. Of pairs with equal costs the first counts as cheaper. Returns
-    indices of pairs, by ascending cost.
+    the search is repeated among the remaining pairs. If two pairs have equal costs, the earlier pair counts as cheaper.
+    Returns indices of pairs, by ascending cost.
     """
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))
@@ -109,9 +114,9 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
 def reduce_to(cloud: Cloud, count: int) -> Cloud:
     """Merge pairs in rounds until at most ``count`` Gaussians are left.
 
-    A round merges as many pairs as possible. With fewer pairs per round cheap regions grow while the rest remains
-    unmerged, and renders are worse. On a real capture they are worse by 0.6 dB with a third of the Gaussians per round,
-    and by 1.6 dB with a sixth.
+    A round merges as many pairs as possible. With fewer pairs per round, merging would concentrate on regions where
+    pairs are cheap, and renders would be worse. On a real capture, rounds that merge a third of the Gaussians lose
+    0.6 dB, and rounds that merge a sixth lose 1.6 dB.
     """
     while len(cloud) > max(count, 1):
         left, right, costs = neighbor_pairs(cloud)
@@ -121,9 +126,9 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
 
 
 def merge_greedily(gaussians: Gaussians, count: int) -> Gaussians:
-    """Merge pairs in rounds until at most ``count`` Gaussians are left."""
+    """Merge Gaussians in pairs until at most ``count`` are left, and compute their opacities from their masses."""
     cloud = cloud_of(gaussians)
-    cloud.masses[:] = gaussians.opacities.clip(MIN_OPACITY, 1) * areas(gaussians.scales)
+    cloud.masses[:] = gaussians.opacities.clip(MIN_OPACITY, 1) * areas(gaussians.scales)  # as in splat-transform
     cloud = reduce_to(cloud, count)
     merged = gaussians_of_cloud(cloud, gaussians)
     opacities = np.minimum(cloud.masses / areas(merged.scales), MAX_OPACITY).astype(np.float32)

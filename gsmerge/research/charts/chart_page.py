@@ -43,14 +43,14 @@ def make_chart_page(
 
 
 def list_held_out_notes(records: Sequence[RunRecord]) -> list[str]:
-    """List a note for each scene without targets; it names the held-out photos on which the scene's runs are scored."""
+    """List a note for each scene without targets, with the names of the photos that were held out of its runs."""
     notes = (f"{record.scene}: {note}" for record in records for note in record.notes if note.startswith(HELD_OUT_NOTE))
     return list(dict.fromkeys(notes))
 
 
 def _mean_table(results: Results) -> ChartTable:
     """Make the table of means over the scenes, with a row for each method, settings and size."""
-    points = {
+    intervals = {
         (metric, line.name, point.label): point.y
         for metric in results.metrics
         for line in results.by_size("percent", f"{metric}_{results.part}")
@@ -69,10 +69,12 @@ def _mean_table(results: Results) -> ChartTable:
         for metric in results.metrics:
             digits, values = CHART_METRICS[metric].digits, [r.value(f"{metric}_{results.part}") for r in group]
             known = [value for value in values if value is not None]
-            cell = f"{sum(known) / len(known):.{digits}f}" if known else ""
-            if (point := points.get((metric, name, size))) and point.count >= MIN_SCENES:
-                cell = f"{point.mean:.{digits}f} \N{PLUS-MINUS SIGN} {point.high - point.mean:.{digits}f}"
-            row.append(cell)
+            score_text = f"{sum(known) / len(known):.{digits}f}" if known else ""
+            if (interval := intervals.get((metric, name, size))) and interval.count >= MIN_SCENES:
+                score_text = (
+                    f"{interval.mean:.{digits}f} \N{PLUS-MINUS SIGN} {interval.high - interval.mean:.{digits}f}"
+                )
+            row.append(score_text)
         rows.append(row)
     return ("Method", "Size", "Scenes", *COSTS, *(CHART_METRICS[metric].label for metric in results.metrics)), rows
 

@@ -21,18 +21,10 @@ from gsmerge.research.charts.lines import CHART_METRICS, MIN_SCENES, PARTS, Inte
 from gsmerge.research.charts.measure_run import INPUT
 
 PANEL_WIDTH, SINGLE_WIDTH, PANEL_HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
-LINE_COLORS = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-    "#7B4173",
-    "#8C6D31",
-)  # Okabe, Ito 2008
-MARKERS = "osD^vPX"  # their number is coprime to the number of colours
-DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # each cycle through the colours takes the next dash
+# The first six colours are those of Okabe and Ito (2008)
+LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7B4173", "#8C6D31")
+MARKERS = "osD^vPX"  # 7 markers and 8 colours, so each pair of both comes once in 56 lines
+DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # the first 8 lines have the first dash, and so on
 RC: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.grid": True,
@@ -79,7 +71,7 @@ class Chart:
 
 
 def make_figures(results: Results) -> list[Chart]:
-    """Make the figures for which there are data: quality against time, and against size."""
+    """Make the figures for which there are runs: quality against time, and quality against size."""
     time = "Quality against time", "the wall time of the merge (reading and writing not counted)", "Seconds"
     size = "Quality against size", "the share of the input's Gaussians that is kept", "Gaussians kept (%)"
     figures = [
@@ -89,16 +81,20 @@ def make_figures(results: Results) -> list[Chart]:
     return [figure for figure in figures if figure is not None]
 
 
-def _plot_against(results: Results, cost: str, name: str, title: str, described: str, label: str) -> Chart | None:
-    """Plot quality against a cost, with a panel for each metric and a table of all points; None without lines."""
+def _plot_against(results: Results, cost: str, name: str, title: str, cost_words: str, x_label: str) -> Chart | None:
+    """Plot quality against a cost, with a panel for each metric and a table of all points.
+
+    ``cost`` is the name of a value of a record, and ``cost_words`` describe the cost in the caption. Returns None if no
+    run has the cost.
+    """
     panels = []
     for metric in results.metrics:
         score = f"{metric}_{results.part}"
         lines = results.by_size(cost, score)
         scenes = {scene for line in lines for point in line.points for scene in point.by_scene}
-        shape = CHART_METRICS[metric]
+        y_label, higher = CHART_METRICS[metric].label, CHART_METRICS[metric].higher
         if lines:
-            panels.append(Panel(shape.label, shape.higher, tuple(lines), results.input_mean(score, scenes)))
+            panels.append(Panel(y_label, higher, tuple(lines), results.input_mean(score, scenes)))
     if not panels:
         return None
     rows = [
@@ -107,9 +103,9 @@ def _plot_against(results: Results, cost: str, name: str, title: str, described:
         for line in panel.lines
         for point in line.points
     ]
-    head = ("Panel", "Line", "Point", label, "Mean", "Low", "High")
-    caption = f"{results.caveat}Quality against {described}. Measured on {PARTS[results.part]}."
-    return Chart(name, title, f"{caption} {_describe_scenes(panels[0])}", label, head, tuple(rows), tuple(panels))
+    head = ("Panel", "Line", "Point", x_label, "Mean", "Low", "High")
+    caption = f"{results.caveat}Quality against {cost_words}. Measured on {PARTS[results.part]}."
+    return Chart(name, title, f"{caption} {_describe_scenes(panels[0])}", x_label, head, tuple(rows), tuple(panels))
 
 
 def _describe_scenes(panel: Panel) -> str:
@@ -144,9 +140,10 @@ def draw_figures(figures: Sequence[Chart], folder: Path) -> dict[str, bytes]:
             matplotlib.rcdefaults()  # the user's own settings have no effect
             matplotlib.rcParams.update(RC)
             drawing = draw_curves(figure, styles)
-            for suffix, unknown in (("png", ("Software",)), ("svg", ("Date", "Creator", "Format", "Type"))):
+            # Dates and versions in the metadata would make equal figures differ
+            for suffix, omitted in (("png", ("Software",)), ("svg", ("Date", "Creator", "Format", "Type"))):
                 data = io.BytesIO()
-                drawing.savefig(data, format=suffix, metadata=dict.fromkeys(unknown))
+                drawing.savefig(data, format=suffix, metadata=dict.fromkeys(omitted))
                 with atomic_output(folder / f"{figure.name}.{suffix}", overwrite=True) as temporary:
                     temporary.write_bytes(data.getvalue())
         drawn[figure.name] = data.getvalue()

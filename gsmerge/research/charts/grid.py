@@ -27,7 +27,10 @@ GridRun = tuple[ChartScene, RunRecord, CompactOptions]  # scene, record without 
 
 
 def parse_grid(pairs: Sequence[str]) -> SettingGrid:
-    """Make a grid from pairs NAME=A,B with names of settings of compact; UsageError for other names or no values."""
+    """Make a grid from pairs NAME=A,B with names of settings of compact.
+
+    Raises UsageError if a name is unknown or given twice, or if a pair has no values.
+    """
     grid: dict[str, list[Any]] = {}
     for pair in pairs:
         name, _, text = pair.partition("=")
@@ -49,27 +52,28 @@ def parse_grid_value(text: str) -> Any:
 def list_settings(grid: SettingGrid, fixed: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     """List (method, settings) of every run on one scene, the unmerged input first.
 
-    Each run has one budget or one number of superpixels, and every such size is combined with all values of the other
-    settings. ``fixed`` settings hold for all runs. Baselines get the settings that they use. Raises UsageError if a
-    method or setting is unknown or impossible, or if a program is missing.
+    Each run has one budget or one number of superpixels. Every such size is combined with all values of the other
+    settings. ``fixed`` settings hold for all runs. A baseline gets only the settings that it uses. Raises UsageError if
+    a method is unknown, if a setting is invalid, or if a method needs a program that is not installed.
     """
     sizes = [{name: value} for name in SIZE_SETTINGS for value in grid.get(name, ())] or [{}]
     others = {name: values for name, values in grid.items() if name not in (*SIZE_SETTINGS, "method")}
     runs: dict[str, tuple[str, dict[str, Any]]] = {INPUT: (INPUT, {})}
     for method in grid.get("method", (OURS,)):
-        uses = None if method == OURS else find_method(options_of(method, {})).uses
+        used = None if method == OURS else (*find_method(options_of(method, {})).uses, *COMMON_SETTINGS)
         for size, *values in product(sizes, *others.values()):
-            settings = {**size, **dict(zip(others, values, strict=True))}
-            settings |= {name: value for name, value in fixed.items() if name not in settings}
-            settings = {
-                name: value for name, value in settings.items() if uses is None or name in (*uses, *COMMON_SETTINGS)
-            }
+            chosen = {**size, **dict(zip(others, values, strict=True))}
+            chosen |= {name: value for name, value in fixed.items() if name not in chosen}
+            settings = {name: value for name, value in chosen.items() if used is None or name in used}
             runs.setdefault(describe_run(method, settings), (method, settings))
     return list(runs.values())
 
 
 def options_of(method: str, settings: Mapping[str, Any]) -> CompactOptions:
-    """Make the options of a run, which uses all of its budget; UsageError if a setting is invalid."""
+    """Make the options of a run, or raise UsageError if a setting is invalid.
+
+    By default a run uses all of its budget ("fill"), so that results of one size can be compared.
+    """
     try:
         baseline = {} if method in (OURS, INPUT) else {"method": method}
         return CompactOptions().with_settings({"fill": True, **settings, **baseline})
@@ -78,7 +82,7 @@ def options_of(method: str, settings: Mapping[str, Any]) -> CompactOptions:
 
 
 def find_sources(arguments: Sequence[str], out: Path, targets: str | None = None) -> list[ChartScene]:
-    """Find scenes as ``gsmerge batch`` does, and hash the files of each.
+    """Find scenes as ``gsmerge batch`` does, and hash the files of each, so that finished runs can be recognised.
 
     ``targets`` are the cameras of held-out views: one path for all scenes, or a template with ``{scene}`` (as given),
     ``{parent}`` (its folder) and ``{stem}`` (its name without extension). Raises SceneError if a file is missing, and
@@ -109,7 +113,7 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
 def make_runs(
     sources: Sequence[ChartScene], grid: SettingGrid, fixed: Mapping[str, Any], measured: EvaluateOptions
 ) -> list[GridRun]:
-    """Make the runs of a grid, scene by scene; UsageError if a setting is invalid."""
+    """Make the runs of a grid, scene by scene. Raises UsageError if a setting is invalid."""
     combinations = [(method, settings, options_of(method, settings)) for method, settings in list_settings(grid, fixed)]
     runs = []
     for source, (method, settings, options) in product(sources, combinations):

@@ -31,7 +31,7 @@ K = TypeVar("K")
 
 @dataclass(frozen=True)
 class Metric:
-    """Label, direction and decimals of a score."""
+    """How charts show a score."""
 
     label: str
     higher: bool  # True if higher is better
@@ -61,7 +61,7 @@ class Point:
     """Values of one method at one size over all scenes."""
 
     label: str  # size
-    x: float  # mean cost over the scenes (geometric)
+    x: float  # geometric mean of the cost over the scenes
     y: Interval  # mean quality with its interval
     by_scene: ByScene
 
@@ -78,7 +78,7 @@ class Line:
 def mean_interval(values: Sequence[float]) -> Interval:
     """Compute the mean of at least one value with its two-sided t interval (Student 1908).
 
-    The interval is wide for few values: with two it reaches 12.7 standard errors to each side.
+    The interval is wide for few values. With two values it reaches 12.7 standard errors to each side.
     """
     if not len(values):
         raise ValueError("expected at least one value, got none")
@@ -91,10 +91,10 @@ def mean_interval(values: Sequence[float]) -> Interval:
 
 
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
-    """Compute confidence intervals of the columns of ``values [scenes, conditions]``, without the scenes' differences.
+    """Compute a mean and a confidence interval for each column of ``values [scenes,conditions]``.
 
-    Scenes differ by several dB, but conditions by tenths. So plain intervals would hide the effect of conditions.
-    Here the mean of every scene is subtracted first (Cousineau 2005), and the intervals are corrected for that (Morey
+    Scenes differ by several dB, but conditions by tenths, so plain intervals would hide the effect of conditions. That
+    is why the mean of every scene is subtracted first (Cousineau 2005). A factor corrects the intervals for this (Morey
     2008).
     """
     num_scenes, num_conditions = values.shape
@@ -124,44 +124,53 @@ def size_label(record: RunRecord) -> str:
 
 
 def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
-    """Name every line by its method, and by the settings in which the method's lines differ from each other."""
+    """Name every line by its method, and by the settings in which the lines of the method differ from each other.
+
+    If a method has one line only, all settings are named.
+    """
     names = {}
     for method, settings in keys:
-        variants = [dict(other) for name, other in keys if name == method]
-        differ = [(n, v) for n, v in settings if len(variants) == 1 or any(other.get(n) != v for other in variants)]
-        names[method, settings] = ", ".join([method, *(f"{name} {value}" for name, value in differ)])
+        variants = [dict(other_settings) for other_method, other_settings in keys if other_method == method]
+        words = [
+            f"{name} {value}"
+            for name, value in settings
+            if len(variants) == 1 or any(variant.get(name) != value for variant in variants)
+        ]
+        names[method, settings] = ", ".join([method, *words])
     return names
 
 
 class Results:
-    """Successful runs, with values that tables and figures share.
+    """The successful runs of a grid, and the choice of scores that tables and figures show.
 
     Attributes:
         runs: The runs.
-        names: Name of each line. The line of the input is named by its method.
-        part: Key of ``PARTS``, which names views and pixels of the scores. It is the most meaningful part that nine of
-            ten runs have.
-        metrics: Names of the measured metrics, which are PSNR, SSIM and one LPIPS, VGG if possible.
+        names: Name of each line in figures.
+        part: Views and pixels of the scores, a key of ``PARTS``. It is the first key with scores of nine of ten runs.
+        metrics: Names of the scores: PSNR, SSIM, and LPIPS of one network, preferably VGG.
     """
 
     def __init__(self, records: Iterable[RunRecord]) -> None:
+        """Choose names, views, pixels and metrics for the successful runs of ``records``."""
         self.runs = [record for record in records if record.error is None]
-        # gsmerge's own first, then baselines, each by number of settings
+        # Runs of gsmerge come first, then baselines. Of each, runs with fewer settings come first
         own_first = sorted(self.runs, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
         keys = dict.fromkeys(map(line_key, own_first))
         self.names = line_names(list(keys))
-        counts = {part: sum(r.value(f"psnr_{part}") is not None for r in self.runs) for part in PARTS}
-        self.part = next((p for p in counts if self.runs and counts[p] >= 0.9 * len(self.runs)), "context")
-        names = [m for m in CHART_METRICS if any(r.value(f"{m}_{self.part}") is not None for r in self.runs)]
-        self.metrics = [m for m in names if m != "lpips_alex" or "lpips_vgg" not in names]
+        counts = {part: sum(run.value(f"psnr_{part}") is not None for run in self.runs) for part in PARTS}
+        self.part = next(
+            (part for part, count in counts.items() if self.runs and count >= 0.9 * len(self.runs)), "context"
+        )
+        metrics = [m for m in CHART_METRICS if any(run.value(f"{m}_{self.part}") is not None for run in self.runs)]
+        self.metrics = [m for m in metrics if m != "lpips_alex" or "lpips_vgg" not in metrics]
 
     @property
     def caveat(self) -> str:
-        """Beginning of captions if no view was held out; empty otherwise."""
+        """Warning with which captions begin if no view was held out; empty otherwise."""
         return "" if self.part.startswith("target") else "No view was held out: fits have seen these. "
 
     def name(self, record: RunRecord) -> str:
-        """Return the name of a run's line."""
+        """Return the name of the line that has this run."""
         return self.names[line_key(record)]
 
     def by_size(self, x: str, y: str) -> list[Line]:
@@ -169,7 +178,7 @@ class Results:
         return make_lines([r for r in self.runs if r.method != INPUT], x, y)
 
     def input_mean(self, name: str, scenes: Iterable[str]) -> float | None:
-        """Average a value of the unmerged input over ``scenes``; None if a scene lacks it."""
+        """Average a value of the unmerged input over ``scenes``. Returns None if a scene lacks the value."""
         inputs = {r.scene: r.value(name) for r in self.runs if r.method == INPUT}
         values = [inputs.get(scene) for scene in scenes]
         numbers = [value for value in values if value is not None]
@@ -177,21 +186,23 @@ class Results:
 
 
 def make_lines(records: Sequence[RunRecord], x: str, y: str) -> list[Line]:
-    """Make lines from records; all points cover the same scenes, at least ``MIN_SHARE`` of all scenes.
+    """Make lines of the score ``y`` against the cost ``x``, which are names of values of a record.
 
-    ``x`` and ``y`` are names of values of a record. Costs x must be positive.
+    A point is a mean over scenes. If possible, all points cover the same scenes, see :func:`keep_common`. Runs without
+    a positive cost are left out.
     """
-    cells: dict[tuple[LineKey, str], dict[str, tuple[float, float]]] = {}
+    measured: dict[tuple[LineKey, str], dict[str, tuple[float, float]]] = {}  # cost and score by point, then by scene
     for record in sorted(records, key=lambda record: record.percent):
-        cost, value = record.value(x), record.value(y)
-        if cost and value is not None:
-            cells.setdefault((line_key(record), size_label(record)), {})[record.scene] = float(cost), value
-    common = keep_common({cell: set(points) for cell, points in cells.items()})
-    by_cell = {cell: {s: xy for s, xy in cells[cell].items() if s in scenes} for cell, scenes in common.items()}
-    intervals = _cell_intervals(list(by_cell.values()))
+        cost, score = record.value(x), record.value(y)
+        if cost and score is not None:
+            measured.setdefault((line_key(record), size_label(record)), {})[record.scene] = float(cost), score
+    common = keep_common({point: set(by_scene) for point, by_scene in measured.items()})
+    kept = {point: {s: xy for s, xy in measured[point].items() if s in scenes} for point, scenes in common.items()}
+    intervals = _point_intervals(list(kept.values()))
     points: dict[LineKey, list[Point]] = {}
-    for ((key, size), by_scene), interval in zip(by_cell.items(), intervals, strict=True):
-        costs = [cost for cost, _ in by_scene.values()]  # below, equal costs are not averaged, which would round them
+    for ((key, size), by_scene), interval in zip(kept.items(), intervals, strict=True):
+        costs = [cost for cost, _ in by_scene.values()]
+        # Equal costs are not averaged, since that would round them
         mean_cost = costs[0] if min(costs) == max(costs) else float(np.exp(np.mean(np.log(costs))))
         points.setdefault(key, []).append(Point(size, mean_cost, interval, by_scene))
     names = line_names(list(points))
@@ -199,22 +210,23 @@ def make_lines(records: Sequence[RunRecord], x: str, y: str) -> list[Line]:
     return [Line(names[key], key[0] == OURS, tuple(points[key])) for key in keys]
 
 
-def keep_common(scenes: Mapping[K, set[str]]) -> dict[K, set[str]]:
-    """Restrict every key to the scenes that all keys share, so that means can be compared.
+def keep_common(scenes_of: Mapping[K, set[str]]) -> dict[K, set[str]]:
+    """Choose over which scenes the points of a figure are averaged: if possible, the same scenes for all points.
 
-    Keys with too few scenes are left out first, so that a few failed runs do not remove the other keys. Without common
-    scenes each key keeps its own.
+    ``scenes_of`` are the measured scenes of each point. First, points with less than ``MIN_SHARE`` of all scenes are
+    left out, so that failed runs of one setting do not remove scenes of the others. If the remaining points have no
+    scene in common, each keeps its own scenes.
     """
-    fewest = MIN_SHARE * len(set().union(*scenes.values()))
-    covering = {name: scene_names for name, scene_names in scenes.items() if len(scene_names) >= fewest}
-    common = set.intersection(*covering.values()) if covering else set()
-    return {name: common or scene_names for name, scene_names in covering.items()}
+    fewest = MIN_SHARE * len(set().union(*scenes_of.values()))
+    kept = {point: scenes for point, scenes in scenes_of.items() if len(scenes) >= fewest}
+    common = set.intersection(*kept.values()) if kept else set()
+    return {point: common or scenes for point, scenes in kept.items()}
 
 
-def _cell_intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Compute an interval of y for each cell, without the scenes' differences.
+def _point_intervals(columns: Sequence[ByScene]) -> list[Interval]:
+    """Compute the mean score of each point, with an interval as in :func:`paired_intervals`.
 
-    If cells differ in their scenes, intervals have the width 0.
+    If points differ in their scenes, intervals have the width 0.
     """
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]

@@ -28,7 +28,7 @@ SCORING = ("score", "input")  # stages of a run that only measure
 
 @dataclass(frozen=True)
 class ChartScene:
-    """A scene to run, before it is read."""
+    """A scene of a grid, which is not yet read."""
 
     path: Path  # the ``.ply``, or its folder
     name: str  # short name, unique in a grid
@@ -40,9 +40,9 @@ class ChartScene:
 class RunRecord:
     """Record of one run, successful or not.
 
-    ``scores`` are means over the views of a split, by names such as ``psnr_target_visible``. ``context`` are the views
-    that the scene was made of, and ``target`` are held-out views. ``_visible`` counts only pixels that the context
-    views see.
+    ``scores`` are means over views. Their names are made of a metric, "context" for the views that the scene was made
+    of or "target" for held-out views, and "visible" if only pixels that context views see are counted. An example is
+    ``psnr_target_visible``.
     """
 
     scene: str  # its name
@@ -64,7 +64,7 @@ class RunRecord:
         return 100 * self.count / max(self.num_input, 1)
 
     def value(self, name: str) -> float | None:
-        """Return a score or a number by name; None if it was not measured."""
+        """Return a score or a number by name, or None if it was not measured."""
         return getattr(self, name) if name in ("count", "bytes", "seconds", "percent") else self.scores.get(name)
 
 
@@ -107,9 +107,9 @@ def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, 
 
 @lru_cache(maxsize=1)
 def load_source(source: ChartScene) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
-    """Read a scene and its held-out views, and return them with notes; consecutive runs share what was read.
+    """Return a scene, its held-out views, and notes; they are cached, since the next run often has the same scene.
 
-    The held-out views are those of ``targets``, otherwise some of the scene's own, which it then loses.
+    Held-out views are those of ``source.targets``. Without targets, some views are taken out of the scene.
     """
     load = load_files(find_scene_files(source.path))
     if source.targets is not None:

@@ -64,9 +64,9 @@ def chart(args: opt.Args) -> None:
         raise UsageError("--dry-run: expected scenes to run, got none")
     fixed = args.values(CompactOptions, ChartOptions)
     with opt.usage_errors():
-        own = ChartOptions(**{name: fixed.pop(name) for name in flat_settings(ChartOptions) if name in fixed})
-    measured, runs, notes = _plan_runs(args, scenes, own, fixed)
-    done = {record.key for record in read_runs(out) if record.error is None and not own.rerun}
+        chart_options = ChartOptions(**{name: fixed.pop(name) for name in flat_settings(ChartOptions) if name in fixed})
+    measured, runs, notes = _plan_runs(args, scenes, chart_options, fixed)
+    done = {record.key for record in read_runs(out) if record.error is None and not chart_options.rerun}
     pending = [run for run in runs if run[1].key not in done]
     if args.dry_run:
         labels = [f"{source.path} -> {out}: {record.label}" for source, record, _ in pending]
@@ -81,23 +81,23 @@ def chart(args: opt.Args) -> None:
 
 
 def _plan_runs(
-    args: opt.Args, scenes: Sequence[str], own: ChartOptions, fixed: dict[str, Any]
+    args: opt.Args, scenes: Sequence[str], chart_options: ChartOptions, fixed: dict[str, Any]
 ) -> tuple[EvaluateOptions, list[GridRun], list[str]]:
-    """Return the options of all measurements, the runs of the grid, and notes for the user.
+    """Return the options with which results are measured, the runs of the grid, and notes for the user.
 
-    ``own`` are the settings of the measurements, and ``fixed`` those of all runs.
+    ``fixed`` are settings of compact that hold for all runs.
     """
     from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.research.charts.grid import find_sources, make_runs, parse_grid
 
-    nets, notes = lpips_networks(own.lpips, NETS) if scenes else ((), [])
-    measured, grid = EvaluateOptions(nets, own.lpips_views), parse_grid(args.grid or ())
+    nets, notes = lpips_networks(chart_options.lpips, NETS) if scenes else ((), [])
+    measured, grid = EvaluateOptions(nets, chart_options.lpips_views), parse_grid(args.grid or ())
     sources = find_sources(scenes, args.output, args.targets) if scenes else []
     return measured, make_runs(sources, grid, fixed, measured), list(notes)
 
 
 def _run_all(args: opt.Args, runs: Sequence[GridRun], measured: EvaluateOptions) -> list[tuple[str, str]]:
-    """Run all runs, and append a record of each to the folder; return the name and the error of each failed run."""
+    """Do all runs, and append a record of each to the folder. Returns the name and the error of each failed run."""
     from gsmerge.io.jsonl import append_line
     from gsmerge.research.charts.measure_run import RUNS, run_setting
 
@@ -118,7 +118,7 @@ def _run_all(args: opt.Args, runs: Sequence[GridRun], measured: EvaluateOptions)
 def _draw_results(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     """Draw the charts, page and table of all runs in the folder, and print a summary.
 
-    ``notes`` were printed before. ``num_done`` is the number of runs of this call.
+    ``notes`` go into the report; they are already printed. ``num_done`` is the number of runs of this call.
     """
     from gsmerge.research.charts.chart_page import list_held_out_notes, make_chart_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures

@@ -34,12 +34,13 @@ class StressFiles(Settings):
     opt.settings_option(CompactOptions, StressFiles, example="targets=FILE"),
 )
 def stress(args: opt.Args) -> None:
-    """Compact a scene under bad conditions, and report for each if the required property holds."""
+    """Compact a scene under bad conditions, and report for each condition if the required property holds."""
     from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.research.stress import stress as stress_scene
 
     settings, places = args.make(CompactOptions, StressFiles)
     paths = {name: None if path is None else Path(path) for name, path in vars(places).items()}
+    # ``args.files`` and ``args.load`` take these from options that other commands have
     args.cameras, args.images = (None if p is None else opt.named_or_none(p) for p in (places.cameras, places.images))
     args.hint = None
     load = args.load(args.files(args.scene))

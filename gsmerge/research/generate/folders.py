@@ -32,17 +32,17 @@ class SceneFolder:
 
 
 def generate_scene(folder: Path, options: GenerateOptions | None = None, *, seed: int = 0, index: int = 0) -> Path:
-    """Generate scene ``index`` of the series that ``seed`` defines into a folder, and return the folder.
+    """Write scene ``index`` of a series to a folder, and return the folder. A ``seed`` defines a series of scenes.
 
     A folder with the same scene is not changed. Raises UsageError if the folder has other contents, and SceneError if
     it cannot be written.
     """
     options = options or GenerateOptions()
-    key = scene_facts(seed, index, options)
-    if not is_complete(folder, key):
+    facts = scene_facts(seed, index, options)
+    if not is_complete(folder, facts):
         scene = make_synthetic_scene(seed, index, options)
         record = {
-            **key,
+            **facts,
             "num_views": len(scene.cameras),
             "num_gaussians": len(scene.gaussians),
             "noise": asdict(scene.noise),
@@ -85,13 +85,13 @@ def generate(
         planned.append(SceneFolder(folder, is_complete(folder, scene_facts(seed, index, options))))
     todo = [i for i, scene in enumerate(planned) if not scene.kept]
 
-    def work(index: int) -> None:
+    def fill_folder(index: int) -> None:
         """Generate the scene of one folder."""
         generate_scene(planned[index].folder, options, seed=seed, index=index)
 
     with use_threads(threads) as workers:
         for start in range(0, len(todo), workers):
-            parallel_map(work, todo[start : start + workers])
+            parallel_map(fill_folder, todo[start : start + workers])
             if progress is not None:
                 progress(count - len(todo) + min(start + workers, len(todo)), count)
     return planned
@@ -101,18 +101,18 @@ RECORD = "generated.json"
 
 
 def scene_facts(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
-    """Return everything that defines a scene, as plain values; they are the beginning of its record."""
+    """Return all that defines a scene, as JSON types. A record of a scene begins with these facts."""
     record_version = 3  # increases if the same seed and options give other scenes than before
     return {"record_version": record_version, "seed": seed, "index": index, "options": options.to_dict()}
 
 
-def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
-    """Return True if a folder has the complete scene with this key; UsageError if it has other contents."""
+def is_complete(folder: Path, facts: Mapping[str, Any]) -> bool:
+    """Return True if a folder has the complete scene with these facts. Raises UsageError if it has other contents."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         record = None
-    if isinstance(record, dict) and {name: record.get(name) for name in key} == dict(key):
+    if isinstance(record, dict) and {name: record.get(name) for name in facts} == dict(facts):
         return True
     if folder.is_dir() and any(folder.iterdir()):
         problem = (

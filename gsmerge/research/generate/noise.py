@@ -26,7 +26,7 @@ LOG_UNIFORM = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # values
 
 @dataclass(frozen=True)
 class NoiseOptions:
-    """Ranges of an exporter's errors and habits, from which the values of each scene are drawn.
+    """Ranges from which the values of each scene are drawn: errors of a network, and habits of its exporter.
 
     Depth errors are standard deviations of the logarithm of depth. They are about equal to relative errors of depth.
     docs/internals/lab.md compares the ranges with real exports.
@@ -41,7 +41,7 @@ class NoiseOptions:
     bleed: Range = (0.1, 1.0)  # blend towards a smoothed inverse depth at edges, 0 to 1
     bleed_width: Range = (0.6, 1.8)  # standard deviation of the smoothing of inverse depth, pixels
     far: Range = (4.0, 12.0)  # largest depth that the network predicts, in medians of the depth
-    # share of the pixels whose Gaussian floats in front of the surface; it is eleven times as large at depth edges
+    # Share of the pixels whose Gaussian floats in front of the surface. At depth edges the share is 11 times as large
     floaters: Range = (0.0, 0.004)
     turn: Range = (0.005, 0.3)  # rotation error of a pose, degrees
     shift: Range = (0.0001, 0.004)  # translation error of a pose, in median depths
@@ -77,7 +77,7 @@ else:  # the values that were drawn for one scene, under the names of their rang
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
     """Draw the values of one scene from their ranges.
 
-    ``factor`` multiplies errors, not habits. Shares and ``bleed`` are then cut to 1.
+    ``factor`` multiplies the values of ``ERRORS``. Of these, shares and ``bleed`` are then cut to 1.
     """
     drawn: dict[str, float] = {}
     for name in NOISE_RANGES:
@@ -112,20 +112,20 @@ def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) 
 
 
 def edge_mask(depth: Array) -> Float:
-    """Rate pixels ``[h,w]`` by depth edges: 0 on smooth surfaces, 1 if neighbours differ by a tenth or more."""
+    """Rate pixels ``[h,w]`` by depth edges, from 0 on smooth surfaces (also if slanted) to 1 at clear edges."""
     inverse = (1 / depth).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
-    jump = log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
-    middle = blur(inverse, 1.0)  # blur does not change the inverse depth of a slanted plane, so only bends remain
-    bend = np.abs(middle / inverse - 1)
-    return np.clip((np.minimum(jump / 2, 4 * bend) - 0.01) / 0.09, 0, 1).astype(np.float32)
+    step = log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
+    blurred = blur(inverse, 1.0)  # blur does not change the inverse depth of a slanted plane
+    bend = np.abs(blurred / inverse - 1)
+    return np.clip((np.minimum(step / 2, 4 * bend) - 0.01) / 0.09, 0, 1).astype(np.float32)
 
 
 MEAN_FILTER = np.full(7, 1 / 7, np.float32)  # filter that averages 7 pixels
 
 
 def texture_mask(image: Float) -> Float:
-    """Rate pixels ``[h,w]`` by texture: 0 in flat areas of a photo, 1 in detailed areas."""
+    """Rate pixels ``[h,w]`` by texture, from 0 in flat areas of a photo to 1 in detailed areas."""
     grey = image.mean(2)
     mean, mean_square = (convolve(values, MEAN_FILTER, MEAN_FILTER) for values in (grey, grey * grey))
     deviation = np.sqrt(np.maximum(mean_square - mean * mean, 0))
@@ -137,8 +137,8 @@ def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     """Simulate a network's depth ``[h,w]`` and its confidence ``[h,w]`` in [0, 1].
 
     Errors of the logarithm of depth are a bias of the view, a slow drift, wrong patches and fine grain. All of them are
-    larger in areas without texture. Inverse depth bleeds over edges, depth has a maximum, and some pixels float in
-    front of their surface.
+    larger in areas without texture. Besides, edges are smoothed in inverse depth, depth is cut at a largest value, and
+    some pixels float in front of their surface.
     """
     height, width = view.depth.shape
     far = noise.far * float(np.median(view.depth))
@@ -182,7 +182,7 @@ def quats_facing(normals: Array) -> Array:
 def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
     """Draw random shN ``[n,k-1,3]``, and compute sh0 ``[n,1,3]`` so that Gaussians have ``colors`` seen from ``eye``.
 
-    Returns sh0 and shN.
+    Returns sh0 and shN. The effect of shN is rendered at the colour ``RAISED``, and subtracted from sh0.
     """
     n, num_rest = len(colors), (noise.sh_degree + 1) ** 2 - 1
     sh0 = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)

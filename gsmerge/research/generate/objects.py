@@ -50,6 +50,7 @@ def build_table(pal: Palette, width: float, depth: float, height: float) -> Shap
 def build_chair(pal: Palette) -> Shapes:
     """Build a chair with a slatted or closed back."""
     rng, seat, wood = pal.rng, pal.material("cloth", "wood", "plain"), pal.material("wood", "plain")
+    # Width and height of the seat, and height of the back
     w, h, back = rng.uniform(0.38, 0.5), rng.uniform(0.42, 0.5), rng.uniform(0.8, 1.05)
     out = [box((-w / 2, -h, -w / 2), (w / 2, 0.05 - h, w / 2), seat)]
     for x in (-w / 2 + 0.02, w / 2 - 0.02):
@@ -172,12 +173,12 @@ def build_plant(pal: Palette, height: float, leaves: int) -> Shapes:
 
 def random_rotation(rng: np.random.Generator) -> Array:
     """Draw a random rotation ``[3,3]``."""
-    first, second, third = rng.normal(size=(3, 3)).T  # Gram and Schmidt's
+    first, second, third = rng.normal(size=(3, 3)).T
     x = first / norm(first)
     y = second - (x * second).sum() * x
     y /= norm(y)
     z = np.cross(x, y)
-    sign = 1.0 if (z * third).sum() > 0 else -1.0  # an axis of a left-handed set is reversed
+    sign = 1.0 if (z * third).sum() > 0 else -1.0  # axes of Gram and Schmidt that are left-handed are all reversed
     return np.stack([sign * x, sign * y, z], 1)
 
 
@@ -253,7 +254,7 @@ FACING = axis_rotation(1, np.pi / 2)  # rotates -z to -x
 def draw_lights(rng: np.random.Generator, lamp_at: Array) -> Light:
     """Draw a direct and an ambient light of random colour and strength.
 
-    The direct light comes from above and from the side of the cameras.
+    The direct light comes from above and from behind the cameras.
     """
     side, up = rng.uniform(-1.2, 1.2), rng.uniform(0.5, 1.3)
     towards = np.array([sin(side), -up, -cos(side)])
@@ -288,15 +289,15 @@ def _build_wall_objects(pal: Palette, half: float, height: float) -> Shapes:
     """Build pictures, windows, shelves and doors at random, side by side on the plane z = 0."""
     rng, out, x = pal.rng, [], -half + 0.3
     while x < half - 0.5:
-        wide, kind = rng.uniform(0.3, 1.2), rng.integers(0, 5)
+        wide, kind = rng.uniform(0.3, 1.2), ("picture", "picture", "window", "shelf", "door")[rng.integers(0, 5)]
         at = (x + wide / 2, 0.0, 0.0)
-        if kind <= 1:
+        if kind == "picture":
             frame = build_picture(pal, wide, min(wide * rng.uniform(0.6, 1.4), 0.45 * height))
             out += place_shapes(frame, (at[0], -rng.uniform(0.35, 0.5) * height, 0))
-        elif kind == 2:
+        elif kind == "window":
             pane = build_window(pal, wide, rng.uniform(0.35, 0.55) * height)
             out += place_shapes(pane, (at[0], -0.35 * height, 0))
-        elif kind == 3:
+        elif kind == "shelf":
             out += place_shapes(build_shelf(pal, wide, rng.uniform(0.4, 0.85) * height), at)
         else:
             out += place_shapes(
@@ -309,14 +310,14 @@ def _build_wall_objects(pal: Palette, half: float, height: float) -> Shapes:
 def build_room(pal: Palette) -> Room:
     """Build a furnished room: walls with pictures and shelves, tables, chairs, plants, lamps, cables."""
     rng = pal.rng
-    w, d, h = rng.uniform(4.0, 7.0), rng.uniform(4.5, 7.0), rng.uniform(2.3, 3.2)
+    w, d, h = rng.uniform(4.0, 7.0), rng.uniform(4.5, 7.0), rng.uniform(2.3, 3.2)  # width, depth and height
     shapes = _build_walls(pal, w, d, h)
-    spots = [(x * w, z * d) for x in (-0.3, 0.0, 0.3) for z in (0.05, 0.32)]
+    spots = [(x * w, z * d) for x in (-0.3, 0.0, 0.3) for z in (0.05, 0.32)]  # x and z where furniture may stand
     for i in rng.permutation(len(spots))[: rng.integers(3, 6)]:
         at = spots[i][0] + rng.normal(0, 0.15), 0.0, spots[i][1] + rng.normal(0, 0.15)
         shapes += place_shapes(_build_furniture(pal), at, yaw=rng.normal(0, 0.5))
-    pot = build_plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90)))
-    shapes += place_shapes(pot, (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
+    plant = build_plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90)))
+    shapes += place_shapes(plant, (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
     shapes += place_shapes(
         build_lamp(pal, rng.uniform(1.1, 1.8)), (rng.uniform(-0.4, 0.4) * w, 0, rng.uniform(0, 0.4) * d)
     )
@@ -324,8 +325,8 @@ def build_room(pal: Palette) -> Room:
     shapes += build_wire(pal, a, b, rng.uniform(0.05, 0.4), rng.uniform(0.003, 0.008))
     focus = np.array([rng.normal(0, 0.2), -rng.uniform(0.4, 1.0), rng.uniform(0.15, 0.35) * d])
     lamp_at = np.array([rng.uniform(-0.3, 0.3) * w, -h + 0.1, rng.uniform(-0.3, 0.2) * d])
-    reach = focus[2] + 0.42 * d
-    return Room(tuple(shapes), tuple(pal.textures), draw_lights(rng, lamp_at), focus, (0.6 * reach, reach))
+    farthest = focus[2] + 0.42 * d  # largest distance of cameras from the focus
+    return Room(tuple(shapes), tuple(pal.textures), draw_lights(rng, lamp_at), focus, (0.6 * farthest, farthest))
 
 
 def build_sofa(pal: Palette) -> Shapes:
@@ -338,10 +339,10 @@ def build_sofa(pal: Palette) -> Shapes:
 
 def _build_furniture(pal: Palette) -> Shapes:
     """Build a chair, a sofa, or a table with small objects and perhaps a chair."""
-    rng, kind = pal.rng, pal.rng.integers(0, 4)
-    if kind == 0:
+    rng, kind = pal.rng, ("chair", "sofa", "table", "table")[pal.rng.integers(0, 4)]
+    if kind == "chair":
         return build_chair(pal)
-    if kind == 1:
+    if kind == "sofa":
         return build_sofa(pal)
     width, depth, height = rng.uniform(0.7, 1.5), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)
     top = spread_objects(pal, int(rng.integers(2, 7)), (0.3 * width, 0.3 * depth), height)

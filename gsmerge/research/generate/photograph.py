@@ -1,8 +1,7 @@
 """Render photos and exact depth of a room.
 
-Each sample is a ray, which finds the first surface. The colour comes from the surface's texture and from lights with
-shadow maps. A tone curve like that of film turns the light into the
-colours of a photo.
+A ray of each sample finds the first surface. Its colour comes from the surface's texture, and from lights with shadow
+maps. A tone curve like that of film turns the light into the colours of a photo.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from numpy.typing import NDArray
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.kernels.elementary import arctan2, cos, power, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack_shapes, rotate
+from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, half_sizes, norm, pack_shapes, rotate
 from gsmerge.research.generate.textures import Texture, make_mipmaps
 
 NO_SURFACE_DEPTH = 1e6  # depth of pixels without a surface, metres
-SAMPLE_RAYS = 2  # rays per pixel and axis for the colours; depth is measured at the pixel's centre
+SAMPLE_RAYS = 2  # rays per pixel and axis for colours; depth has one ray through the pixel's centre
 KEY_MAPS, KEY_SIZE = 5, 640  # number of shadow maps of the direct light, for soft shadows, and their side in pixels
 AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # number and side of the shadow maps of the light from all sides
 GLOW = 0.7  # brightness of glowing shapes, relative to a white wall in full light
@@ -33,7 +32,7 @@ Float: TypeAlias = NDArray[Any]  # float32
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """The lights of a scene."""
+    """The lights of a room."""
 
     towards: Array  # [3] unit vector to the direct light
     lamp: Array  # [3] position of the lamp, near which surfaces are brighter
@@ -44,7 +43,7 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """Shapes, textures and light of a scene; y points down, and the cameras look along +z."""
+    """Shapes, textures and lights of a room. The y axis points down, and cameras look along +z."""
 
     shapes: tuple[Shape, ...]
     textures: tuple[Texture, ...]  # indexed by the shapes' materials
@@ -69,7 +68,7 @@ class Pinhole:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """The first hit of each of a view's h x w rays."""
+    """What the h x w rays of a view hit first."""
 
     depth: Array  # [h,w] along the camera's z
     ids: NDArray[np.int32]  # [h,w] number of the shape; -1 if the ray hits none
@@ -93,7 +92,7 @@ class LitRoom:
 
 
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
-    """Compute the box ``[m,4]`` that contains each shape's image: x0, y0, x1 and y1 in samples."""
+    """Compute in which samples of a picture each shape can appear: a box ``[m,4]`` of x0, y0, x1 and y1."""
     points, valid = _clipped_corners(shapes, c2w)
     pixels = points[..., :2] / np.where(valid, points[..., 2:], 1) * lens.focal + [lens.width / 2, lens.height / 2]
     limits = np.array([lens.width, lens.height]) * samples
@@ -105,18 +104,18 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
 def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
     """Clip the bounding boxes of shapes at the near plane.
 
-    Returns camera-frame points ``[m,20,3]``: the 8 corners, then the points where the 12 edges cross the near plane.
-    The mask ``[m,20,1]`` is True for corners in front of the plane and for edges that cross it.
+    Returns points ``[m,20,3]`` in the camera's frame: the 8 corners, then the points where the 12 edges cross the near
+    plane. A mask ``[m,20,1]`` is True for corners beyond the plane, and for edges that cross it.
     """
-    half = bounds(shapes)
+    half = half_sizes(shapes)
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
     corners = matmul(half[:, None] * signs, shapes.rotations.swapaxes(1, 2)) + shapes.centres[:, None]
     local = matmul(corners - c2w[:3, 3], c2w[:3, :3])
-    # Corners whose numbers differ in one bit share an edge
+    # The numbers of two corners of an edge differ in one bit
     edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
     near_plane = 1e-3  # depth in metres at which edges that reach behind the camera are cut
-    with np.errstate(divide="ignore", invalid="ignore"):  # edges that are parallel to the plane do not cross it
+    with np.errstate(divide="ignore", invalid="ignore"):  # edges parallel to the plane are not used
         crossing = a + (b - a) * ((near_plane - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
     crosses = (a[..., 2] < near_plane) != (b[..., 2] < near_plane)
     points = np.concatenate([local, np.where(crosses[..., None], crossing, 0.0)], 1)
@@ -131,8 +130,9 @@ def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
     c2w = np.ascontiguousarray(c2w, dtype=np.float64)
     eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()
     table = shapes.kinds, shapes.rotations, shapes.centres, shapes.sizes, shapes.waves
-    rects = screen_boxes(shapes, c2w, lens, samples)
-    cast(eye, axes, intrinsics, 1.0 / samples, *table, rects, hits.depth, hits.ids, hits.points, hits.normals)
+    boxes = screen_boxes(shapes, c2w, lens, samples)
+    # Fills the arrays of hits
+    cast(eye, axes, intrinsics, 1.0 / samples, *table, boxes, hits.depth, hits.ids, hits.points, hits.normals)
     return hits
 
 
@@ -145,7 +145,7 @@ def _shadow_map_axes(towards: Array) -> Array:
 
 
 def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, size: int) -> Float:
-    """Compute a shadow map ``[size,size]``: the depth of the first surface, relative to ``middle``."""
+    """Compute a shadow map ``[size,size]``: by how much the first surface is deeper than ``middle``."""
     c2w = np.eye(4)
     behind = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel
     c2w[:3, :3], c2w[:3, 3] = axes.T, middle - behind * radius * axes[2]
@@ -155,10 +155,10 @@ def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, 
 
 def light_room(room: Room) -> LitRoom:
     """Prepare a room for rendering: make the arrays of its shapes, the mipmaps, and the shadow maps."""
+    # Walls and glowing shapes cast no shadow; the arrays need one shape at least
     opaque = pack_shapes([s for s in room.shapes if not s.shell and not s.glow] or room.shapes[:1])
-    extent = bounds(opaque)
-    reach = np.linalg.norm(extent, axis=1)
-    low, high = (opaque.centres - reach[:, None]).min(0), (opaque.centres + reach[:, None]).max(0)
+    radii = np.linalg.norm(half_sizes(opaque), axis=1)[:, None]
+    low, high = (opaque.centres - radii).min(0), (opaque.centres + radii).max(0)
     middle, radius = (low + high) / 2, norm(high - low) / 2
     rng = np.random.default_rng(0)
     key = [room.light.towards + room.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
@@ -193,15 +193,15 @@ def texture_coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Flo
     """
     kinds, half = shapes.kinds[ids], shapes.sizes[ids, :3].astype(np.float32)
     x, y, z = points.T
-    a, b, c = (np.abs(points) / np.maximum(half, 1e-9)).T
-    is_round = (kinds == ELLIPSOID) | (kinds == BLOB) | ((kinds == CONE) & (b < 1 - 1e-5))
-    girth = np.maximum(half[:, 0], half[:, 2])
-    is_side = (kinds == BOX) & (a >= b) & (a >= c)  # faces across x
-    is_top = ((kinds == BOX) & (b > a) & (b >= c)) | ((kinds == CONE) & ~is_round)  # faces across y
+    share_x, share_y, share_z = (np.abs(points) / np.maximum(half, 1e-9)).T  # 1 on a face across this axis
+    is_round = (kinds == ELLIPSOID) | (kinds == BLOB) | ((kinds == CONE) & (share_y < 1 - 1e-5))
+    radius = np.maximum(half[:, 0], half[:, 2])
+    is_side = (kinds == BOX) & (share_x >= share_y) & (share_x >= share_z)  # faces across x
+    is_top = ((kinds == BOX) & (share_y > share_x) & (share_y >= share_z)) | ((kinds == CONE) & ~is_round)  # across y
     azimuth = arctan2(x, z)
-    u = np.where(is_round, azimuth * girth, np.where(is_side, z, x))
+    u = np.where(is_round, azimuth * radius, np.where(is_side, z, x))
     v = np.where(is_top, z, y)
-    half_width = np.where(is_round, np.pi * girth, np.where(is_side, half[:, 2], half[:, 0]))
+    half_width = np.where(is_round, np.pi * radius, np.where(is_side, half[:, 2], half[:, 0]))
     half_height = np.where(is_top, half[:, 2], half[:, 1])
     materials = [s.material for s in shapes.shapes]
     repeat = np.array([material.repeat for material in materials], np.float32)[ids]
@@ -213,12 +213,15 @@ def texture_coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Flo
 
 
 def look_up_colors(lit: LitRoom, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
-    """Look up the texture colours ``[n,3]`` sRGB of points; ``spread`` is the size of a sample there, world units."""
+    """Look up the texture colours ``[n,3]``, sRGB, of points in the frames of the shapes ``ids [n]``.
+
+    ``spread [n]`` is the size of a sample at the point, in world units. It chooses the mipmap.
+    """
     uv, repeat = texture_coordinates(lit.shapes, ids, points)
     textures = np.array([s.material.texture for s in lit.shapes.shapes])[ids]
     size, num_levels = len(lit.mips[0][0]), len(lit.mips[0])
-    levels = np.frexp(np.maximum(spread * repeat * size, 1) * 2**0.5)[1] - 1  # the nearest power of two
-    levels = np.minimum(levels, num_levels - 1)
+    powers = np.frexp(np.maximum(spread * repeat * size, 1) * 2**0.5)[1] - 1  # nearest powers of two, in texels
+    levels = np.minimum(powers, num_levels - 1)
     mip_ids = textures * num_levels + levels
     order = np.argsort(mip_ids, kind="stable")
     out = np.empty((len(ids), 3), np.float32)
@@ -230,7 +233,7 @@ def look_up_colors(lit: LitRoom, ids: NDArray[np.int32], points: Float, spread: 
 
 
 def _sample_texture(texture: Texture, uv: Float) -> Float:
-    """Sample a repeating texture bilinearly; y of the texture points down."""
+    """Sample a repeating texture bilinearly at ``uv [n,2]``; return the colours ``[n,3]``. The v axis points down."""
     size = len(texture)
     remap_width = 4096  # columns of a table for cv2.remap, which takes at most 32767
     rows = -(-len(uv) // remap_width)
@@ -242,7 +245,7 @@ def _sample_texture(texture: Texture, uv: Float) -> Float:
 
 
 def render_light(lit: LitRoom, c2w: Array, lens: Pinhole, samples: int) -> Float:
-    """Render the linear light ``[h,w,3]`` that a view's pixels receive, with ``samples`` x ``samples`` rays each."""
+    """Render the linear light ``[h,w,3]`` of a view's pixels: means of ``samples`` x ``samples`` rays each."""
     hits = trace(lit.shapes, c2w, lens, samples)
     h, w = hits.depth.shape
     out = np.zeros((h * w, 3), np.float32)
@@ -257,29 +260,29 @@ def _reflect(lit: LitRoom, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens
     points, normals = hits.points.reshape(-1, 3)[rows], hits.normals.reshape(-1, 3)[rows]
     ids, depth = hits.ids.reshape(-1)[rows], hits.depth.reshape(-1)[rows]
     y, x = np.divmod(rows, hits.depth.shape[1])
-    rays = np.stack([(x + 0.5) / samples - lens.width / 2, (y + 0.5) / samples - lens.height / 2], 1) / lens.focal
-    rays = rotate(np.concatenate([rays, np.ones((len(rays), 1))], 1), c2w[:3, :3])
+    slopes = np.stack([(x + 0.5) / samples - lens.width / 2, (y + 0.5) / samples - lens.height / 2], 1) / lens.focal
+    rays = rotate(np.concatenate([slopes, np.ones((len(slopes), 1))], 1), c2w[:3, :3])  # with the depth 1
     positions = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
-    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    min_cosine = 0.1  # bounds the size of a sample on a surface, which would grow without end at grazing angles
-    cosine = np.maximum(-(normals * rays).sum(1), min_cosine)
+    directions = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    min_cosine = 0.1  # at smaller cosines, that is at grazing angles, a sample would cover too much of a surface
+    cosine = np.maximum(-(normals * directions).sum(1), min_cosine)
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
     gamma = 2.2  # exponent from sRGB to linear light
     albedo = power(look_up_colors(lit, ids, points, spread), gamma)
-    return _shade(lit, ids, albedo, positions, normals, rays)
+    return _shade(lit, ids, albedo, positions, normals, directions)
 
 
 def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Float, Float]:
     """Compute the direct and the ambient light ``[n]`` that arrives at points, with shadows."""
     light, half_side = lit.room.light, lit.radius
     direct, indirect = np.zeros((2, len(positions)), np.float32)
-    key_bias, ambient_bias = 2.0, 1.2  # texels by which a surface may lie behind its shadow map's depth and be lit
-    bias = key_bias * 2 * half_side / KEY_SIZE
+    key_texels, ambient_texels = 2.0, 1.2  # texels by which a lit surface may lie behind the shadow map's depth
+    key_bias, ambient_bias = key_texels * 2 * half_side / KEY_SIZE, ambient_texels * 2 * half_side / AMBIENT_SIZE
+    key_axes, ambient_axes = lit.axes[:KEY_MAPS], lit.axes[KEY_MAPS:]
     equal = np.full(KEY_MAPS, 1 / KEY_MAPS)
-    # add_light adds to its last argument
-    add_light(positions, normals, lit.axes[:KEY_MAPS], lit.middle, half_side, lit.key, bias, equal, direct)
-    bias = ambient_bias * 2 * half_side / AMBIENT_SIZE
-    add_light(positions, normals, lit.axes[KEY_MAPS:], lit.middle, half_side, lit.ambient, bias, lit.weights, indirect)
+    # Each call adds to its last argument
+    add_light(positions, normals, key_axes, lit.middle, half_side, lit.key, key_bias, equal, direct)
+    add_light(positions, normals, ambient_axes, lit.middle, half_side, lit.ambient, ambient_bias, lit.weights, indirect)
     lamp_distance = np.linalg.norm(positions - light.lamp.astype(np.float32), axis=1)
     lamp_gain, lamp_falloff = 2.5, 1.5  # brightness of the direct light at the lamp, and its decrease with the distance
     direct *= lamp_gain / (1 + (lamp_distance / norm(light.lamp - lit.room.focus)) ** 2 * lamp_falloff)
@@ -287,7 +290,10 @@ def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Flo
 
 
 def _shade(lit: LitRoom, ids: NDArray[np.int32], albedo: Float, positions: Float, normals: Float, rays: Float) -> Float:
-    """Compute the linear light ``[n,3]`` that points reflect or emit towards the camera."""
+    """Compute the linear light ``[n,3]`` that points of shapes ``ids [n]`` reflect or emit towards the camera.
+
+    ``rays`` are unit vectors from the camera to the points.
+    """
     light, shapes = lit.room.light, lit.shapes.shapes
     direct, indirect = _incoming_light(lit, positions, normals)
     gloss = np.array([s.material.gloss for s in shapes], np.float32)[ids]

@@ -18,7 +18,7 @@ Vector: TypeAlias = Sequence[float] | Array  # of length 3
 Pair: TypeAlias = tuple[float, float]
 NUM_WAVES = 4  # number of waves that bend the surface of a shape
 NO_WAVES = np.zeros((NUM_WAVES, 5))  # waves with the amplitude 0, for a smooth surface
-TAPER, AMPLITUDE = 3, 4  # column of the taper in a shape's size, and of the amplitude in its waves
+TAPER, AMPLITUDE = 3, 4  # columns: the taper in a shape's size, and the amplitude in its waves
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def box(low: Vector, high: Vector, material: Material) -> Shape:
 
 
 def quad(centre: Vector, half: Pair, material: Material, rotation: Array = FACING_FRONT) -> Shape:
-    """Make a rectangle with half sides ``half``; it faces -z unless it is rotated."""
+    """Make a rectangle with the half sides ``half``. Without a rotation it faces -z."""
     return Shape(QUAD, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
 
@@ -93,9 +93,9 @@ def ball(centre: Vector, radii: Vector, material: Material) -> Shape:
 
 
 def column(foot: Vector, height: float, radius: float, material: Material, *, top: float = 1.0) -> Shape:
-    """Make an upright cylinder or cone on ``foot``; its top radius is ``top`` times ``radius``."""
+    """Make an upright cylinder or cone on the point ``foot``. Its top radius is ``top`` times ``radius``."""
     x, y, z = foot
-    size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel takes the radii at -y, which is up
+    size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel takes the radii of the top, which is at -y
     return Shape(CONE, size, material, np.array([x, y - height / 2, z]))
 
 
@@ -110,7 +110,7 @@ def rod(start: Vector, end: Vector, radius: float, material: Material) -> Shape:
 
 
 def leaf(centre: Vector, half: Pair, material: Material, rotation: Array) -> Shape:
-    """Make a pointed leaf with half sides ``half``; its tips are on the y axis of its own frame."""
+    """Make a pointed leaf with the half sides ``half``. Before the rotation its tips are on the y axis."""
     return Shape(LEAF, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
 
@@ -156,8 +156,8 @@ def pack_shapes(shapes: Sequence[Shape]) -> ShapeArrays:
     )
 
 
-def bounds(shapes: ShapeArrays) -> Array:
-    """Compute half sizes ``[m,3]`` of the shapes' bounding boxes in shape frames."""
+def half_sizes(shapes: ShapeArrays) -> Array:
+    """Compute the half sizes ``[m,3]`` of the shapes' bounding boxes, along the axes of each shape."""
     half = shapes.sizes[:, :3].copy()
     relief = np.abs(shapes.waves[:, :, AMPLITUDE]).sum(1)
     half[shapes.kinds == BLOB] *= 1 + relief[shapes.kinds == BLOB, None]

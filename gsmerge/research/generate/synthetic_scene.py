@@ -37,7 +37,7 @@ from gsmerge.settings.setting import Settings, setting
 from gsmerge.types import Cameras, Gaussians
 
 FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
-SWING = 35  # largest angle between -z and a camera, seen from the focus, degrees
+SWING = 35  # largest angle, at the focus, between -z and the direction to a camera, degrees
 CAMERA_HEIGHTS = 0.9, 1.8  # range of the height of cameras above the ground, metres
 PathFunction = Callable[[float], Array]  # from a position along the path, 0 to 1, to a camera-to-world matrix [4,4]
 
@@ -67,11 +67,11 @@ def draw_path(room: Room, rng: np.random.Generator, num_views: int) -> PathFunct
     start = rng.uniform(-SWING, SWING - span)
     distance, height = rng.uniform(*room.distance), rng.uniform(*CAMERA_HEIGHTS)
     sway = rng.uniform(0, 0.4) * (CAMERA_HEIGHTS[1] - CAMERA_HEIGHTS[0])  # largest change of the height, metres
-    phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
+    phase, growth = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)  # phase of the sway, growth of the distance
 
     def pose(s: float) -> Array:
         """Return the camera-to-world matrix at a position along the path, 0 to 1."""
-        angle, radius = np.deg2rad(start + span * s), distance * (1 + closer * s)
+        angle, radius = np.deg2rad(start + span * s), distance * (1 + growth * s)
         x, _, z = room.focus
         eye = np.array([x + radius * sin(angle), -(height + sway * sin(6 * s + phase)), z - radius * cos(angle)])
         return look_at(eye, room.focus, 0.03 * sin(5 * s + phase))
@@ -159,20 +159,23 @@ class _PhotoSession:
 
 
 def make_synthetic_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScene:
-    """Generate scene ``index`` of a series; the same arguments give the same bits on any number of threads."""
+    """Generate scene ``index`` of a series; the same arguments give the same bits on any number of threads.
+
+    Places along the path of the camera are alternately input views and held-out views.
+    """
     rng = np.random.default_rng([seed, index])
     session = _plan_session(rng, options)
     num_places = len(session.poses)
     photo_seeds = rng.integers(0, 2**63, num_places)
-    # Half of the scenes are in the frame of the first camera, as many exporters write them
+    # Half of the scenes have the first camera at the origin, as many exporters write them
     session = replace(session, to_export=invert_motion(session.poses[0]) if rng.random() < 0.5 else np.eye(4))
     views, targets = range(0, num_places, 2), range(1, num_places, 2)
-    errors = {place: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for place in views}
+    errors = {view: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for view in views}  # deviation and seed
 
     def take_view(place: int) -> tuple[Float, Array, Gaussians | None]:
         """Return the photo, the pose and the Gaussians of a place; held-out views have no Gaussians."""
         photo = session.take_photo(place, photo_seeds[place])
-        if place not in errors:
+        if place in targets:
             return photo, session.exported_pose(place), None
         return photo, *session.predict(place, photo, *errors[place])
 
@@ -189,7 +192,7 @@ def make_synthetic_scene(seed: int, index: int, options: GenerateOptions) -> Syn
 
 
 def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoSession:
-    """Draw the errors, cameras, room, path and exposure of a scene; the world is that of the room."""
+    """Draw the errors, cameras, room, path and exposure of a scene, in the world of the room."""
     noise = draw_noise(options.ranges, rng, options.noise)
     focal = max(options.width, options.height) * rng.uniform(*FOCAL)
     lens, scale = Pinhole(options.width, options.height, focal), options.photo_scale
@@ -203,14 +206,15 @@ def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoS
 
 
 def _shrink_lens(lens: Pinhole) -> Pinhole:
-    """Return the lens of previews, which show if views are usable and how bright they are."""
-    divisor = 8  # divides the sides of views
+    """Return a smaller camera for previews. They show if views are usable, and how bright they are."""
+    divisor = 8  # the sides of previews are those of views divided by this
     return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
 
 def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitRoom, PathFunction]:
-    """Draw a room and a path on which all views are usable; after too many tries, return the last ones."""
-    side = 1 << min(max(int(1.6 * max(lens.width, lens.height)).bit_length() - 1, 7), 10)  # side of textures, pixels
+    """Draw a room and a path on which all views are usable. After too many tries, return the last room and path."""
+    power = int(1.6 * max(lens.width, lens.height)).bit_length() - 1
+    side = 2 ** min(max(power, 7), 10)  # side of textures, pixels: a power of two near the photo's side
     path_tries, room_tries = 6, 6  # most paths per room, and most rooms
     for _ in range(room_tries):
         lit = light_room(build_room(Palette(rng, side)))
@@ -223,13 +227,13 @@ def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple
 
 
 def _take_photo(lit: LitRoom, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
-    """Render a photo with the errors of lens, sensor and exposure."""
+    """Render a photo ``[h,w,3]`` with the errors of lens, sensor and exposure."""
     rng = np.random.default_rng(seed)
     linear = render_light(lit, pose, lens, SAMPLE_RAYS)
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     square_radius = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
-    vignette = 0.3  # loss of light at a distance of one diagonal from the middle of a photo; grows with its square
+    vignette = 0.3  # share of light lost at one diagonal from the middle; it grows with the squared distance
     linear = linear * gains.astype(np.float32) * (1 - vignette * square_radius)[..., None].astype(np.float32)
     image = blur(tone_map(linear), noise.blur)
     sensor_noise = 0.004  # standard deviation of the noise of a photo, sRGB

@@ -32,8 +32,9 @@ def draw_octaves(
 ) -> Grey:
     """Draw noise as a sum of octaves. Each octave has half the cell size and ``fade`` times the strength of the last.
 
-    A ``fade`` of 0.3 gives clouds, 0.9 gives grit. ``first`` is the number of cells of the coarsest octave along a
-    side. ``stretch`` is the ratio of a cell's length to its height. ``ridged`` gives sharp crests, as in rock and bark.
+    A ``fade`` of 0.3 gives clouds, and one of 0.9 gives grit. ``first`` is the number of cells of the coarsest octave
+    along a side. ``stretch`` is the ratio of a cell's length to its height. Noise that is ``ridged`` has sharp crests,
+    as in rock and bark.
     """
     out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
     while cells <= size // 2:
@@ -45,7 +46,7 @@ def draw_octaves(
 
 
 def pixel_places(size: int) -> tuple[Grey, Grey]:
-    """Return x and y of the centre of every pixel, in sides of the picture."""
+    """Return x and y of the centres of all pixels, as shares of the picture's side."""
     centres = (np.arange(size, dtype=np.float32) + 0.5) / size
     x, y = np.meshgrid(centres, centres)
     return x, y
@@ -130,10 +131,10 @@ def draw_color(
 
     Without a range of hues, half of the colours are warm and the others have any hue.
     """
-    h = rng.uniform(*hue) % 1 if hue is not None else rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()
+    h = (rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()) if hue is None else rng.uniform(*hue) % 1
     s, v = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5, rng.uniform(*light)
-    ramp = np.clip(np.abs(np.mod(6 * h + np.array([0, 4, 2]), 6) - 3) - 1, 0, 1)
-    return (v * (1 - s * (1 - ramp))).astype(np.float32)
+    pure = np.clip(np.abs(np.mod(6 * h + np.array([0, 4, 2]), 6) - 3) - 1, 0, 1)  # RGB of the hue at s = v = 1
+    return (v * (1 - s * (1 - pure))).astype(np.float32)
 
 
 def draw_shades(rng: np.random.Generator, base: Color, contrast: float) -> tuple[Color, Color]:
@@ -256,7 +257,7 @@ def draw_bark(rng: np.random.Generator, size: int) -> Texture:
 def draw_foliage(rng: np.random.Generator, size: int) -> Texture:
     """Draw one leaf: veins from a middle rib."""
     base = draw_color(rng, hue=(0.2, 0.38), strength=(0.4, 0.85), light=(0.2, 0.6))
-    if rng.random() < 0.25:  # petals
+    if rng.random() < 0.25:  # a petal instead
         base = draw_color(rng, hue=(0.8, 1.12), strength=(0.4, 0.9), light=(0.6, 0.95))
     low, high = draw_shades(rng, base, 0.45)
     x, y = pixel_places(size)
@@ -398,7 +399,7 @@ MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4} 
 
 @dataclass
 class Palette:
-    """The textures of a scene, drawn when a material first needs them."""
+    """The textures of a scene. A texture is drawn when a material needs it first."""
 
     rng: np.random.Generator
     size: int  # side of the textures, pixels
@@ -406,9 +407,9 @@ class Palette:
     by_kind: dict[str, list[int]] = field(default_factory=dict)  # indices of the textures of each kind
 
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
-        """Make a material of a random one of ``kinds``. Its texture is new, unless the kind has enough textures.
+        """Make a material of a random one of ``kinds``, with a new texture until the kind has its number of textures.
 
-        ``repeat`` is the number of repeats per world unit; with 0 the texture covers every face once. ``gloss`` is
+        ``repeat`` is the number of repeats per world unit. If it is 0, the texture covers every face once. ``gloss`` is
         random by default, and zero in about half of the cases.
         """
         kind = kinds[self.rng.integers(len(kinds))]

@@ -1,7 +1,7 @@
 """Make training examples: the Feature Gaussians of a scene's superpixels before any network, and the photos.
 
-The networks get some of the scene's views. The photos of all other views, and held-out photos, are novel views. The
-choice of views is fixed, or drawn again for every window (:func:`draw_random_views`).
+The networks get some of the scene's views. The photos of all other views, and held-out photos, are novel views. An
+example has fixed views, or a window gets random ones of them (:func:`draw_random_views`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Pixels
 class ColorMap:
     """A linear change of colours that is applied to a scene and its photos."""
 
-    order: tuple[int, ...] = (0, 1, 2)  # source channel of each channel
+    order: tuple[int, ...] = (0, 1, 2)  # for each channel, the old channel from which it is taken
     gain: float = 1.0  # factor; negative if colours are inverted
     offset: float = 0.0  # added after the gain, sRGB in [0, 1]
 
@@ -49,7 +49,7 @@ class ColorMap:
         return colors.take(self.order, -1) * np.float32(self.gain) + np.float32(self.offset)
 
     def change_sh0(self, sh0: np.ndarray) -> np.ndarray:
-        """Change base colours ``[...,3]``, coefficients of harmonics."""
+        """Change the sh0 ``[...,3]`` of Gaussians like colours."""
         shift = (self.gain / 2 + self.offset - 0.5) / SH_C0
         return sh0.take(self.order, -1) * np.float32(self.gain) + np.float32(shift)
 
@@ -61,7 +61,7 @@ class Example:
     name: str  # name of the scene
     unit: float  # unit of length of the scene, the median depth of the Feature Gaussians, in canonical units
     members: Members  # the Gaussians of v views
-    cameras: Cameras  # these views
+    cameras: Cameras  # cameras of these v views
     features: FeatureGaussians  # g analytic Feature Gaussians before merging
     base: Gaussians  # g Gaussians, one for each Feature Gaussian
     photos: Photos  # p photos without colours: first those of the views, then those of novel views
@@ -111,7 +111,7 @@ def make_example(training: TrainingScene, options: TrainOptions, density: float,
     level = options.photo_level(scene.cameras.width, scene.cameras.height)
     images = (training.photos(level).images.clip(0, 1) * 255).round().astype(np.uint8)
     focals = np.sqrt(np.abs(scene.cameras.Ks[:, 0, 0] * scene.cameras.Ks[:, 1, 1]))
-    # A footprint times the focal length is a depth, since footprints are sizes of pixels in the Feature Gaussian's view
+    # A footprint is the size of a pixel at the Feature Gaussian's depth, so it is the depth over the focal length
     unit = float(lower_median(features.footprints * focals.astype(np.float64)[features.views]))
     return Example(
         name, unit, members, scene.cameras, features, feature_to_gaussians(features),
@@ -128,7 +128,7 @@ def select_example_views(example: Example, ids: Sequence[int]) -> Example:
     new_views[list(ids)] = np.arange(len(ids))
     rows = np.flatnonzero(new_views[example.features.views] >= 0)
     part = take_features(example.features, rows)
-    member_rows, pixels = Pixels(members.pixels, members.fronts, own=True).select(ids)
+    member_rows, pixels = Pixels(members.pixels, members.fronts, own=True).select(ids)  # members of the kept views
     new_rows = np.full(len(members.pixels), -1, np.int32)  # new row of each member; -1 if it is left out
     new_rows[member_rows] = np.arange(len(member_rows), dtype=np.int32)
     columns = {f.name: getattr(members, f.name)[member_rows] for f in fields(Members) if f.name != "fronts"}

@@ -1,6 +1,6 @@
 """Train with AdamW on windows of photos, with validation and checkpoints; an interrupted run can be resumed.
 
-Validation uses fixed windows and whole photos of the validation examples, which are read one after another.
+Validation uses the same windows of its examples every time. The examples are read one after another.
 
 Random numbers depend only on seed and step, and the gradients of crops are added in order. So a resumed run ends with
 the same bytes as an uninterrupted run, on any number of threads.
@@ -38,7 +38,8 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 
 VALIDATION = 2**32  # replaces the step in the seed of the random numbers of validation
 LossRow = dict[str, float]  # a row of the table of losses, by column
-Scores = list[tuple[float, float, float]]  # of each window: PSNR (dB) without and with networks, share merged
+# For each window: PSNR (dB) without and with networks, and share of merged Feature Gaussians
+Scores = list[tuple[float, float, float]]
 OnTrainingStep = Callable[[int, int, float], None]  # called with step, number of steps, loss
 RUN_FORMAT = "gsmerge-training"
 RUN_REMEDY = "choose another --output, or remove it to start again"
@@ -52,11 +53,13 @@ def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions)
 
 
 def _score_shard(networks: Networks, shard: Shard, number: int, options: TrainOptions) -> Scores:
-    """Score random windows of a shard; the windows depend on its ``number``."""
+    """Score random windows of a shard. A shard of the same ``number`` gets the same windows every time."""
     rng = np.random.default_rng([options.seed, VALIDATION, number])
     example = read_shard(shard)
     windows = [
-        sample_window(draw_random_views(example, options, rng), options.levels, options.window, options.most, 1, rng)
+        sample_window(
+            draw_random_views(example, options, rng), options.levels, options.window, options.most, novel=1, rng=rng
+        )
         for _ in range(options.validation_windows)
     ]
 
@@ -143,8 +146,8 @@ def _train(
     state = TrainingState(networks, deepcopy(networks).requires_grad_(False), optimizer)
     losses = list[Tensor]()
     hashes = {kind: [shard.sha256 for shard in part] for kind, part in (("data", shards), ("validation", validation))}
-    head = {"options": options.to_dict(), **hashes}
-    step, rows = _load_run(out, state, head)
+    facts = {"options": options.to_dict(), **hashes}
+    step, rows = _load_run(out, state, facts)
     resumed = step
     read = lru_cache(options.buffer)(read_shard)
     while step < options.steps:
@@ -156,20 +159,24 @@ def _train(
             mean = float(torch.stack(losses).mean())
             rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
             losses = []
-            _save_run(out, state, rows, head, options)
+            _save_run(out, state, rows, facts, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
     best_psnr = max(row["psnr_learned"] for row in rows)
     return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], best_psnr, resumed)
 
 
 def _save_run(
-    out: Path, state: TrainingState, rows: Sequence[LossRow], head: Mapping[str, Any], options: TrainOptions
+    out: Path, state: TrainingState, rows: Sequence[LossRow], facts: Mapping[str, Any], options: TrainOptions
 ) -> None:
-    """Write the checkpoints, the table of losses, and the state for resuming the run."""
+    """Write the checkpoints, the table of losses, and the state for resuming the run.
+
+    ``facts`` are options and hashes of the run, which all files but the table contain. The best checkpoint is replaced
+    if the last row has the highest PSNR.
+    """
     figures = {name: value for name, value in rows[-1].items() if name not in ("step", "rate", "loss")}
-    training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **head}
+    training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **facts}
     networks = deepcopy(state.smooth)
-    with torch.no_grad():
+    with torch.no_grad():  # checkpoints have the opacity shift in the bias of the heads
         for module in networks.heads.values():
             assert isinstance(module, Head)
             module.out.bias[LOGIT_COLUMN] += options.opacity_shift
@@ -179,13 +186,13 @@ def _save_run(
     lines = [",".join(rows[0]), *(",".join(f"{value:.8g}" for value in row.values()) for row in rows)]
     with atomic_output(out / "losses.csv", overwrite=True) as temporary:
         temporary.write_bytes("\n".join([*lines, ""]).encode())
-    save_training(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
+    save_training(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **facts})
 
 
 def _load_run(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[LossRow]]:
-    """Load the run in the folder into ``state``; return its step and table of losses, step 0 and no rows without a run.
+    """Load the run in the folder into ``state``; return its step, and the rows of its table of losses.
 
-    Raises SceneError if the run differs from what is ``expected``.
+    Without a run, the step is 0 and there are no rows. Raises SceneError if a fact of the run is not as ``expected``.
     """
     path = out / "state.safetensors"
     if not path.exists():
@@ -227,7 +234,8 @@ def _take_step(
     for group in state.optimizer.param_groups:
         group["lr"] = options.rate_at(step)
     state.optimizer.step()
-    share = min(options.average, (1 + step) / (10 + step))  # less at first, so that the start is soon forgotten
+    # The share is small at first, so that the mean forgets the first weights soon
+    share = min(options.average, (1 + step) / (10 + step))
     with torch.no_grad():
         for _, parameter, smooth in state.pairs():
             smooth.lerp_(parameter, 1 - share)
@@ -235,7 +243,7 @@ def _take_step(
 
 
 def save_training(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
-    """Write weights, running means, moments and facts about the run to a file, replacing it."""
+    """Write weights, running means, moments and ``facts`` about the run to a file, which is replaced."""
     tensors: dict[str, torch.Tensor] = {}
     for name, parameter, mean in state.pairs():
         moments = state.optimizer.state[parameter]
@@ -246,7 +254,7 @@ def save_training(path: Path, state: TrainingState, facts: Mapping[str, Any]) ->
 
 
 def load_training(path: Path, state: TrainingState) -> dict[str, Any]:
-    """Read weights, running means and moments into ``state``; return the facts about the run.
+    """Read a file of :func:`save_training` into ``state``; return the facts about the run.
 
     Raises SceneError if the file is damaged or has other networks.
     """

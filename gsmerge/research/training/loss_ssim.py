@@ -1,7 +1,7 @@
 """Structural similarity in the loss of training, by the formula that the full fit uses.
 
-The windows are uniform, which makes the gradient quick. So the values differ from those of
-:func:`gsmerge.raster.metrics.ssim`, which measures. The full fit takes its loss and gradient from
+The windows are uniform, which makes the gradient quick. The SSIM of reports, :func:`gsmerge.raster.metrics.ssim`, has
+Gaussian windows, so its values differ. The full fit takes its loss and gradient from
 ``gsmerge/kernels/raster/image_loss``.
 """
 
@@ -20,8 +20,8 @@ LOSS_WINDOW = WINDOW_SIDE  # pixels per side of the windows of loss_ssim
 def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
     """Compute the structural similarity ``[h,w,3]`` around every pixel; torch can differentiate it.
 
-    Windows are uniform and have ``LOSS_WINDOW`` pixels per side; pixels beyond the border are zero. Covariances are
-    those of the population; K1 = .01, K2 = .03.
+    Windows are uniform, and have ``LOSS_WINDOW`` pixels per side. Pixels beyond the border are zero. Covariances are
+    sums divided by the number of pixels. The constants of SSIM are K1 = .01 and K2 = .03.
     """
     import torch
     from torch.nn.functional import avg_pool2d
@@ -29,5 +29,5 @@ def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
     stacked = torch.stack([image, photo, image * image, photo * photo, image * photo]).permute(0, 3, 1, 2)
     mx, my, xx, yy, xy = avg_pool2d(stacked, LOSS_WINDOW, 1, LOSS_WINDOW // 2).permute(0, 2, 3, 1)
     c1, c2 = float(C1), float(C2)
-    above = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
-    return above / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
+    numerator = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
+    return numerator / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))

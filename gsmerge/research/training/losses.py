@@ -2,8 +2,9 @@
 
 All Feature Gaussians that reach into a window of a photo run through all networks, and the window is rendered from them
 (paper section 4.6). Pixels that the scene does not cover have no loss, so networks need not guess them. LPIPS has the
-values of :mod:`gsmerge.measure.lpips`, and torch can differentiate it. In early training regularizers hold Gaussians
-near the moments of their groups, which are the paper's teacher, and keep siblings apart.
+values of :mod:`gsmerge.measure.lpips`, and torch can differentiate it. Two regularizers act in early training. One
+penalises Gaussians that are far from the moments of their groups, which are the paper's teacher. The other penalises
+children of one group that lie upon each other.
 """
 
 from __future__ import annotations
@@ -87,8 +88,8 @@ def window_loss(
         prediction = decode_crop(refined, crop, k)
         loss = photometric_loss(draw_window(prediction.gaussians, window, background), window, options, step)
         if diversity and k > 1:
-            spread = diversity_loss(prediction.gaussians, prediction.parents, prediction.sizes)
-            loss = loss + diversity * float(loss.detach()) * spread
+            sibling_loss = diversity_loss(prediction.gaussians, prediction.parents, prediction.sizes)
+            loss = loss + diversity * float(loss.detach()) * sibling_loss
         if teacher:
             loss = loss + teacher * teacher_loss(prediction, crop.example.members)
         total = total + loss / len(levels)
@@ -109,14 +110,14 @@ def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:
 
 
 def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """Average the SSIM of the fit's loss over images ``[h,w,3]`` within ``mask [h,w]``; 1 if it is empty."""
+    """Average :func:`loss_ssim` of images ``[h,w,3]`` over the pixels of ``mask [h,w]``. An empty mask gives 1."""
     if not bool(mask.any()):
         return torch.ones(())
     return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()
 
 
 def photometric_loss(image: Tensor, window: Window, options: TrainOptions, step: int) -> Tensor:
-    """Add up the weighted difference of colours, 1 - SSIM and, if it has a weight in this step, LPIPS (VGG)."""
+    """Add up the weighted losses of a render: difference of colours, 1 - SSIM, and LPIPS in the steps that use it."""
     photo, mask = window.image, window.mask
     color = color_loss(image, photo, mask, options.photo_loss)
     similar = masked_ssim(image, photo, mask) if options.ssim_weight else torch.ones(())
@@ -126,9 +127,10 @@ def photometric_loss(image: Tensor, window: Window, options: TrainOptions, step:
 
 
 def render_window(window: Window, networks: Networks | None, options: TrainOptions) -> tuple[Tensor, float]:
-    """Render a window ``[h,w,3]`` on black, clipped to [0, 1]; also return the share of merged Feature Gaussians.
+    """Predict and render a window ``[h,w,3]`` on black, clipped to [0, 1].
 
-    Without networks only the analytic stages are used, and the share is 0.
+    Also returns the share of the Feature Gaussians that were merged with others. Without ``networks`` the closed
+    formulas of the stages are used, and the share is 0.
     """
     with torch.no_grad():
         if networks is None:
@@ -140,7 +142,7 @@ def render_window(window: Window, networks: Networks | None, options: TrainOptio
 
 
 def window_psnr(window: Window, image: Tensor) -> float:
-    """Compute the PSNR (dB) of a render ``[h,w,3]`` of a window within the mask."""
+    """Compute the PSNR (dB) of a render ``[h,w,3]`` of a window, over the pixels of the window's mask."""
     error = float(color_loss(image, window.image, window.mask, "mse"))
     max_db = 100.0  # PSNR of windows without an error
     return min(max_db, -10 * float(np.log10(max(error, 1e-12))))
@@ -151,9 +153,9 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
 
     The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means (eq.
     teacher_mean, teacher_cov), their mean colour, and the opacity that conserves their optical depth. The loss is the
-    angle between the rotations plus L1 distances: of the means in sizes of the teacher, of the logarithms of the
-    scales, of the opacities and of the base colours. A Gaussian has 24 equivalent pairs of rotation and scales; the
-    pair nearest to the prediction is used.
+    angle between the rotations plus L1 distances of means, logarithms of scales, opacities and base colours. The unit
+    of the distance of means is the teacher's size. A Gaussian has 24 equivalent pairs of rotation and scales, of which
+    the pair nearest to the prediction is used.
     """
     g, merged = prediction.gaussians, prediction.merged
     if len(g) == 0:
@@ -165,9 +167,8 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     scales = (scales[:, None] @ orders.abs())[:, 0]
     rotations = quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats) @ orders
     cosines = (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
-    angles = torch.atan2(
-        (skew_vectors(rotations).square().sum(1) + 1e-12).sqrt(), cosines
-    )  # finite gradients at 0, too
+    # The small number makes the gradient finite at an angle of 0
+    angles = torch.atan2((skew_vectors(rotations).square().sum(1) + 1e-12).sqrt(), cosines)
     sizes = gaussian_sizes(scales)
     distances = (g.means - teacher.means).abs() / sizes[:, None]
     stretches = (torch.log(g.scales) - torch.log(scales)).abs()
@@ -177,10 +178,10 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
 
 
 def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
-    """Return the signed axis permutations ``[n,3,3]`` that bring ``quats [n,4]`` nearest to a reference.
+    """Return the signed permutations ``[n,3,3]`` of axes with which ``quats [n,4]`` are nearest to ``reference [n,4]``.
 
-    A Gaussian has 24 equivalent pairs of rotation and scales: the rotation times a permutation, and the scales in its
-    order.
+    A Gaussian does not change if its rotation is multiplied by one of these 24 permutations, and its scales are
+    permuted alike.
     """
     signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
     orders = torch.stack([torch.eye(3)[list(order)] for order in permutations(range(3))])
@@ -195,20 +196,21 @@ GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of dive
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
-    """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D); 0 to 1.
+    """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D), from 0 to 1.
 
-    ``parents [n]`` of the children are ascending. The result is a mean over pairs, weighted by their volumes in units
-    of the ``sizes [n]`` of their groups. The weights have no gradient, since it would make siblings small. With volumes
-    in world units, as in the paper, the loss of a million small Gaussians would be almost 0.
+    Siblings are children of one group. ``parents [n]`` of the children are ascending. The result is a mean over pairs
+    of siblings, weighted by their volumes in units of the ``sizes [n]`` of their groups. The weights have no gradient,
+    since a gradient would make siblings small. With volumes in world units, as in the paper, the loss of a million
+    small Gaussians would be almost 0.
     """
     left, right = sibling_pairs(parents)
     if len(left) == 0:
         return gaussians.means.new_zeros(())
     volumes = (gaussians.scales.detach() / sizes.detach()[:, None]).prod(1)
     weights = (volumes[left] * volumes[right]).clamp_min(1e-30).sqrt()
-    profile = overlap_profile(gaussians, left, right)
-    opacity = (gaussians.opacities[left] - gaussians.opacities[right]).square()
-    return (weights * (GEOMETRY_WEIGHT * profile + OPACITY_WEIGHT * opacity)).sum() / weights.sum()
+    overlap_loss = overlap_profile(gaussians, left, right)
+    opacity_loss = (gaussians.opacities[left] - gaussians.opacities[right]).square()
+    return (weights * (GEOMETRY_WEIGHT * overlap_loss + OPACITY_WEIGHT * opacity_loss)).sum() / weights.sum()
 
 
 def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
@@ -226,9 +228,10 @@ def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor:
-    """Compute the paper's U-shaped overlap penalty of pairs ``[p]``, which is 0 for boxes that overlap by half.
+    """Compute the paper's penalty ``[p]`` of pairs that overlap too much or too little.
 
-    The boxes have one standard deviation along the world's axes, as in matching.
+    It is 0 for pairs whose boxes have an intersection over union of a half. A box is parallel to the world's axes, and
+    reaches one standard deviation to each side, as in matching.
     """
     axes = quat_to_rotmat(gaussians.quats) * gaussians.scales[:, None]
     halves = axes.norm(dim=2)
@@ -239,6 +242,6 @@ def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor
     overlaps = shared / union
     contact = (a.norm(dim=1) + b.norm(dim=1)).clamp_min(1e-12)
     gaps = (away.norm(dim=1) - contact).clamp_min(0) / contact
-    free_overlap = 0.5  # overlap of the boxes of two children at which the loss is 0
+    free_overlap = 0.5  # intersection over union of two boxes at which the penalty is 0
     apart = 0.5 * ((free_overlap - overlaps) / free_overlap) ** 3 + 0.5 * (1 - torch.exp(-3 * gaps))
     return torch.where(overlaps >= free_overlap, ((overlaps - free_overlap) / (1 - free_overlap)) ** 3, apart)

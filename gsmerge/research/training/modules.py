@@ -1,10 +1,10 @@
 """Encoder, decoder heads, merger and refiner as torch modules, for training (paper sections 4.2 to 4.5).
 
-All of them take tokens and return raw corrections of the results of the analytic stages (fig. architecture). The last
-layers start at zero, so untrained networks change nothing.
+All of them take tokens, and return raw corrections of what the closed formulas of the stages compute (fig.
+architecture). The last layers start at zero, so untrained networks change nothing.
 
-They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded; ``mask`` is True for tokens of
-the set and False for padding. Padded tokens are never attended to.
+They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded to one size. ``mask`` is True
+for tokens of the set and False for padding, which gets no attention.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 def zero_init(layer: nn.Linear) -> nn.Linear:
-    """Set a layer's weights and bias to zero, so that it corrects nothing before training."""
+    """Set a last layer's weights and bias to zero, so that its network corrects nothing before training."""
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer
 
 
 def small_init(layer: nn.Linear) -> nn.Linear:
-    """Make a layer's initial outputs small but different, since siblings with equal outputs would stay equal."""
+    """Make a layer's initial weights small. With zeros, the children of a group would be equal and stay equal."""
     with torch.no_grad():
         for values in layer.parameters():
             values.mul_(0.1)
@@ -56,6 +56,7 @@ class Attention(nn.Module):
     """Multi-head attention from ``x [b,q,w]`` to ``context [b,n,w]`` with ``mask [b,n]``."""
 
     def __init__(self, width: int, heads: int) -> None:
+        """Make the layers for tokens of ``width`` numbers."""
         super().__init__()
         self.heads = heads
         self.query, self.pair, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
@@ -71,19 +72,20 @@ class Attention(nn.Module):
 class AttentionBlock(nn.Module):
     """Attention and an MLP, both residual with normalised inputs (paper fig. architecture: SAB).
 
-    With ``first`` only the first token is computed, ``[b,1,w]``.
+    If ``first_only``, the result is the first token alone, ``[b,1,w]``.
     """
 
-    def __init__(self, width: int, heads: int, *, first: bool = False) -> None:
+    def __init__(self, width: int, heads: int, *, first_only: bool = False) -> None:
+        """Make the layers for tokens of ``width`` numbers."""
         super().__init__()
-        self.first = first
+        self.first_only = first_only
         self.before, self.between = nn.LayerNorm(width), nn.LayerNorm(width)
         self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Return the tokens ``[b,n,w]`` after attending to each other."""
         context = self.before(x)
-        if self.first:
+        if self.first_only:
             x = x[:, :1]
         x = x + self.attention(context[:, : x.shape[1]], context, mask)
         return x + self.mlp(self.between(x))
@@ -93,6 +95,7 @@ class Pooling(nn.Module):
     """Reduce a set to one token by attention from a learned query (paper fig. architecture: PMA)."""
 
     def __init__(self, width: int, heads: int) -> None:
+        """Make the layers for tokens of ``width`` numbers, and the query."""
         super().__init__()
         self.seed = nn.Parameter(torch.randn(1, 1, width) / width**0.5)
         self.before, self.between = nn.LayerNorm(width), nn.LayerNorm(width)
@@ -111,15 +114,16 @@ class SetNetwork(nn.Module):
     Tokens pass through an MLP, attention blocks and pooling. The result is joined with the group's numbers in an MLP.
     """
 
-    def __init__(self, token: int, out: int, options: NetworkOptions) -> None:
+    def __init__(self, token_width: int, out: int, options: NetworkOptions) -> None:
+        """Make the layers for tokens of ``token_width`` numbers, and a result of ``out`` numbers."""
         super().__init__()
         width, heads = options.width, options.heads
-        self.embed = mlp(token, width, width)
+        self.embed = mlp(token_width, width, width)
         self.blocks = nn.ModuleList(AttentionBlock(width, heads) for _ in range(options.blocks))
         self.pool, self.join = Pooling(width, heads), mlp(width + GROUP_COLUMNS, 2 * width, out)
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
-        """Compute ``[b,out]`` from ``tokens [b,n,token]``, ``mask [b,n]`` and ``group [b,GROUP_COLUMNS]``."""
+        """Compute ``[b,out]`` from ``tokens [b,n,token_width]``, ``mask [b,n]`` and ``group [b,GROUP_COLUMNS]``."""
         x = self.embed(tokens)
         for block in self.blocks:
             x = block(x, mask)
@@ -130,6 +134,7 @@ class Encoder(nn.Module):
     """Network from a group's members to the group's latent and a shift of its mean."""
 
     def __init__(self, options: NetworkOptions) -> None:
+        """Make the layers. An untrained encoder shifts no mean."""
         super().__init__()
         self.set = SetNetwork(MEMBER_COLUMNS, options.width, options)
         self.latent, self.shift = nn.Linear(options.width, options.latent), zero_init(nn.Linear(options.width, 3))
@@ -144,6 +149,7 @@ class Head(nn.Module):
     """Network from a Feature Gaussian and its K analytic children to corrections of the children."""
 
     def __init__(self, slots: int, options: NetworkOptions) -> None:
+        """Make the layers of the head for at most ``slots`` children of a Feature Gaussian."""
         super().__init__()
         self.slots, width = slots, options.width
         self.numbers = list(options.head_numbers)
@@ -160,9 +166,10 @@ class Head(nn.Module):
 
 
 class Merger(nn.Module):
-    """Network from the Feature Gaussians of a cluster to corrections of the pooled one and its latent."""
+    """Network from the Feature Gaussians of a cluster to corrections of the pooled Feature Gaussian and its latent."""
 
     def __init__(self, options: NetworkOptions) -> None:
+        """Make the layers. An untrained merger corrects nothing."""
         super().__init__()
         self.set = SetNetwork(PART_COLUMNS + options.latent, options.width, options)
         self.out = zero_init(nn.Linear(options.width, FEATURE + options.latent))
@@ -173,14 +180,15 @@ class Merger(nn.Module):
 
 
 class Refiner(nn.Module):
-    """Network from a Feature Gaussian and its nearest neighbours to corrections of it and its latent."""
+    """Network from a Feature Gaussian and its nearest neighbours to corrections of this Feature Gaussian."""
 
     def __init__(self, options: NetworkOptions) -> None:
+        """Make the layers. The last block computes only the token of the Feature Gaussian itself."""
         super().__init__()
         width, last = options.width, options.refine_blocks - 1
         self.embed = mlp(PART_COLUMNS + 1 + options.latent, width, width)
         self.blocks = nn.ModuleList(
-            AttentionBlock(width, options.heads, first=i == last) for i in range(options.refine_blocks)
+            AttentionBlock(width, options.heads, first_only=i == last) for i in range(options.refine_blocks)
         )
         self.norm, self.join = nn.LayerNorm(width), mlp(width + GROUP_COLUMNS, 2 * width, width)
         self.out = zero_init(nn.Linear(width, FEATURE + options.latent))
@@ -195,9 +203,10 @@ class Refiner(nn.Module):
 
 
 class Networks(nn.Module):
-    """The torch modules of a checkpoint; None for networks that the options leave out."""
+    """The torch modules of a checkpoint. A network that the options leave out is None."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
+        """Make the networks that the options ask for, with random weights."""
         super().__init__()
         self.options = chosen = options or NetworkOptions()
         self.encoder = Encoder(chosen) if chosen.encoder else None
@@ -205,7 +214,7 @@ class Networks(nn.Module):
         self.refiner = Refiner(chosen) if chosen.refiner else None
         self.heads = nn.ModuleDict({str(slots): Head(slots, chosen) for slots in SLOTS})
 
-    in_parallel = False  # tables of groups run one after another, because gradients are recorded
+    in_parallel = False  # gradients are recorded, so tables of groups have to run one after another
 
     def run(self, name: str, *inputs: Array) -> Tensor:
         """Run the module ``name`` like :meth:`NetworkWeights.run`, with gradients."""

@@ -3,7 +3,8 @@
 The geometry of the stages is computed on tensors here, so that gradients pass from the results of a stage to the
 results of earlier stages. The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`,
 :mod:`gsmerge.geometry.pooling`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours,
-clusters, order of axes, views, and the agreement of a group with other views.
+clusters, order of axes, views, and the agreement of a group with other views. A value that is "zero, with a gradient"
+is added to results of kernels: it does not change them, and gives them a gradient.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take_features
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 from gsmerge.values.arrays import Array, as_array, as_tensor
 
-TINY = 1e-12  # world units
+TINY = 1e-12  # least length whose logarithm is taken, world units
 CONSTANT = slice(6, 8)  # columns of ``group`` without a gradient: log of the number of members, and their mean weight
 
 
@@ -95,7 +96,10 @@ def differentiate_base(features: FeatureGaussians) -> Gaussians:
 
 
 def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
-    """Compute the networks' inputs for groups, differentiable; ``inputs`` has the same values as arrays."""
+    """Compute the networks' inputs for Feature Gaussians as tensors with a gradient.
+
+    ``inputs`` are the arrays that the kernels made: views, footprints and statistics are taken from them.
+    """
     group_viewmats = torch.from_numpy(viewmats[inputs.views]).float()
     base, frames = differentiate_base(features), _differentiate_frames(features.means, group_viewmats, inputs.frames)
     sizes = gaussian_sizes(base.scales).clamp_min(TINY)
@@ -116,9 +120,13 @@ def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, view
     return replace(inputs, features=features, base=base, frames=frames, sizes=sizes, group=group)
 
 
-def _differentiate_frames(means: Tensor, viewmats: Tensor, values: np.ndarray) -> Tensor:
-    """Compute the frames of points in views ``[g,4,4]``, differentiable unless the ray is the image's right axis."""
-    frames = torch.from_numpy(values)
+def _differentiate_frames(means: Tensor, viewmats: Tensor, frame_arrays: np.ndarray) -> Tensor:
+    """Convert the frames ``[g,3,3]`` of groups to tensors with a gradient.
+
+    A frame depends on the group's mean and on its view, ``viewmats [g,4,4]``. A frame has no gradient if the ray to the
+    mean is parallel to the image's right axis.
+    """
+    frames = torch.from_numpy(frame_arrays)
     if not means.requires_grad:
         return frames
     centres = -rotate_vectors(viewmats[:, :3, :3].transpose(1, 2), viewmats[:, :3, 3])
@@ -127,61 +135,72 @@ def _differentiate_frames(means: Tensor, viewmats: Tensor, values: np.ndarray) -
     right = normalize(across, dim=1)
     computed = torch.stack([right, torch.linalg.cross(away, right), away], 2)
     is_stable = (across.norm(dim=1) > 1e-3)[:, None, None]
-    # ``computed`` gives the gradient, but does not change the values
-    return torch.where(is_stable, frames + computed - computed.detach(), frames)
+    return torch.where(is_stable, frames + computed - computed.detach(), frames)  # adds zero, with a gradient
 
 
 def differentiate_tokens(
     parts: Gaussians, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
 ) -> Tensor:
-    """Make tokens ``[n,13]`` like :func:`gsmerge.networks.tokens.part_tokens`, differentiable."""
+    """Describe Gaussians relative to their groups by tokens ``[n,13]``, as tensors with a gradient.
+
+    The function and its arguments are those of :func:`gsmerge.networks.tokens.part_tokens`.
+    """
     g, owner_ids = group_features, torch.from_numpy(owners)
     selected = parts[torch.from_numpy(ids)]
-    back = g.frames[owner_ids].transpose(1, 2)
+    to_frames = g.frames[owner_ids].transpose(1, 2)
     pixels = torch.from_numpy(g.footprints)[owner_ids].clamp_min(TINY)
-    local = rotate_vectors(back, selected.means - g.base.means[owner_ids]) / g.sizes[owner_ids, None]
-    ordered = selected.scales.sort(-1).values.clamp_min(TINY)
+    offsets = rotate_vectors(to_frames, selected.means - g.base.means[owner_ids]) / g.sizes[owner_ids, None]
+    ascending_scales = selected.scales.sort(-1).values.clamp_min(TINY)
     shortest = selected.scales.argmin(1)[:, None, None].expand(-1, 3, 1)
-    normals = quat_to_rotmat(selected.quats).gather(2, shortest)[..., 0]
-    facing = rotate_vectors(back, normals)
-    flat = -(1 - ordered[:, 0] / ordered[:, 1]) * facing[:, 2].sign()
+    normals = rotate_vectors(to_frames, quat_to_rotmat(selected.quats).gather(2, shortest)[..., 0])
+    flatness = 1 - ascending_scales[:, 0] / ascending_scales[:, 1]
+    towards_view = -flatness * normals[:, 2].sign()
     colors = SH_C0 * (selected.sh0 - g.base.sh0[owner_ids])[:, 0]
-    numbers = [torch.asinh(local), _log_scales(ordered, pixels), _logits(selected.opacities)[:, None], colors]
-    tokens = torch.cat([*numbers, flat[:, None] * facing], 1)
+    numbers = [
+        torch.asinh(offsets),
+        _log_scales(ascending_scales, pixels),
+        _logits(selected.opacities)[:, None],
+        colors,
+    ]
+    tokens = torch.cat([*numbers, towards_view[:, None] * normals], 1)
     assert tokens.shape[1] == PART_COLUMNS
     return tokens.nan_to_num()
 
 
 def _log_scales(scales: Tensor, pixels: Tensor) -> Tensor:
-    """Return inputs for scales ``[n,3]``: their logarithms in units of ``pixels [n]``, clipped and scaled down."""
+    """Make inputs of networks from scales ``[n,3]``: logarithms in units of ``pixels [n]``, clipped and scaled down."""
     return torch.log(scales.clamp_min(TINY) / pixels[:, None]).clamp(-12, 12) / 4
 
 
 def _logits(opacities: Tensor) -> Tensor:
-    """Return inputs for opacities ``[n]``: their logits, clipped and scaled down."""
+    """Make inputs of networks from opacities ``[n]``: logits, clipped and scaled down."""
     return torch.logit(opacities.clamp(1e-4, 1 - 1e-4)) / 3
 
 
 def _log_ratio(values: Tensor, units: Tensor) -> Tensor:
-    """Return inputs for masses or extinctions ``[g]``: their logarithms in ``units [g]``, clipped and scaled down."""
+    """Make inputs of networks from masses or extinctions ``[g]``: logarithms in ``units [g]``, clipped, scaled down."""
     return (torch.log(values.clamp_min(1e-30)) - torch.log(units)).clamp(-30, 30) / 10
 
 
 def move_feature_tensors(group_features: GroupFeatures, residuals: Tensor) -> FeatureGaussians:
-    """Apply corrections ``[g,14]`` like :func:`gsmerge.networks.corrections.move_features`, differentiable."""
+    """Apply corrections ``residuals [g,14]`` to Feature Gaussians, as tensors with a gradient.
+
+    The corrections are those of :func:`gsmerge.networks.corrections.move_features`.
+    """
     g, f = group_features, group_features.features
     rotations = _rotations(rotate_vectors(g.frames, residuals[:, ROTATION_COLUMNS]))
-    axes, logs = quat_to_rotmat(g.base.quats), residuals[:, SIZE_COLUMNS]
-    stretches = torch.eye(3) + (axes * torch.expm1(logs)[:, None]) @ axes.transpose(1, 2)
+    axes, log_stretches = quat_to_rotmat(g.base.quats), residuals[:, SIZE_COLUMNS]
+    stretches = torch.eye(3) + (axes * torch.expm1(log_stretches)[:, None]) @ axes.transpose(1, 2)
     changes = rotations @ stretches
     covars = changes @ f.covars @ changes.transpose(1, 2)
-    discs = logs[:, 1] + logs[:, 2]
+    log_areas = log_stretches[:, 1] + log_stretches[:, 2]  # change of the area of the two largest scales
     return replace(
         f,
         means=f.means + rotate_vectors(g.frames, residuals[:, MEAN_COLUMNS] * gaussian_sizes(g.base.scales)[:, None]),
         covars=(covars + covars.transpose(1, 2)) / 2,
-        masses=f.masses * torch.exp(residuals[:, LOGIT_COLUMN] + logs[:, 0] + discs + residuals[:, MASS_COLUMN]),
-        extinctions=f.extinctions * torch.exp(residuals[:, LOGIT_COLUMN] + discs),
+        masses=f.masses
+        * torch.exp(residuals[:, LOGIT_COLUMN] + log_stretches[:, 0] + log_areas + residuals[:, MASS_COLUMN]),
+        extinctions=f.extinctions * torch.exp(residuals[:, LOGIT_COLUMN] + log_areas),
         sh0=f.sh0 + residuals[:, None, COLOR_COLUMNS] / SH_C0,
     )
 
@@ -196,22 +215,26 @@ def _rotations(vectors: Tensor) -> Tensor:
 
 
 def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
-    """Pool runs of rows like :func:`gsmerge.stages.merge.pool_runs`, differentiable."""
+    """Pool each cluster of Feature Gaussians into one, as tensors with a gradient.
+
+    The rows of the clusters are ``order``, cluster after cluster. ``cuts`` are the places in ``order`` where clusters
+    begin. Values are those of :func:`gsmerge.stages.merge.pool_runs`.
+    """
     pooled = pool_runs(features_to_arrays(features), order, cuts)
-    run = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
+    clusters = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
     weights = torch.from_numpy(np.maximum(features.weights[order].astype(np.float64) * features.gains[order], 1e-12))
-    share = (weights / torch.zeros(len(cuts), dtype=torch.float64).index_add(0, run, weights)[run]).float()
+    share = (weights / torch.zeros(len(cuts), dtype=torch.float64).index_add(0, clusters, weights)[clusters]).float()
 
     def total(values: Tensor) -> Tensor:
-        """Sum over the rows of each run."""
-        return torch.zeros(len(cuts), *values.shape[1:]).index_add(0, run, values)
+        """Sum over the rows of each cluster."""
+        return torch.zeros(len(cuts), *values.shape[1:]).index_add(0, clusters, values)
 
     def average(values: Tensor) -> Tensor:
-        """Average over the rows of each run, weighted by ``share``."""
+        """Average over the rows of each cluster, weighted by ``share``."""
         return total(values * share.reshape(-1, *[1] * (values.ndim - 1)))
 
     means = average(features.means[order])
-    offsets = features.means[order] - means[run]
+    offsets = features.means[order] - means[clusters]
     spread = features.covars[order] + offsets[:, :, None] * offsets[:, None]
     columns: dict[str, Array] = {"means": means, "covars": average(spread), "sh0": average(features.sh0[order])}
     columns |= {name: total(getattr(features, name)[order]) for name in ("masses", "extinctions")}
@@ -219,17 +242,17 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
 
 
 def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, children: Gaussians) -> Gaussians:
-    """Make the round Gaussians that absolute heads correct, as tensors with gradients.
+    """Convert round Gaussians from :func:`gsmerge.networks.apply.prepare_children` to tensors with a gradient.
 
-    ``children`` are the same n Gaussians as arrays, see :func:`gsmerge.networks.apply.prepare_children`.
+    Heads whose outputs are "absolute" make children by correcting such Gaussians. ``parents [n]`` are their groups.
     """
-    parent_ids, base, same = torch.from_numpy(parents), group_features.base, children.to("cpu")
+    parent_ids, base, tensors = torch.from_numpy(parents), group_features.base, children.to("cpu")
     frames = group_features.frames[parent_ids]
     rotations = (frames - frames.detach()) @ frames.detach().transpose(1, 2)  # zero, with a gradient
     return replace(
-        same,
+        tensors,
         means=base.means[parent_ids],
-        quats=rotate_quats(skew_vectors(rotations), same.quats),
+        quats=rotate_quats(skew_vectors(rotations), tensors.quats),
         scales=group_features.sizes[parent_ids, None].expand(-1, 3),
         sh0=base.sh0[parent_ids],
     )
@@ -239,7 +262,7 @@ class TrainingContext(NetworkContext):
     """Networks and their inputs for training: the stages' formulas on tensors, with gradients."""
 
     def make_base(self, features: FeatureGaussians) -> Gaussians:
-        """Decode every Feature Gaussian into one Gaussian of tensors."""
+        """Return for each Feature Gaussian the Gaussian with the same moments, as tensors."""
         return differentiate_base(features)
 
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
@@ -250,17 +273,17 @@ class TrainingContext(NetworkContext):
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Make tokens of Gaussians as tensors. Tokens of members are arrays, since no network precedes the encoder."""
+        """Make tokens: tensors for Gaussians, and arrays for members, since no network changes members."""
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
         return super().make_tokens(parts, ids, owners, groups_to_arrays(group_features))
 
     def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
-        """Apply corrections ``[g,14]`` to Feature Gaussians of tensors."""
+        """Apply corrections ``residuals [g,14]`` to Feature Gaussians, as tensors with a gradient."""
         return move_feature_tensors(group_features, residuals)
 
     def decode_covars(self, features: FeatureGaussians) -> Array:
-        """Run the head for K = 1; return the covariances of its Gaussians as tensors, with gradients."""
+        """Decode each Feature Gaussian into one child; return the children's covariances, tensors with a gradient."""
         g = self.correct_children(None, np.arange(len(features)), self.describe(features))
         half = quat_to_rotmat(g.quats) * g.scales[:, None]
         return half @ half.transpose(1, 2)
@@ -268,20 +291,20 @@ class TrainingContext(NetworkContext):
     def correct_children(
         self, children: Gaussians | None, parents: np.ndarray, group_features: GroupFeatures
     ) -> Gaussians:
-        """Run the heads on analytic children, or on round Gaussians if None; return the corrected children."""
+        """Correct the children of groups by the heads. If ``children`` is None, the heads get round Gaussians."""
         if children is None:
             arrays = groups_to_arrays(group_features)
-            round_ones = prepare_children(arrays.base[parents], parents, arrays, self.options)
-            children = make_round_tensors(parents, group_features, round_ones)
+            round_gaussians = prepare_children(arrays.base[parents], parents, arrays, self.options)
+            children = make_round_tensors(parents, group_features, round_gaussians)
         corrections = as_tensor(run_heads(children, parents, group_features, self))
         return move_tensors(children, corrections, group_features.frames[torch.from_numpy(parents)])
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The children of a crop, corrected by the networks."""
+    """What the networks make of a crop."""
 
-    gaussians: Gaussians  # n corrected children, tensors with gradients
+    gaussians: Gaussians  # n corrected children, tensors with a gradient
     parents: Tensor  # [n] int64 merged Feature Gaussian of each child, ascending
     merged: FeatureGaussians  # Feature Gaussians of the crop, merged and refined, without gradients
     sizes: Tensor  # [n] size of each child's group, world units
@@ -290,29 +313,30 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class RefinedCrop:
-    """The Feature Gaussians of a crop after all stages before the heads, which are the same for every K."""
+    """The merged and refined Feature Gaussians of a crop. They do not depend on K."""
 
     context: TrainingContext
-    described: GroupFeatures  # the heads' inputs for the merged and refined Feature Gaussians, tensors with gradients
+    described: GroupFeatures  # these Feature Gaussians as inputs of the heads, tensors with a gradient
     matches: Matches  # the crop's clusters
 
 
 def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> RefinedCrop:
-    """Run a crop through encoder, merger and refiner with gradients; each stage takes the results of earlier stages."""
+    """Run encoder, merger and refiner on a crop, one after the other, with gradients."""
     example = crop.example
     context = TrainingContext(networks, example.members, example.cameras, seed)
     encoded = context.encode(features_to_tensors(take_features(example.features, crop.rows)))
-    encoded = replace(encoded, latents=as_tensor(encoded.latents))
+    encoded = replace(encoded, latents=as_tensor(encoded.latents))  # without an encoder they are an array of zeros
     matches = match(features_to_arrays(encoded), options.match_options())
     refined = context.refine(_merge(encoded, matches, context))
     return RefinedCrop(context, context.describe(refined), matches)
 
 
 def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
-    """Run the heads for ``k`` children of every Feature Gaussian of a crop, with gradients.
+    """Decode every Feature Gaussian of a crop into ``k`` children, and correct them by the heads, with gradients.
 
-    For K > 1 the analytic children of residual heads are pooled from the members again. So gradients reach earlier
-    stages only through the inputs of these heads.
+    If ``k`` is more than 1, the closed formulas make the children from the members, without a gradient. Then earlier
+    stages get gradients only through the inputs of the heads. Heads with "absolute" outputs make the children
+    themselves.
     """
     described, context = refined.described, refined.context
     arrays = features_to_arrays(described.features)
@@ -324,12 +348,12 @@ def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
 
 
 def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
-    """Run a crop through all networks with gradients."""
+    """Run all networks on a crop, with gradients."""
     return decode_crop(refine_crop(crop, networks, options, seed), crop, crop.k)
 
 
 def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext) -> FeatureGaussians:
-    """Merge Feature Gaussians of tensors as :func:`gsmerge.stages.merge.merge` does."""
+    """Merge the Feature Gaussians of each cluster, tensors with a gradient; see :func:`gsmerge.stages.merge.merge`."""
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
         return encoded
@@ -340,9 +364,9 @@ def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext
 def _make_children(
     crop: Crop, arrays: FeatureGaussians, described: GroupFeatures, context: TrainingContext, k: int
 ) -> tuple[Gaussians | None, np.ndarray]:
-    """Make the Gaussians of tensors that the heads correct, and the row ``[n]`` of the group of each, ascending.
+    """Make ``k`` children of every Feature Gaussian, by closed formulas; return them, and their parents ``[n]``.
 
-    The Gaussians are None if the networks make the children themselves.
+    Parents are rows of Feature Gaussians, ascending. The children are None if the heads make them themselves.
     """
     if context.makes_children:
         return None, np.repeat(np.arange(len(arrays)), k)
@@ -353,7 +377,7 @@ def _make_children(
 
 
 def analytic_gaussians(crop: Crop, options: TrainOptions) -> Gaussians:
-    """Decode the children of a crop without networks."""
+    """Merge and decode a crop by closed formulas, without networks."""
     features = take_features(crop.example.features, crop.rows)
     merged = merge(features, match(features, options.match_options()))
     return divide_groups(merged, crop.example.members, np.full(len(merged), crop.k))[0]

@@ -33,9 +33,9 @@ class TrainingScene:
 
 
 def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
-    """Choose evenly spread views for each of ``counts``, without repeated selections.
+    """Choose evenly spread views for each of ``counts``; equal choices are returned once.
 
-    A count of 0, or of more views than there are, stands for all views.
+    All views are chosen if a count is 0, or larger than ``num_views``.
     """
     chosen = [even_views(num_views, count if 0 < count < num_views else num_views) for count in counts]
     return [ids for i, ids in enumerate(chosen) if ids not in chosen[:i]]
@@ -63,8 +63,8 @@ def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None
 def measure_covered(training: TrainingScene, level: float = 1) -> np.ndarray:
     """Measure how far each chosen view covers every pixel of each photo, ``[v,p,h,w]`` uint8.
 
-    Values are the opacity of the view's Gaussians times 255, and 0 on surfaces that the view does not see. The
-    transmittances of views multiply, so the coverage of any subset of views follows. ``level`` divides the photos'
+    A pixel has the opacity of the view's Gaussians, times 255. It has 0 if the view does not see what the pixel shows.
+    :func:`covered_pixels` finds from these values what a subset of the views covers. ``level`` divides the photos'
     sides.
     """
     scene, photos = training.scene, training.photos(level)
@@ -77,7 +77,7 @@ def measure_covered(training: TrainingScene, level: float = 1) -> np.ndarray:
         views = (tile_view(splats, **photos.camera(photo), near=NEAR_PLANE) for photo in range(len(photos)))
         opacities = np.stack([1 - composite(tiled)[1] for tiled in views])
         seen = visible_pixels(context_points(part, NEAR_PLANE), cameras, NEAR_PLANE, scene.cameras)
-        seen[view] = True
+        seen[view] = True  # the view sees all of its own photo
         return np.where(seen, np.round(255 * opacities), 0).astype(np.uint8)
 
     return np.stack(parallel_map(measure_view, range(len(scene))))

@@ -33,9 +33,9 @@ from gsmerge.version import __version__
 LAYOUT = 7  # version of the files and their contents
 EXAMPLE_FORMAT = "gsmerge-example"
 EXAMPLE_REMEDY = "remove it; the next call makes it again"
-# Settings that an example depends on
+# Settings of which an example is made, besides its views
 EXAMPLE_SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
-STORED_PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}  # whose fields are all arrays
+STORED_PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}  # all their fields are arrays
 
 
 @dataclass(frozen=True)
@@ -82,18 +82,24 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shar
 
 
 def scene_key(scene: Path, options: TrainOptions) -> str:
-    """Return a hash of a scene's files and the settings that its examples depend on; SceneError without a scene."""
+    """Return a hash of a scene's files, and of the settings of which its examples are made.
+
+    Raises SceneError if there is no scene.
+    """
     head = {"layout": LAYOUT, "gsmerge": __version__, "views": options.example_views}
     head |= {name: getattr(options, name) for name in EXAMPLE_SETTINGS}
     files = find_scene_files(scene)
     targets = files.ply.parent / "targets"
-    # Held-out photos have a hash of their own, because the names in a hash are relative to the folder
+    # Held-out photos get a hash of their own, because a hash contains names relative to one folder
     held_out = content_hash([targets]) if targets.is_dir() else None
     return digest({**head, "content": content_hash(list_files(files)), "held_out": held_out})
 
 
 def _read_hashes(path: Path) -> dict[str, str] | None:
-    """Read the hash of each shard from a scene's record; None without a record, or if a shard is missing."""
+    """Read the hash of each shard from a scene's record.
+
+    Returns None if there is no record, or if a shard is missing.
+    """
     try:
         hashes = json.loads(path.read_text())
         return hashes if all(path.with_name(file).is_file() for file in hashes) else None
@@ -102,14 +108,16 @@ def _read_hashes(path: Path) -> dict[str, str] | None:
 
 
 def write_shard(path: Path, example: Example) -> str:
-    """Write an example to a file, replacing it, and return the hash of its arrays; SceneError if that fails."""
+    """Write an example to a file, which is replaced, and return the hash of its arrays.
+
+    Raises SceneError if the file cannot be written.
+    """
     arrays = dict(_example_arrays(example))
     facts = {"layout": LAYOUT, "sha256": hash_arrays(arrays), "unit": example.unit, "eps2d": example.photos.eps2d}
     facts |= {"size": [example.cameras.width, example.cameras.height]}
     with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(
-            save(arrays, {EXAMPLE_FORMAT: json.dumps(facts)})
-        )  # save_file would change the file's mode
+        # ``save_file`` would change the rights of the file
+        temporary.write_bytes(save(arrays, {EXAMPLE_FORMAT: json.dumps(facts)}))
     return str(facts["sha256"])
 
 
@@ -155,7 +163,7 @@ def read_shard(shard: Shard) -> Example:
         prefix = f"{name}."
         return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
 
-    black = np.broadcast_to(np.float32(0), arrays["images"].shape)
+    black = np.broadcast_to(np.float32(0), arrays["images"].shape)  # the photos' colours are in ``images``
     return Example(
         name=shard.scene,
         unit=float(facts["unit"]),

@@ -89,7 +89,8 @@ class TrainOptions(Settings):
     seed: int = setting(0, "Seed of all random numbers.", **FROM_0_LIMITS)
 
     def __post_init__(self) -> None:
-        for name in LIST_OPTIONS:  # JSON and TOML have lists
+        """Convert lists to tuples, since JSON and TOML have lists, and check all settings."""
+        for name in LIST_OPTIONS:
             object.__setattr__(self, name, tuple(getattr(self, name)))
         super().__post_init__()
         if self.random_views and (len(self.random_views) != 2 or self.random_views[0] > self.random_views[1]):
@@ -97,7 +98,7 @@ class TrainOptions(Settings):
 
     @property
     def example_views(self) -> tuple[int, ...]:
-        """Numbers of views of the examples made of each scene; 0: all views."""
+        """Numbers of views: each scene gives an example for each number; 0 stands for all views."""
         return (0,) if self.random_views else self.views
 
     def match_options(self) -> MatchOptions:
@@ -167,12 +168,13 @@ PAPER: Mapping[str, Any] = {
     "diversity_weight": 1.0,
     "diversity_steps": 50_000,
 }
-# Settings of the shipped networks. Encoder and merger gained nothing in validation, and colour corrections learnt the
-# exposure of the training photos; docs/internals/networks.md has the figures.
+# Settings of the shipped networks. They have no encoder and no merger, which did not raise the PSNR of validation. They
+# have no corrections of colour, which learnt the exposure of the training photos. docs/internals/networks.md has the
+# figures.
 SHIPPED_TRAINING: Mapping[str, Any] = {
     "encoder": False,
     "merger": False,
-    "color": 0.0,  # the bound of corrections
+    "color": 0.0,  # bound of the corrections of colour
     "recolor": True,
     "views": (3, 0),
     "steps": 2_600,
@@ -184,7 +186,7 @@ SHIPPED_TRAINING: Mapping[str, Any] = {
     "save_every": 100,
     "validation_windows": 6,
 }
-# The paper's training, shortened to one and a half hours on two processor cores.
+# Settings of the paper with fewer steps: training takes one and a half hours on two processor cores.
 PAPER_SHIPPED: Mapping[str, Any] = {
     **PAPER,
     "recolor": True,
@@ -209,7 +211,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def preset_options(name: str) -> TrainOptions:
-    """Return the settings of a named preset; ValueError if the name is unknown."""
+    """Return the settings of a named preset, or raise ValueError if the name is unknown."""
     if name not in PRESETS:
         raise ValueError(f"preset: expected {' or '.join(PRESETS)}, got {name!r}")
     return change_settings(TrainOptions(), PRESETS[name])

@@ -22,7 +22,7 @@ class Crop:
     """A subset of an example's Feature Gaussians, which are decoded into K children each."""
 
     example: Example
-    k: int  # K
+    k: int  # number of children of each Feature Gaussian
     rows: np.ndarray  # [r] rows of the example's Feature Gaussians, ascending
 
 
@@ -54,7 +54,7 @@ class Window:
 
     @property
     def camera(self) -> Cameras:
-        """Camera that sees only the window."""
+        """Camera whose picture is the window."""
         camera = box_camera(self.crop.example.photos, self.photo, self.box)
         return Cameras(camera["viewmat"][None], camera["K"][None], camera["width"], camera["height"])
 
@@ -86,10 +86,11 @@ def sample_window(
     k = levels[int(rng.integers(len(levels)))]
     photo, pixels = _choose_photo(example, novel, rng)
     pixel = int(pixels[rng.integers(len(pixels))]) if len(pixels) else 0
-    height, width = example.images.shape[1:3]
-    w, h = min(side, width), min(side, height)
-    left, top = max(0, pixel % width - w // 2), max(0, pixel // width - h // 2)
-    box = Box(min(left, width - w), min(top, height - h), w, h)  # moved inside the photo
+    photo_height, photo_width = example.images.shape[1:3]
+    width, height = min(side, photo_width), min(side, photo_height)
+    left, top = max(0, pixel % photo_width - width // 2), max(0, pixel // photo_width - height // 2)
+    # The box is moved so that it lies inside the photo
+    box = Box(min(left, photo_width - width), min(top, photo_height - height), width, height)
     rows = _reaching_rows(example, photo, box)
     while len(rows) > most and box.halved() != box:
         box = box.halved()
@@ -98,10 +99,10 @@ def sample_window(
 
 
 def _choose_photo(example: Example, novel: float, rng: np.random.Generator) -> tuple[int, np.ndarray]:
-    """Choose a random photo that the example's views cover in part; return its number and the covered pixels' indices.
+    """Choose a random photo with pixels that the example's views cover; return its number, and these pixels' indices.
 
-    ``novel`` is the probability that novel views are tried first. If the views cover no photo, the last tried photo is
-    returned, without pixels.
+    ``novel`` is the probability that novel views are tried first. If the views cover no pixel of any photo, the last
+    tried photo is returned, and no indices.
     """
     num_views = len(example.cameras)
     own_photos, novel_photos = rng.permutation(num_views), num_views + rng.permutation(len(example.photos) - num_views)
@@ -115,8 +116,8 @@ def _choose_photo(example: Example, novel: float, rng: np.random.Generator) -> t
 
 
 def _reaching_rows(example: Example, photo: int, box: Box) -> np.ndarray:
-    """Return the ascending rows of the Feature Gaussians that reach into a box of a photo, or near it."""
-    border = 4  # pixels around the box from which corrections may move Gaussians into it
+    """Return the rows of the Feature Gaussians that reach into a box of a photo, or that corrections may move there."""
+    border = 4  # width, in pixels, of the frame around the box from which corrections may move Gaussians into it
     wide = Box(box.left - border, box.top - border, box.width + 2 * border, box.height + 2 * border)
     tiled = tile_view(
         make_splats(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR_PLANE

@@ -166,13 +166,13 @@ def test_a_gif_has_one_palette_and_plays_again(tmp_path: Path) -> None:
 
 def test_lines_between_scenes_start_evenly_and_stay_inside() -> None:
     for count in (2, 3):
-        places = np.array(clip.swipe_places(count, 48, 8.0, 600))
+        places = np.array(clip.swipe_borders(count, 48, 8.0, 600))
         np.testing.assert_array_equal(places[0], np.arange(count + 1) * 600 // count)
         assert (np.diff(places, axis=1) > 0).all()
         assert places[:, 1].min() <= 60 // count < 300 < places[:, -2].max()
         steps = np.diff(np.vstack([places, places[:1]]), axis=0)
         assert np.abs(steps).max() < 60  # also from the last frame to the first
-    assert clip.swipe_places(1, 2, 8.0, 10) == [[0, 10], [0, 10]]
+    assert clip.swipe_borders(1, 2, 8.0, 10) == [[0, 10], [0, 10]]
 
 
 def test_captions_stay_in_their_scene_s_part() -> None:

@@ -24,18 +24,18 @@ def test_human_share(share: float, text: str) -> None:
 def test_tables_leave_out_columns_that_a_terminal_has_no_room_for() -> None:
     rows = [("result", "Gaussians", "of", "dB"), ("room/small.ply", "52,038", "1,182,720", "28.36")]
     whole = ["result          Gaussians         of     dB", "room/small.ply     52,038  1,182,720  28.36"]
-    assert text_table(rows) == text_table(rows, columns=43) == whole
-    assert text_table(rows, columns=42, least=(2,)) == [
+    assert text_table(rows) == text_table(rows, letters=43) == whole
+    assert text_table(rows, letters=42, omitted_first=(2,)) == [
         "result          Gaussians     dB",
         "room/small.ply     52,038  28.36",
     ]
-    assert text_table(rows, columns=42) == [
+    assert text_table(rows, letters=42) == [
         "result         Gaussians         of     dB",
         "room/...l.ply     52,038  1,182,720  28.36",
     ]
-    assert text_table(rows, columns=40) == [
+    assert text_table(rows, letters=40) == [
         "result          Gaussians         of",
         "room/small.ply     52,038  1,182,720",
     ]
-    assert text_table(rows, "  ", columns=25) == ["  result        Gaussians", "  room/....ply     52,038"]
-    assert text_table(rows, columns=3)[1] == "room/....ply     52,038"  # the first two always
+    assert text_table(rows, "  ", letters=25) == ["  result        Gaussians", "  room/....ply     52,038"]
+    assert text_table(rows, letters=3)[1] == "room/....ply     52,038"  # the first two always
