@@ -25,7 +25,7 @@ from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
 from gsmerge.io.formats.read import GaussianFile, convert_files
-from gsmerge.io.formats.splat_transform import name_file, run_program
+from gsmerge.io.formats.splat_transform import blame_program, run_program
 from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply
 from gsmerge.types import Gaussians, StrPath
@@ -86,7 +86,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
         program_index = Path(folder) / "made" / INDEX
         iterations = 1  # of the program's fit of palettes; ten take four times as long, and renders are not better
         run_program(*arguments, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", iterations, program_index)
-        with name_file(path):
+        with blame_program(path):
             _name_by_content(program_index)
             levels = read_index(program_index).levels
         index.write_bytes(program_index.read_bytes())
