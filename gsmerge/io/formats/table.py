@@ -172,7 +172,7 @@ STATE = Format(
 )
 META = "meta.json"  # name of the main file of a .sog that is a folder
 SOG_FOLDER = Format(
-    META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_folder"),
+    META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_sog_meta"),
 )  # fmt: skip
 FORMATS = (*FILES, HTML, LEVELS, TILESET, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
