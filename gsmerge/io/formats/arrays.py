@@ -42,11 +42,11 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of compressed PLYs
 REQUIRED_COLUMNS = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
-UNIT_ROUNDING = 0.01  # values of [0, 1] that were rounded to half floats may lie outside by this
+UNIT_ROUNDING = 0.01  # rounding to half floats may move values this far outside [0, 1]
 MAX_STRAY = 0.01  # share of a column's values that may contradict the others, because of rounding and damage
 _EXACT = 1e-5  # largest rounding error of a whole number in a matrix that rotates harmonics
 EXPORT_AGAIN = "copy or export it again"  # remedy for a damaged file
-GAUSSIAN_BYTES = 4 * len(REQUIRED_COLUMNS) + 1  # bytes in memory with the flag of validity, without higher harmonics
+GAUSSIAN_BYTES = 4 * len(REQUIRED_COLUMNS) + 1  # bytes in memory of a Gaussian of degree 0 with its flag ``valid``
 
 
 def sh_degree(num_higher: int) -> int:
@@ -309,7 +309,7 @@ def max_array_bytes(file_bytes: int) -> int:
 
 
 def check_gaussian_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
-    """Raise SceneError if ``count`` Gaussians, with ``packed_bytes`` each, take more memory than its budget allows."""
+    """Raise SceneError if ``count`` Gaussians, with ``packed_bytes`` each, take more memory than ``budget`` allows."""
     # Larger harmonics lie in a temporary file
     harmonics_bytes = min(12 * num_higher * count, max_array_bytes(budget.file_bytes))
     unpacked_bytes = 16_000_000  # bytes of all blocks that are unpacked at the same time
@@ -384,7 +384,7 @@ def rotator(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Column
 def _harmonics_rotator(rotation: np.ndarray, num_higher: int) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that rotates ``harmonics [n,num_higher,3]`` by a matrix ``[3,3]``."""
     matrix = harmonics_rotation(num_higher, rotation) if num_higher else np.zeros((0, 0))
-    # Whole numbers in the matrix become exact, so that half a turn is found to change only signs
+    # Rounding errors of whole numbers are removed, so that the matrix of half a turn is exactly diagonal
     matrix = np.where(np.abs(matrix - np.round(matrix)) < _EXACT, np.round(matrix), matrix)
     signs = np.diagonal(matrix)[:, None]
     if np.array_equal(matrix, np.diag(np.diagonal(matrix))):

@@ -22,7 +22,7 @@ class ColumnKind:
 
     what: str  # their content; empty for columns that do not change renders
     names: str  # regular expression of their names
-    effect: str = ""  # what changes without them
+    effect: str = ""  # how renders look without them
     remedy: str = ""  # in the error of files with these columns; empty: a note names the columns
 
 
@@ -112,7 +112,7 @@ def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]
 
 
 def _check_types(path: Path, row_type: np.dtype[np.void]) -> None:
-    """Raise SceneError if a column of Gaussians has an integer type; columns such as red may be bytes."""
+    """Raise SceneError if a column of Gaussians has an integer type; columns such as ``red`` may be bytes."""
     colors = arrays.color_columns(row_type.names)
     for name in row_type.names or ():
         dtype, is_used = row_type[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
@@ -132,7 +132,7 @@ def describes_places(name: str) -> bool:
 
 def list_names(names: Sequence[str]) -> str:
     """List the names of columns for a message: the first six names, and the number of further names."""
-    max_names, max_characters = 6, 60  # names in a list of columns, and characters of each
+    max_names, max_characters = 6, 60  # most listed names, and most characters of each
     num_unlisted = len(names) - max_names
     listed = ", ".join(name[:max_characters] for name in names[:max_names])
     return listed + (f" and {num_unlisted} more" if num_unlisted > 0 else "")

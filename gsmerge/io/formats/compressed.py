@@ -3,8 +3,8 @@
 Each Gaussian has four packed words. Each chunk of 256 Gaussians has the least and the largest of their values.
 
 The layout is that of PlayCanvas' reader. Positions and scales have 11, 10 and 11 bits between a chunk's minimum and
-maximum. Rotations are their three smaller components at 10 bits, colours and opacities have 8 bits, and harmonics are
-bytes in the element ``sh``.
+maximum. Rotations are the three smaller components of quaternions at 10 bits. Colours and opacities have 8 bits.
+Harmonics are bytes in the element ``sh``.
 """
 
 from __future__ import annotations

@@ -31,7 +31,9 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
     """Join the rows of files in the columns that all have; also return the names of the columns left out."""
-    types = [{name: part.dtype[name] for name in part.dtype.names or ()} for part in parts]  # of each file, by column
+    types = [
+        {name: part.dtype[name] for name in part.dtype.names or ()} for part in parts
+    ]  # of each file: name -> type
     names = dict.fromkeys(name for file_types in types for name in file_types)
     common = [name for name in names if len({file_types.get(name) for file_types in types}) == 1]
     out = np.empty(sum(map(len, parts)), [(name, types[0][name]) for name in common])

@@ -140,7 +140,7 @@ def _describe_arrays(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]]
     for view_id, array in enumerate(arrays):
         row_bytes, width = array.strides[0], array.shape[1]
         size = len(array) * row_bytes
-        stride = {"byteStride": 4} if row_bytes == 4 and width == 1 else {}  # rows of two bytes are padded
+        stride = {"byteStride": 4} if row_bytes == 4 and width == 1 else {}  # rows of two bytes are padded to four
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, **stride, "target": _VERTICES})
         component: dict[str, Any] = {"componentType": _COMPONENTS[array.dtype.str]}
         component |= {} if array.dtype.kind == "f" else {"normalized": True}
@@ -186,7 +186,7 @@ def holds_gaussians(path: Path) -> bool:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if it has none or is damaged."""
+    """Read all Gaussians of a ``.glb``, with the axes of a ``.ply``; SceneError if it has none or is damaged."""
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
     with _damage_errors(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
         document, total = _read_document(file, budget)
@@ -239,7 +239,7 @@ class _Content:
     file: IO[bytes]
     document: dict[str, Any]
     start: int  # of the binary chunk, in bytes from the start of the file
-    end: int  # of this chunk, likewise
+    end: int  # of the same, in bytes from the start of the file
     num_read: int = 0  # bytes read so far, at most the size of the chunk
 
     def read_view(self, view_id: int) -> bytes:

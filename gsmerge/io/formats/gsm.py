@@ -116,7 +116,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Parse the header of a file; SceneError if there is none, or if its schema or an entry is wrong."""
+    """Parse the header of a file; SceneError if the file has no header, or if its schema or an entry is wrong."""
     text = metadata.get(HEADER, metadata.get(ENCODED))
     if text is None:
         raise SceneError(path, "expected a .gsm of gsmerge, found another safetensors file", "name the .gsm")

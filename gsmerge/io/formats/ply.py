@@ -87,7 +87,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
 
 
 def _white_of_floats(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[float, list[str]]:
-    """Return the number that means white in columns such as red if they are floats, 1 or 255; also return notes."""
+    """Return the number that stands for white in columns of RGB as floats, 1 or 255; also return notes on a guess."""
     colors = arrays.color_columns(rows.dtype.names)
     float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
     if float_colors and np.nanmedian(read_columns(path, rows, colors[:1])[colors[0]]) > 1:
@@ -108,15 +108,15 @@ def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequen
 
 
 def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
-    """Return a copy of a block of rows with the usual units: three log scales, and columns such as red up to 1.
+    """Return a copy of a block of rows with three log scales, and with RGB colours in [0, 1].
 
-    2D Gaussians get the third scale of :data:`THIN`. ``white``: the largest value of columns such as red.
+    The third scale of 2D Gaussians is :data:`THIN` times the smaller one. ``white``: the stored number for white.
     """
     columns = {name: rows[name] for name in rows.dtype.names or ()}
     if white != 1:
         columns |= {name: columns[name] / white for name in arrays.color_columns(rows.dtype.names)}
     scales = [columns[name].astype(np.float64) for name in arrays.SCALES if name in columns]
-    with np.errstate(all="ignore"):  # scales that are not finite
+    with np.errstate(all="ignore"):  # scales may be NaN or infinite
         scales = scales if len(scales) == 3 else [*scales, np.minimum(*scales) + float(log(THIN))]
         columns |= {name: scale.astype(np.float32) for name, scale in zip(arrays.SCALES, scales, strict=True)}
     out = np.empty(len(rows), [(name, column.dtype) for name, column in columns.items()])
@@ -145,7 +145,7 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
     optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
     missing = [name for name in arrays.REQUIRED_COLUMNS if name not in columns | optional]
     if missing:
-        check_columns(path, rows.dtype, ())  # other columns may give the reason
+        check_columns(path, rows.dtype, ())  # raises a clearer error if other columns show the reason
         remedy = "name a .ply of Gaussians, since this one has none"
         if any(name.startswith("packed_") for name in columns):
             remedy = "export it again, since it is compressed but lacks its element 'chunk'"
@@ -289,7 +289,7 @@ def _open_for_parser(path: Path, end: int, *, is_text: bool) -> IO[Any]:
 class _TextRows(TextIOWrapper):
     """A PLY file of text whose empty lines are skipped."""
 
-    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # bytes in the base of all
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # bytes in the base class
         line = super().readline(MAX_LINE)
         while line and not line.strip():
             line = super().readline(MAX_LINE)
@@ -402,12 +402,12 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
     is_text = ["format", "ascii", "1.0"] in words
     elements = _parse_elements(words)
-    steps_per_element = 50  # steps of 20 microseconds in a ReadBudget; several readers open a file one after another
+    steps_per_element = 50  # steps of 20 microseconds for all readers that open the file one after another
     budget.check_steps(steps_per_element * len(elements), "steps for elements")
     bytes_left = size - end - len(last_line)
     for element in elements:
         _check_element(budget, element)
-        # Of text at least a character and a space, of a list at least its length
+        # A number as text has at least a digit and a space. A list has at least its length
         row_bytes = sum(2 if is_text else _SIZES.get((words[1:2] or words)[0], 1) for words in element.properties)
         bytes_before, bytes_left = bytes_left, bytes_left - element.count * row_bytes
         if bytes_left < -1:  # the last row of a text may end without a new line
@@ -535,7 +535,7 @@ def _header(
 
 
 def file_bytes(count: int, sh_degree: int) -> int:
-    """Return the size in bytes of a ``.ply`` with ``count`` Gaussians, and with no comments by the user."""
+    """Return the size in bytes of a ``.ply`` with ``count`` Gaussians, and with no comment but that of gsmerge."""
     header, num_columns = _header(count, min(sh_degree, MAX_DEGREE))
     return len(header) + 4 * num_columns * count
 

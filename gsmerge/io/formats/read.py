@@ -26,7 +26,7 @@ from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
 MAX_HARMONIC = 1e6  # no scene has larger harmonics; squares and sums of such renders are finite in float32
-FREED_ROWS = 1 << 17  # the memory of large columns is freed each time when this number of rows is converted
+FREED_ROWS = 1 << 17  # number of converted rows after which the memory of large columns is freed
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FileInfo:
     count: int  # number of rows, including unusable ones
     file_bytes: int  # bytes of the file; of levels of detail, also of the chunks of the level that is read
     # Attribute (means, normals, sh0, shN, opacities, scales, quats, extra) -> its bytes. Numbers of an ascii file count
-    # as binary ones, and those of a .spz before compression. Of a .sog, textures count, and sh0 includes the opacities
+    # as binary ones. For .spz, bytes before compression. For .sog, bytes of textures; those of sh0 include opacities
     bytes_by_attribute: dict[str, int]
     columns: tuple[str, ...]  # all columns of the vertex element, in the file's order
     extra_columns: tuple[str, ...]  # the columns that do not belong to Gaussians
@@ -56,7 +56,7 @@ class FileInfo:
     odd_scales: str = ""
     color_units: ColorUnits | None = None  # units of RGB in the columns of harmonics; None if these hold harmonics
     color_note: str = ""  # says that these units were guessed, in one sentence without a full stop
-    open_units: ColorUnits | None = None  # units in which the columns hold RGB if photos show it; None: no such units
+    open_units: ColorUnits | None = None  # units of RGB that the columns may have if photos confirm it; None: none
     adapted: tuple[str, ...] = ()  # how the content was adapted, one sentence each without a full stop
 
 
@@ -162,7 +162,7 @@ def read_parts(
 def read_gaussians(
     path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto", colors: ColorChoice = "auto"
 ) -> GaussianFile:
-    """Read a file of Gaussians, whose format is that of its ending.
+    """Read a file of Gaussians in the format that its ending names.
 
     Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``. The finest level of a
     ``lod-meta.json`` is read. ``meta.json`` or its folder is a ``.sog`` without its zip. :func:`read_ply` reads
@@ -275,7 +275,7 @@ def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[s
 def _judge_scales(
     paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray], choice: ScaleChoice
 ) -> ScaleJudgement:
-    """Judge whether stored scales are linear or logarithms; ``out`` has them as if they were logarithms.
+    """Judge whether stored scales are linear or logarithms; ``out`` was filled as if they were logarithms.
 
     Only the scales of a PLY file may be linear. Those in a file of gsmerge are logarithms, unless the caller states
     something else.
@@ -357,7 +357,7 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
 
 
 def _convert_with_kernel(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
-    """Fill arrays with rows from the start of a block by the fast kernel; return the number of these rows.
+    """Fill arrays with the first rows of a block by the compiled kernel; return the number of these rows.
 
     The kernel stops before rows with numbers that are not finite or beyond the limits. The number is 0 if a used column
     is missing or any column is not float32.
@@ -416,7 +416,7 @@ def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[i
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions to ``out [n,4]``, the identity for those of zeros; return which these are ``[n]``."""
+    """Write unit quaternions to ``out [n,4]``, and the identity for each zero quaternion; return their mask ``[n]``."""
     w, x, y, z = quats
     squared = w * w + x * x + y * y + z * z
     inverse = 1 / np.sqrt(squared)
@@ -536,7 +536,7 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     """Return the valid rows that are no Gaussians, but only pad the file.
 
     A row at the origin pads the file if it is not rotated, round and grey, as a row of zeros is. VolSplat pads with
-    many equal rows at the origin. If all valid rows look so, a few rows count as Gaussians, and many raise SceneError.
+    many equal rows at the origin. If all valid rows are such, a few count as Gaussians, and many raise SceneError.
     """
     rows = np.flatnonzero((out["means"][:, 0] == 0) & out["valid"])
     rows = rows[(out["means"][rows] == 0).all(1)]

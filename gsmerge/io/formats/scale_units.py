@@ -64,8 +64,8 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
 def _vary_little_as_logs(stored: np.ndarray) -> bool:
     """Return whether numbers ``stored [s]`` vary much if they are sizes, but hardly if they are logarithms of sizes."""
     low, high = (float(value) for value in quantiles(stored.astype(np.float64), (0.1, 0.9)))
-    # Large sizes are at least 1.5 times the small ones, so the difference of their logarithms exceeds 0.4. Small linear
-    # scales differ little. Read as logarithms, they give sizes that are all close to 1
+    # Large sizes are at least 1.5 times the small ones, so the difference of their logarithms exceeds 0.4. The
+    # difference of linear scales is much smaller. Read as logarithms, they would give sizes that are all close to 1
     min_variation, min_ratio = 0.4, 4.0
     return low > 0 and float(log(high / low)) > max(min_variation, min_ratio * (high - low))
 

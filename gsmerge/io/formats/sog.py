@@ -46,7 +46,7 @@ MAX_DEGREE = 3  # of harmonics, the highest of the format
 VERSION = 2  # of the format, as its metadata states it
 MODELS = {arrays.MIP: "antialiased", arrays.FLAT: "2dgs"}  # splat-transform's names of the modes of rendering
 GENERATOR = "gsmerge"
-# All files that writers make
+# Names of all files that writers of the format make
 SOG_FILES = (
     "means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_centroids.webp", "shN_labels.webp",
     META,
@@ -127,7 +127,7 @@ def read_unzipped(path: Path) -> SogContent:
 
     SceneError as in :func:`read_rows`.
     """
-    text = read_text(path)  # the files that it names limit the memory of the reader
+    text = read_text(path)  # the size of the files that it names limits the memory of the reader
     with _damage_errors(path):
         entries = (entry for entry in os.scandir(path.parent) if f'"{entry.name}"' in text or entry.name == path.name)
         size = sum(entry.stat().st_size for entry in entries)
@@ -188,13 +188,13 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
 
 def _image_size(data: bytes) -> tuple[int, int]:
     """Return width and height of a lossless WebP image; ValueError for any other file."""
-    at = 12  # position after "RIFF", the file's size and "WEBP", bytes
+    at = 12  # bytes before the first chunk: "RIFF", the size of the file, "WEBP"
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         # A chunk has 4 bytes of name, 4 bytes of size, and content that is padded to an even number of bytes
         while at + 8 <= len(data) and data[at : at + 4] in (b"VP8X", b"ICCP"):  # chunks before the image
             at += 8 + (int.from_bytes(data[at + 4 : at + 8], "little") + 1) // 2 * 2
         if data[at : at + 4] == b"VP8L" and len(data) >= at + 13:
-            bits = int.from_bytes(data[at + 9 : at + 13], "little")  # width and height, less 1, of 14 bits each
+            bits = int.from_bytes(data[at + 9 : at + 13], "little")  # width - 1 and height - 1, of 14 bits each
             return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     raise ValueError("no WebP texture without loss")
 
@@ -205,7 +205,9 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
     width, height = _image_size(data)
     if not count <= width * height <= 4 * count + (1 << 16):
         raise ValueError(f"{name} of {width} x {height} pixels for {count}")
-    budget.check_memory(12 * width * height, f"{name} of {width} x {height} pixels")  # decoded, in two channel orders
+    budget.check_memory(
+        12 * width * height, f"{name} of {width} x {height} pixels"
+    )  # the image in two orders of channels
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -281,7 +283,7 @@ def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 
 
 def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, bytes]:
-    """Encode the files of a ``.sog`` by name: textures in the order of the rows, then ``meta.json``."""
+    """Encode the files of a ``.sog`` by name: textures, whose pixels have the order of the rows, and ``meta.json``."""
     count = len(columns)
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": GENERATOR}, "count": count}
     meta["antialias"] = mode == arrays.MIP

@@ -90,7 +90,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
     check_file(path)
     with read_errors(path), path.open("rb") as file:
         packed = file.read(len(ZSTANDARD_MAGIC))
-        if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # other files are refused without reading them
+        if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # the rest of other files is not read
             file.seek(0)
             packed = file.read()
     header, rows, sizes, notes = read_packed(path, packed)
@@ -182,14 +182,14 @@ def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndar
 
 
 def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
-    """Read version 4; return header, columns ``[n,width]`` uint8, extensions, and number of bytes after them."""
+    """Read version 4, with a stream per column; return the same as :func:`_gzip_parts`."""
     import zstandard  # few files need it
 
     path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,))
     sizes = [header.count * width for width in header.widths if width]
     table_start, ends = _read_table(path, packed, header, sizes)
     streams = [packed[start:end] for start, end in pairwise(ends)]
-    try:  # only whole streams, with their checksums if there are any; a stream may not state its size
+    try:  # streams must be whole, and fit their checksums if they have any; a stream may not state its size
         if any(
             zstandard.frame_content_size(stream) not in (-1, size) for stream, size in zip(streams, sizes, strict=True)
         ):
@@ -373,7 +373,7 @@ def gzip_bytes(
     parts: Iterable[bytes | memoryview], *, level: int = 6, strategy: int = zlib.Z_DEFAULT_STRATEGY
 ) -> bytes:
     """Compress parts to a gzip stream, without the time and the system, so that equal parts give equal bytes."""
-    packer, packed = zlib.compressobj(level, wbits=31, strategy=strategy), bytearray()  # writes no time into the header
+    packer, packed = zlib.compressobj(level, wbits=31, strategy=strategy), bytearray()  # zlib writes no time
     for part in parts:
         packed += packer.compress(part)
     packed += packer.flush()

@@ -60,10 +60,10 @@ class Format:
     ending: str  # of names, in lower case; without a leading dot, it is the whole name of a folder's main file
     about: str  # description for people
     read: Callable[[Path], StoredRows] | None  # None: the format is only written
-    # Returns the content of one file with Gaussians and comments; None: :func:`gsmerge.io.write_ply` or ``write`` does
+    # Returns the content of one file with Gaussians and comments; None: ``write_ply`` or ``write`` writes the file
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
     max_degree: int  # largest degree of harmonics that is written; -1: the format is only read
-    # Returns the content of one file that also depends on cameras and options; None: ``encode`` does
+    # Returns the content of one file if this also depends on cameras and options; None: ``encode`` returns it
     encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
     first_view: bool = False  # True: viewers look from its first camera, so one is placed if there is none
     beside: str = ""  # name of a file that is written beside an output; "": none
@@ -73,7 +73,7 @@ class Format:
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
     finish: Callable[[Path], object] = lambda _: None  # is called with the output's path after all files were renamed
-    holds: Callable[[Path], bool] | None = None  # returns whether a file with this ending has Gaussians; None: it has
+    holds: Callable[[Path], bool] | None = None  # returns whether a file of this name has Gaussians; None: each has
 
     # How levels of detail are written: "" if only one can be, "apart" as a file for each, "inside" all in one output
     levels: Literal["", "apart", "inside"] = "apart"

@@ -53,7 +53,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
         "asset": {"version": "1.1", "generator": "gsmerge"},
         "extensionsUsed": ["3DTILES_content_gltf"],
         "extensions": {"3DTILES_content_gltf": extensions},
-        "geometricError": float(np.abs(high - low).max()),  # an empty picture is wrong by the size of the scene
+        "geometricError": float(np.abs(high - low).max()),  # without the tile, a picture lacks the whole scene
         "root": root,
     }
     index.write_text(json.dumps(document), encoding="utf-8")
