@@ -284,15 +284,15 @@ def pack_rows(parts: Sequence[Packed]) -> PackedRows:
     return PackedRows(parts, np.dtype([(name, np.float32) for name in names]))
 
 
-def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], mode: str | None = None) -> StoredRows:
+def to_stored(parts: Sequence[Packed], format_name: str, sizes: dict[str, int], mode: str | None = None) -> StoredRows:
     """Give the packed Gaussians of a file the columns of a PLY file, and describe the file.
 
-    ``name``: name of the format. ``sizes``: bytes by attribute. ``mode``: mode of rendering, see :func:`render_mode`.
+    ``sizes``: bytes by attribute. ``mode``: mode of rendering, see :func:`render_mode`.
     """
     rows = pack_rows(parts)
     return StoredRows(
         rows=rows,
-        layout=f"{name}, SH degree {sh_degree(_num_rest(rows.dtype) // 3)}",
+        layout=f"{format_name}, SH degree {sh_degree(_num_rest(rows.dtype) // 3)}",
         format="quantised",
         encoding="raw",  # opacities in [0, 1]
         sizes=sizes,

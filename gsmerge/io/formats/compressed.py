@@ -80,12 +80,12 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
     """Count the columns of harmonics above degree 0; SceneError unless they make up degree 0, 1, 2 or 3."""
     if "sh" not in data:
         return 0
-    names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}
-    number = len(names)
-    if number not in (9, 24, 45) or names != {f"f_rest_{i}" for i in range(number)} or data["sh"].count != count:
+    names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}  # columns of bytes
+    num_rest = len(names)
+    if num_rest not in (9, 24, 45) or names != {f"f_rest_{i}" for i in range(num_rest)} or data["sh"].count != count:
         problem = f"expected 9, 24 or 45 harmonics of {count} Gaussians in element 'sh', found others"
         raise SceneError(path, problem, "export it again")
-    return number
+    return num_rest
 
 
 def _interpolate(

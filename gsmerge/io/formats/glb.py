@@ -70,17 +70,17 @@ def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
     """
     cameras = contents.cameras if contents.options.viewer_cameras else NO_CAMERAS
     names = contents.names or number_views(len(cameras))
-    nodes, lenses, ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
+    nodes, gltf_cameras, view_ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
     near = 0.01  # distance of the near plane in world units, which `gsmerge render` uses, too
-    for i, view in enumerate(ids):
+    for i, view_id in enumerate(view_ids):
         pose = np.eye(4)  # of glTF's cameras, which look along -z with y up
-        pose[:3, :3], pose[:3, 3] = cameras.viewmats[view, :3, :3].T * (1, -1, -1), cameras.centres[view]
+        pose[:3, :3], pose[:3, 3] = cameras.viewmats[view_id, :3, :3].T * (1, -1, -1), cameras.centres[view_id]
         pose = matmul(HALF_TURN, pose)
-        nodes.append({"name": names[view], "camera": i, "matrix": pose.T.reshape(-1).tolist()})
-        ratio = float(cameras.width * cameras.Ks[view, 1, 1] / (cameras.height * cameras.Ks[view, 0, 0]))
-        lens = {"yfov": vertical_field(cameras, view), "aspectRatio": ratio, "znear": near}
-        lenses.append({"name": names[view], "type": "perspective", "perspective": lens})
-    return glb_bytes(gaussians, nodes=nodes, cameras=lenses)
+        nodes.append({"name": names[view_id], "camera": i, "matrix": pose.T.reshape(-1).tolist()})
+        ratio = float(cameras.width * cameras.Ks[view_id, 1, 1] / (cameras.height * cameras.Ks[view_id, 0, 0]))
+        perspective = {"yfov": vertical_field(cameras, view_id), "aspectRatio": ratio, "znear": near}
+        gltf_cameras.append({"name": names[view_id], "type": "perspective", "perspective": perspective})
+    return glb_bytes(gaussians, nodes=nodes, cameras=gltf_cameras)
 
 
 def glb_bytes(
@@ -263,17 +263,17 @@ class _Content:
         dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
         row_bytes, offset = dtype.itemsize * width, accessor.get("byteOffset", 0)
         count, stride = check_whole(accessor["count"], "count", 1), view.get("byteStride", row_bytes)
-        span, at = (count - 1) * stride + row_bytes, self.start + view.get("byteOffset", 0) + offset
+        num_bytes, position = (count - 1) * stride + row_bytes, self.start + view.get("byteOffset", 0) + offset
         self.num_read += count * row_bytes
-        in_view = offset >= 0 and offset + span <= view["byteLength"]
-        in_chunk = self.start <= at and at + span <= self.end
+        in_view = offset >= 0 and offset + num_bytes <= view["byteLength"]
+        in_chunk = self.start <= position and position + num_bytes <= self.end
         max_stride = 252  # bytes from a value to the next, the limit of glTF
         if not row_bytes <= stride <= max_stride or not (in_view and in_chunk):
             raise _ForeignError(f"a truncated one, of {self.end} bytes without {count} values of {row_bytes} bytes")
         if self.num_read > self.end - self.start:
             raise _ForeignError("one that uses the same values several times")
-        self.file.seek(at)
-        rows = np.ndarray((count, width), dtype, self.file.read(span), strides=(stride, dtype.itemsize))
+        self.file.seek(position)
+        rows = np.ndarray((count, width), dtype, self.file.read(num_bytes), strides=(stride, dtype.itemsize))
         return _Values(np.ascontiguousarray(rows), np.iinfo(dtype).max if accessor.get("normalized") else 1)
 
 

@@ -89,8 +89,8 @@ def read_rows(path: Path) -> arrays.StoredRows:
 def _white_of_floats(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[float, list[str]]:
     """Return the number that stands for white in columns of RGB as floats, 1 or 255; also return notes on a guess."""
     colors = arrays.color_columns(rows.dtype.names)
-    float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
-    if float_colors and np.nanmedian(read_columns(path, rows, colors[:1])[colors[0]]) > 1:
+    has_float_rgb = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
+    if has_float_rgb and np.nanmedian(read_columns(path, rows, colors[:1])[colors[0]]) > 1:
         return 255.0, [f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1"]
     return 1.0, []
 
@@ -189,7 +189,7 @@ def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
 
 
 def _layout_name(names: tuple[str, ...], num_rest: int, *, is_compressed: bool) -> str:
-    """Return the name of a file's layout for the user."""
+    """Name the layout of a file's columns for the user."""
     if is_compressed:
         return f"compressed, SH degree {arrays.sh_degree(num_rest // 3)}"
     if arrays.SH0[0] not in names:
@@ -399,15 +399,15 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     if end < 0:
         found = f"no 'end_header' within {MAX_HEADER_BYTES >> 20} MiB" if size > len(start) else "an early end of file"
         raise SceneError(path, f"expected a PLY header, found {found}", arrays.EXPORT_AGAIN)
-    words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
-    is_text = ["format", "ascii", "1.0"] in words
-    elements = _parse_elements(words)
+    lines = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
+    is_text = ["format", "ascii", "1.0"] in lines
+    elements = _parse_elements(lines)
     steps_per_element = 50  # steps of 20 microseconds for all readers that open the file one after another
     budget.check_steps(steps_per_element * len(elements), "steps for elements")
     bytes_left = size - end - len(last_line)
     for element in elements:
         _check_element(budget, element)
-        # A number as text has at least a digit and a space. A list has at least its length
+        # Text has at least a digit and a space per number. A list has at least its length, whose type is the second word
         row_bytes = sum(2 if is_text else _SIZES.get((words[1:2] or words)[0], 1) for words in element.properties)
         bytes_before, bytes_left = bytes_left, bytes_left - element.count * row_bytes
         if bytes_left < -1:  # the last row of a text may end without a new line

@@ -416,21 +416,22 @@ def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[i
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions to ``out [n,4]``, and the identity for each zero quaternion; return their mask ``[n]``."""
+    """Write unit quaternions to ``out [n,4]``, and the identity where a quaternion is zero; return where ``[n]``."""
     w, x, y, z = quats
-    squared = w * w + x * x + y * y + z * z
-    inverse = 1 / np.sqrt(squared)
+    squared_lengths = w * w + x * x + y * y + z * z
+    inverse_lengths = 1 / np.sqrt(squared_lengths)
     for j, column in enumerate(quats):
-        np.multiply(column, inverse, out=out[:, j])
-    zero = np.zeros(len(w), np.bool_)
-    extreme = np.flatnonzero(~((squared > 1e-30) & (squared < 1e30)))  # float32 squares under- or overflow
+        np.multiply(column, inverse_lengths, out=out[:, j])
+    is_zero = np.zeros(len(w), np.bool_)
+    # Rows whose squares under- or overflow in float32 are computed again in float64
+    extreme = np.flatnonzero(~((squared_lengths > 1e-30) & (squared_lengths < 1e30)))
     if len(extreme):
         exact = np.stack([column[extreme].astype(np.float64) for column in quats], 1)
         length = np.linalg.norm(exact, axis=1)
-        zero[extreme] = length == 0
+        is_zero[extreme] = length == 0
         exact[length == 0] = (1, 0, 0, 0)
         out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
-    return zero
+    return is_zero
 
 
 def _choose_encoding(

@@ -205,9 +205,8 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
     width, height = _image_size(data)
     if not count <= width * height <= 4 * count + (1 << 16):
         raise ValueError(f"{name} of {width} x {height} pixels for {count}")
-    budget.check_memory(
-        12 * width * height, f"{name} of {width} x {height} pixels"
-    )  # the image in two orders of channels
+    # The memory of the image in two orders of channels
+    budget.check_memory(12 * width * height, f"{name} of {width} x {height} pixels")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -226,7 +225,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
         pixels = _read_texture(files, meta[key]["files"][index], count, budget)
         return pixels[:, :channels].copy()  # a copy, so that unused channels take no memory
 
-    low, high = (_to_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
+    mins, maxs = (_to_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
     low_bytes, high_bytes, scales = texture("means"), texture("means", 1), texture("scales")
     quats, sh0 = texture("quats", channels=4), texture("sh0", channels=4)
     scale_codes, color_codes = (_to_numbers(meta[key]["codebook"], CODES) for key in ("scales", "sh0"))
@@ -239,7 +238,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
         largest, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
         codes = np.zeros((len(largest), 0, 3), np.uint8) if labels is None else palette[labels[block]]
         return arrays.Columns(
-            means=_decode_means(low_bytes[block] + 256.0 * high_bytes[block], low, high),
+            means=_decode_means(low_bytes[block] + 256.0 * high_bytes[block], mins, maxs),
             quats=arrays.from_smallest_three(largest, smallest),
             log_scales=scale_codes[scales[block]],
             opacities=sh0[block, 3] / 255,
@@ -261,11 +260,11 @@ def _to_numbers(values: Any, length: int) -> np.ndarray:
 def _read_palette(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> tuple[np.ndarray, np.ndarray]:
     """Return the index ``[count]`` of each Gaussian's entry, and the palette ``[n,num_higher,3]`` of codes."""
     size, num_higher = check_whole(meta["count"], "count", 1, 2**PALETTE_BITS), (meta["bands"] + 1) ** 2 - 1
-    name, labels_name = meta["files"]
+    palette_name, labels_name = meta["files"]
     labels = _read_texture(files, labels_name, count, budget)[:, :2].copy().view("<u2")[:, 0]
     # Rows of the texture; a label may exceed the stated size of the palette
     rows = max(-(-size // PALETTE_COLUMNS), int(labels.max()) // PALETTE_COLUMNS + 1)
-    centroids = _read_texture(files, name, rows * PALETTE_COLUMNS * num_higher, budget)[:, :3]
+    centroids = _read_texture(files, palette_name, rows * PALETTE_COLUMNS * num_higher, budget)[:, :3]
     return labels, centroids.reshape(-1, num_higher, 3)
 
 
@@ -338,14 +337,14 @@ def round_means(means: np.ndarray) -> np.ndarray:
 def _quantise_means(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
     """Quantise the signed logarithms of means to 16 bits; also return their minima and maxima for ``meta.json``."""
     logs = np.sign(means) * log1p(np.abs(means))
-    low, high = logs.min(axis=0), logs.max(axis=0)
-    codes = np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
-    return codes, _shorten(low), _shorten(high)
+    mins, maxs = logs.min(axis=0), logs.max(axis=0)
+    codes = np.round((logs - mins) / np.where(maxs > mins, maxs - mins, 1) * 65535).astype(int)
+    return codes, _shorten(mins), _shorten(maxs)
 
 
-def _decode_means(fixed: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Invert :func:`_quantise_means`."""
-    logs = low + (high - low) * fixed / 65535
+def _decode_means(codes: np.ndarray, mins: np.ndarray, maxs: np.ndarray) -> np.ndarray:
+    """Restore means from the results of :func:`_quantise_means`."""
+    logs = mins + (maxs - mins) * codes / 65535
     return np.asarray(np.sign(logs) * expm1(np.abs(logs)))
 
 
@@ -365,9 +364,9 @@ def _encode_texture(values: np.ndarray) -> bytes:
 
 def _encode_webp(image: np.ndarray) -> bytes:
     """Encode a lossless WebP image. The colours of a pixel may change if its alpha is 0."""
-    bgra = [2, 1, 0, 3][: image.shape[2]]  # OpenCV's order of channels
+    bgr_or_bgra = [2, 1, 0, 3][: image.shape[2]]  # OpenCV's order of channels
     lossless = 101  # OpenCV's WebP quality
-    _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., bgra]), [cv2.IMWRITE_WEBP_QUALITY, lossless])
+    _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., bgr_or_bgra]), [cv2.IMWRITE_WEBP_QUALITY, lossless])
     return data.tobytes()
 
 
@@ -390,8 +389,7 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
     codes = _merge_cells(np.diff(ends).astype(float), np.diff(sums[ends]) / np.diff(ends))
     max_steps = 200  # steps of Lloyd's algorithm
     for _ in range(max_steps):
-        ends = np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2)
-        ends = np.concatenate([[0], ends, [len(ordered)]])
+        ends = np.concatenate([[0], np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2), [len(ordered)]])
         numbers, totals = np.diff(ends), np.diff(sums[ends])
         cell_means = np.where(numbers > 0, totals / np.maximum(numbers, 1), codes)
         if np.array_equal(cell_means, codes):
@@ -411,7 +409,8 @@ def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
     def merge_entry(i: int) -> tuple[float, int, int, float, float]:
         """Return the error that merging cell ``i`` with the next one adds, both cells, and their counts of values."""
         j = following[i]
-        return count[i] * count[j] / (count[i] + count[j]) * (mean[i] - mean[j]) ** 2, i, j, count[i], count[j]
+        added_error = count[i] * count[j] / (count[i] + count[j]) * (mean[i] - mean[j]) ** 2
+        return added_error, i, j, count[i], count[j]
 
     heap = [merge_entry(i) for i in range(len(count) - 1)]
     heapq.heapify(heap)

@@ -104,8 +104,8 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
 
     The Gaussians have the axes of a ``.ply``. ``path``: the file that holds the content, for errors.
     """
-    read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
-    header, parts, extensions, num_left = read(ReadBudget(path, len(packed)), packed)
+    read_parts = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
+    header, parts, extensions, num_left = read_parts(ReadBudget(path, len(packed)), packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     extensions_flag = 2  # flag of a file with extensions
     axes = _stored_axes(path, extensions) if header.flags & extensions_flag else PLY_AXES
@@ -122,14 +122,14 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
 
 def _stored_axes(path: StrPath, extensions: bytes) -> str:
     """Return the axes that an extension states, or else those of a ``.ply``; SceneError if it is damaged."""
-    at = 0
+    position = 0  # in ``extensions``
     # Kind of SPZ_ADOBE_coordinate_system. Its content is 1 for the first of AXIS_SYSTEMS, and 0 for unknown axes
     axes_kind = 0xADBE0003
-    while at + EXTENSION_RECORD.size <= len(extensions):
-        kind, size = EXTENSION_RECORD.unpack_from(extensions, at)
-        at += EXTENSION_RECORD.size + size
+    while position + EXTENSION_RECORD.size <= len(extensions):
+        kind, size = EXTENSION_RECORD.unpack_from(extensions, position)
+        position += EXTENSION_RECORD.size + size
         if kind == axes_kind:
-            content = extensions[at - size : at]
+            content = extensions[position - size : position]
             number = int.from_bytes(content, "little") if len(content) == size == 4 else -1
             if not 0 <= number <= len(AXIS_SYSTEMS):
                 found = f"number {number}" if number > 0 else "a damaged record"

@@ -277,11 +277,11 @@ def remove_unused_chunks(path: Path) -> None:
 
     Other files in the chunks' folders stay. A chunk that cannot be removed stays, too.
     """
-    used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
+    used_folders = {chunk.parent.name for level in read_index(path).levels for chunk in level}
     for folder in path.parent.iterdir():
         if (
             _CHUNK_NAME.fullmatch(folder.name)
-            and folder.name not in used
+            and folder.name not in used_folders
             and folder.is_dir()
             and not folder.is_symlink()
         ):
