@@ -407,7 +407,7 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     bytes_left = size - end - len(last_line)
     for element in elements:
         _check_element(budget, element)
-        # Text has at least a digit and a space per number. A list has at least its length, whose type is the second word
+        # Text has a digit and a space per number. A list has at least its length, whose type is its second word
         row_bytes = sum(2 if is_text else _SIZES.get((words[1:2] or words)[0], 1) for words in element.properties)
         bytes_before, bytes_left = bytes_left, bytes_left - element.count * row_bytes
         if bytes_left < -1:  # the last row of a text may end without a new line
