@@ -191,7 +191,7 @@ def _formats_page(page: str) -> str:
     rows = [
         (f"`{row.ending}`", "no" if row.read is None else "yes",
          f"to degree {row.max_degree}" if row.max_degree >= 0 else "no",
-         " / ".join(f"{row.each[i]:.0f}" for i in (0, 3) if i < len(row.each)), row.about)
+         " / ".join(f"{row.gaussian_bytes[i]:.0f}" for i in (0, 3) if i < len(row.gaussian_bytes)), row.about)
         for row in ROWS
     ]  # fmt: skip
     page = _renew(page, "formats", _table_lines(("name", "read", "written", "bytes", "what it is"), rows))

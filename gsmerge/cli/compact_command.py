@@ -127,7 +127,7 @@ def _choose_levels(args: opt.Args, settings: CompactOptions, outputs: Outputs) -
     if not format_.levels and settings.budget.levels > 1:
         levels, kind = settings.budget.levels, format_.about.partition(":")[0]
         raise UsageError(f"{out}: expected one level in {kind}, found --levels {levels}; drop --levels")
-    if settings.budget.in_bytes and not format_.each:
+    if settings.budget.in_bytes and not format_.gaussian_bytes:
         raise UsageError(f"{out}: expected a --budget in Gaussians for this format, got {settings.budget.budget}")
     return settings
 

@@ -19,7 +19,7 @@ from gsmerge.geometry.frame import scene_frame
 from gsmerge.io import GaussianFile, file_notes, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
-from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, result_comments, upward_axis
+from gsmerge.io.formats.arrays import RESULT_COMMENT, result_comments, states_vertical_axis, upward_axis
 from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_columns, read_extra_columns
 from gsmerge.io.formats.read import FileInfo, kept_comments
 from gsmerge.io.formats.rounding import format_notes
@@ -119,7 +119,7 @@ def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -
     If the scene moves, comments on its frame are no longer true, and are left out.
     """
     file_comments = [
-        [comment for comment in kept_comments(info) if not (moves and is_of_frame(comment))] for info in infos
+        [comment for comment in kept_comments(info) if not (moves and states_vertical_axis(comment))] for info in infos
     ]
     all_comments = list(dict.fromkeys(chain(*file_comments)))
     shared = [comment for comment in all_comments if all(comment in comments for comments in file_comments)]

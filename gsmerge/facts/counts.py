@@ -61,7 +61,7 @@ def file_size(options: BudgetOptions) -> FileSize | None:
     if not options.in_bytes:
         return None
     file = output_format(options.output or PLY.ending)
-    if not file.each:
+    if not file.gaussian_bytes:
         raise UsageError(f"budget: expected a number or a share of Gaussians for {file.ending}, got {options.budget}")
     return FileSize(parse_bytes(str(options.budget)), file)
 

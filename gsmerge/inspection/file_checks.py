@@ -89,7 +89,7 @@ def _read_other(path: Path) -> FileCheck:
     if suffix in SCENE_SUFFIXES:
         find_scene_files(path)  # raises an error that says what a file without Gaussians holds
     if suffix in IMAGE_SUFFIXES | OTHER_SUFFIXES:
-        raise ply.no_ply(path)
+        raise ply.no_ply_error(path)
     endings = ", ".join(dict.fromkeys((*READ_ENDINGS, *CAMERA_FILE_ENDINGS, NETWORKS)))
     raise SceneError(path, f"expected one of {endings}, found another kind of file")
 

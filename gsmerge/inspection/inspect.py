@@ -20,7 +20,7 @@ from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io import GaussianFile, file_notes, kept_comments
-from gsmerge.io.formats.arrays import read_new_views
+from gsmerge.io.formats.arrays import read_expected_scores
 from gsmerge.io.formats.gsm import list_batches
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
@@ -157,7 +157,7 @@ def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] 
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
     """Describe the views of a scene, and whether its rows belong to pixels; see :func:`inspect` for the keys."""
-    is_result, expected = is_from_gsmerge(ply.info.comments), read_new_views(ply.info.comments)
+    is_result, expected = is_from_gsmerge(ply.info.comments), read_expected_scores(ply.info.comments)
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),

@@ -9,7 +9,7 @@ from pathlib import Path
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.transforms import middle_depth
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.formats.arrays import read_new_views
+from gsmerge.io.formats.arrays import read_expected_scores
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import Contents
 from gsmerge.measure.camera_path import median_camera
@@ -58,7 +58,7 @@ def _read_licences() -> bytes:
 
 def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str]) -> str:
     """Make the HTML of a page. Without cameras, gsmerge places viewpoints, and the user may look from any side."""
-    expected = read_new_views(comments)
+    expected = read_expected_scores(comments)
     is_free = len(cameras) == 0
     viewpoints = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
     start = 0 if is_free else median_camera(viewpoints)  # the first of the placed viewpoints is outside the scene

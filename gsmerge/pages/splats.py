@@ -57,7 +57,7 @@ def pack_splats(
     if cameras is not None and homes is not None and (homes >= 0).all():
         positions = _pixel_positions(rows, means, cameras, homes.astype(np.int64, copy=False))
     if positions is None:
-        changes = np.diff(spz.fix_means(drawn_means, fraction), axis=0, prepend=np.zeros((1, 3), np.int32)).T
+        changes = np.diff(spz.quantise_means(drawn_means, fraction), axis=0, prepend=np.zeros((1, 3), np.int32)).T
         positions = np.where(changes < 0, -2 * changes - 1, 2 * changes).astype("<u4")
     elif cameras is not None:
         head |= _camera_head(cameras)

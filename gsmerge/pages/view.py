@@ -15,7 +15,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.first_bytes import may_be_replaced
-from gsmerge.io.formats.arrays import read_new_views
+from gsmerge.io.formats.arrays import read_expected_scores
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.read import GaussianFile, read_gaussians
 from gsmerge.io.scene_files import find_scene_files, scene_title
@@ -126,7 +126,7 @@ def view(
 
 def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, float]]:
     """Return the bounds of the expected gain of new views, in dB, of the results whose files store them."""
-    known = {name: read_new_views(file.info.comments) for name, file in files.items()}
+    known = {name: read_expected_scores(file.info.comments) for name, file in files.items()}
     return {name: scores.bounds for name, scores in known.items() if scores}
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmerge.io.formats import arrays
-from gsmerge.io.formats.compressed import CHUNK, COLORS, RANGE_COLUMNS, SH_RANGE
+from gsmerge.io.formats.compressed import CHUNK, COLOR_RANGES, RANGE_COLUMNS, SH_RANGE
 from gsmerge.io.formats.spz import HEADER, MAGIC, MIP_FLAG, spz_columns
 from gsmerge.types import Gaussians
 
@@ -40,7 +40,7 @@ def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> byte
     words[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], 1), (8, 8, 8, 8))
     harmonics = np.floor((columns.harmonics / SH_RANGE + 0.5) * 256).transpose(0, 2, 1)
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
-    header += [f"element chunk {len(chunks)}", *(f"property float {name}" for name in (*RANGE_COLUMNS, *COLORS))]
+    header += [f"element chunk {len(chunks)}", *(f"property float {name}" for name in (*RANGE_COLUMNS, *COLOR_RANGES))]
     header += [f"element vertex {count}", *(f"property uint {name}" for name in arrays.PACKED)]
     if num_rest:
         header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(num_rest))]

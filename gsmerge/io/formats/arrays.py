@@ -23,7 +23,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
 from gsmerge.values.arrays import Array, as_array
 
-MAX_POSITION = 1e13  # no scene is larger, in any unit; float32 can square and sum positions and scales below
+MAX_POSITION = 1e13  # no scene is larger, in any unit; squares and sums of such positions are finite in float32
 BLOCK_ROWS = 1 << 16  # rows that are converted at a time
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
 LOGIT_COMMENT = "opacity: logit"  # states the encoding in files of gsmerge, so that no reader guesses it
@@ -42,11 +42,11 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of compressed PLYs
 REQUIRED_COLUMNS = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
-SHARE_ROUNDING = 0.01  # shares that were rounded to half floats may exceed [0, 1] by this
-MAX_STRAY = 0.01  # share of a column's values that may contradict the others, because of roundings and damage
+UNIT_ROUNDING = 0.01  # rounding to half floats may move values this far outside [0, 1]
+MAX_STRAY = 0.01  # share of a column's values that may contradict the others, because of rounding and damage
 _EXACT = 1e-5  # largest rounding error of a whole number in a matrix that rotates harmonics
 EXPORT_AGAIN = "copy or export it again"  # remedy for a damaged file
-GAUSSIAN_BYTES = 4 * len(REQUIRED_COLUMNS) + 1  # bytes in memory with the flag of validity, without higher harmonics
+GAUSSIAN_BYTES = 4 * len(REQUIRED_COLUMNS) + 1  # bytes in memory of a Gaussian of degree 0 with its flag ``valid``
 
 
 def sh_degree(num_higher: int) -> int:
@@ -57,36 +57,36 @@ def sh_degree(num_higher: int) -> int:
 def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
     """Return the header comments that copies of a file keep: how to render the Gaussians, and which axis is vertical.
 
-    Of several comments on the same thing, the last one counts.
+    If several comments state the mode or the axis, the last one counts.
     """
     mode = render_mode(comments)
-    vertical = [line for line in comments if is_of_frame(line)]
+    vertical = [line for line in comments if states_vertical_axis(line)]
     return (*([] if mode is None else [f"{RENDER_COMMENT}: {mode}"]), *map(str, vertical[-1:]))
 
 
-def is_of_frame(comment: object) -> bool:
+def states_vertical_axis(comment: object) -> bool:
     """Return whether a header comment says which axis is vertical."""
     return isinstance(comment, str) and _VERTICAL.fullmatch(comment) is not None
 
 
 def upward_axis(comments: Sequence[object]) -> str | None:
-    """Return the axis that header comments call vertical, such as "z" or "-z"; None without such a comment.
+    """Return the axis that a header comment states as vertical, such as "z" or "-z"; None without such a comment.
 
-    None for "y" as well, since programs write it for the usual axis, which is -y.
+    Also None for "y", which programs write for the usual axis -y.
     """
-    axes = [str(comment).split()[-1].lower().removeprefix("+") for comment in comments if is_of_frame(comment)]
+    axes = [str(comment).split()[-1].lower().removeprefix("+") for comment in comments if states_vertical_axis(comment)]
     return axes[-1] if axes and axes[-1] != "y" else None
 
 
 def render_mode(comments: Sequence[object]) -> str | None:
     """Return the mode of rendering that header comments ask for, ``MIP`` or ``FLAT``; None for the plain mode."""
-    max_copied = 100  # characters of a comment that is copied to other files
+    max_copied = 100  # most characters of a comment that is copied to other files
     lines = (line for line in comments if isinstance(line, str) and len(line) <= max_copied)
     matches = [match for match in map(_MODE.fullmatch, lines) if match is not None]
     if not matches:
         return None
     mode, antialiased = matches[-1].groups()
-    mode = (mode or (MIP if antialiased == "1" else "")).lower()
+    mode = MIP if antialiased == "1" else (mode or "").lower()
     return mode if mode in (MIP, FLAT) else None
 
 
@@ -97,8 +97,8 @@ class ExpectedScores:
     Args:
         before: When rendered from the input.
         after: When rendered from the result.
-        low: Lower bound of the expected gain; one of ten results gains less.
-        high: Upper bound of the expected gain; one of ten results gains more.
+        low: Lower bound of the expected gain, which nine of ten results exceed.
+        high: Upper bound of the expected gain, which one of ten results exceeds.
     """
 
     before: float
@@ -108,7 +108,7 @@ class ExpectedScores:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Lower and upper bound of the expected gain of new views, dB."""
+        """Lower and upper bound of the expected gain in PSNR, dB."""
         return self.low, self.high
 
 
@@ -123,19 +123,19 @@ def new_views_comment(scores: ExpectedScores) -> str:
     return f"{NEW_VIEWS_COMMENT}: {scores.before:.2f} to {scores.after:.2f} dB, {gain}"
 
 
-def read_new_views(comments: Sequence[object]) -> ExpectedScores | None:
+def read_expected_scores(comments: Sequence[object]) -> ExpectedScores | None:
     """Read the expected scores of new views from header comments; None without such a comment."""
-    number = r"(-?\d{1,3}\.\d\d)"
-    pattern = re.compile(f"{re.escape(NEW_VIEWS_COMMENT)}: {number} to {number} dB, gain {number} to {number} dB")
+    score = r"(-?\d{1,3}\.\d\d)"
+    pattern = re.compile(f"{re.escape(NEW_VIEWS_COMMENT)}: {score} to {score} dB, gain {score} to {score} dB")
     matches = (pattern.fullmatch(comment) for comment in comments if isinstance(comment, str))
     match = next(filter(None, matches), None)
     return None if match is None else ExpectedScores(*map(float, match.groups()))
 
 
-def note_surplus(num_bytes: int, least: int) -> tuple[Doubt, ...]:
-    """Return a doubt about a file with at least ``least`` bytes after its last row; fewer bytes may be padding."""
+def note_surplus(num_bytes: int, min_bytes: int) -> tuple[Doubt, ...]:
+    """Warn if at least ``min_bytes`` bytes follow the last row of a file; fewer bytes may be padding."""
     reason = "as if the header's count were too small or another file were appended"
-    return (Doubt(f"{num_bytes:,} bytes follow the last row, {reason}"),) if num_bytes >= least else ()
+    return (Doubt(f"{num_bytes:,} bytes follow the last row, {reason}"),) if num_bytes >= min_bytes else ()
 
 
 def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
@@ -144,21 +144,25 @@ def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
     return SH0 if names is None or SH0[0] in names else next(plain, SH0)
 
 
-def are_shares(values: np.ndarray) -> bool:
-    """Return whether stored values are opacities or colours in [0, 1], except for roundings and damage.
+def lie_in_unit_range(values: np.ndarray) -> bool:
+    """Return whether stored values are opacities or colours in [0, 1], rather than logits or harmonics.
 
-    The density of logits and of harmonics continues beyond 0 and 1, while that of shares ends there. Therefore values
-    are shares if hardly any value lies outside [0, 1], and more values lie inside, close to 0 or 1, than outside.
+    Rounding and damage may put a few opacities or colours outside. Logits and harmonics are about as frequent beyond 0
+    and 1 as near to them. Therefore the answer is yes if hardly any value lies outside, and more values lie inside,
+    close to 0 or 1, than outside.
     """
     excess = np.abs(values[np.isfinite(values)] - 0.5) - 0.5  # distance outside [0, 1]; negative inside
     num_outside = int(np.count_nonzero(excess > 0))
-    num_close = int(np.count_nonzero((excess <= 0) & (excess > -SHARE_ROUNDING)))
+    num_close = int(np.count_nonzero((excess <= 0) & (excess > -UNIT_ROUNDING)))
     are_few = num_outside < num_close and num_outside < MAX_STRAY * len(excess)
     return bool(len(excess)) and (are_few or num_outside == 0)
 
 
 def are_logarithms(scales: np.ndarray) -> bool:
-    """Return whether stored scales are logarithms: many are negative, while standard deviations never are."""
+    """Return whether stored scales are logarithms.
+
+    Logarithms of scales are often negative. Scales themselves are negative only by damage.
+    """
     return bool(np.count_nonzero(scales < 0) > MAX_STRAY * scales.size)
 
 
@@ -182,7 +186,7 @@ class Columns:
 
     @property
     def colors(self) -> np.ndarray:
-        """Base colours ``[n,3]`` as RGB; only values from 0 to 1 can be displayed."""
+        """Base colours ``[n,3]`` as RGB, which may lie outside [0, 1]."""
         return sh0_to_rgb(self.sh0)
 
     def along_curve(self) -> Columns:
@@ -209,9 +213,9 @@ def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
 
 @dataclass(frozen=True)
 class Packed:
-    """``count`` Gaussians as a file packs them; the thread-safe function ``unpack`` returns a block of them.
+    """The ``count`` Gaussians of a file with packed columns; the thread-safe ``unpack`` returns a block of them.
 
-    Blocks save memory: all Gaussians unpacked take several times the memory of both the file and the result.
+    Gaussians are unpacked in blocks, since all of them at a time would take several times the memory of the result.
     """
 
     count: int
@@ -221,7 +225,7 @@ class Packed:
 
 @dataclass(frozen=True)
 class PackedRows:
-    """Rows of a PLY file, which are unpacked block by block when they are read."""
+    """Packed Gaussians with the columns of a PLY file; an index with a slice unpacks these rows."""
 
     parts: Sequence[Packed]
     dtype: np.dtype[np.void]
@@ -235,18 +239,19 @@ class PackedRows:
         with np.errstate(all="ignore"):  # the reader accepts scales of 0, and sets aside rows that are not finite
             for part in self.parts:
                 part_block = slice(max(start - part_start, 0), min(stop - part_start, part.count))
-                columns += [part.unpack(part_block)] if part_block.start < part_block.stop else []
+                is_empty = part_block.start >= part_block.stop  # the part has no row of the block
+                columns += [] if is_empty else [part.unpack(part_block)]
                 part_start += part.count
             return _to_table(concatenate(columns, num_higher)).view(self.dtype)[:, 0]
 
 
-def _num_rest(row: np.dtype[np.void]) -> int:
-    """Count the columns of harmonics above degree 0."""
-    return sum(name.startswith("f_rest_") for name in row.names or ())
+def _num_rest(row_type: np.dtype[np.void]) -> int:
+    """Count the columns ``f_rest_*``."""
+    return sum(name.startswith("f_rest_") for name in row_type.names or ())
 
 
 def _to_table(columns: Columns) -> np.ndarray:
-    """Put columns side by side in the order of :func:`pack_rows`, as float32."""
+    """Put columns side by side, as float32, in the order of the names in :func:`pack_rows`."""
     count, num_higher = columns.harmonics.shape[:2]
     harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)
     parts = (columns.means, columns.sh0, harmonics, columns.opacities[:, None], columns.log_scales, columns.quats)
@@ -255,7 +260,10 @@ def _to_table(columns: Columns) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class StoredRows:
-    """Gaussians as a file stores them; after ``adapt``, ``rows`` have at least the PLY columns ``REQUIRED_COLUMNS``."""
+    """The Gaussians of a file before their units are converted, and facts about the file.
+
+    After ``adapt``, ``rows`` have at least the columns ``REQUIRED_COLUMNS`` of a PLY file.
+    """
 
     rows: np.ndarray | PackedRows
     layout: str  # the name of the layout for people
@@ -264,47 +272,48 @@ class StoredRows:
     sizes: dict[str, int]  # bytes by attribute
     comments: tuple[str, ...] = ()
     extra_elements: tuple[str, ...] = ()
-    bytes_beside: int = 0  # bytes of further files with rows
+    bytes_beside: int = 0  # bytes of further files that hold the rows
     notes: tuple[str, ...] = ()  # how the content was adapted, one sentence each, without a full stop
     adapt: Callable[[np.ndarray], np.ndarray] | None = None  # converts a block of rows to the usual columns
 
 
 def pack_rows(parts: Sequence[Packed]) -> PackedRows:
-    """Make rows of a PLY file from packed Gaussians, with the largest number of harmonics of any part."""
+    """Give packed Gaussians the columns of a PLY file; missing harmonics of a part become zeros."""
     num_rest = 3 * max(part.num_higher for part in parts)
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS)
     return PackedRows(parts, np.dtype([(name, np.float32) for name in names]))
 
 
-def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], mode: str | None = None) -> StoredRows:
-    """Make the stored rows of a file from its packed Gaussians.
+def to_stored(parts: Sequence[Packed], format_name: str, sizes: dict[str, int], mode: str | None = None) -> StoredRows:
+    """Give the packed Gaussians of a file the columns of a PLY file, and describe the file.
 
-    ``name``: name of the format. ``sizes``: bytes by attribute. ``mode``: mode of rendering, see :func:`render_mode`.
+    ``sizes``: bytes by attribute. ``mode``: mode of rendering, see :func:`render_mode`.
     """
     rows = pack_rows(parts)
     return StoredRows(
         rows=rows,
-        layout=f"{name}, SH degree {sh_degree(_num_rest(rows.dtype) // 3)}",
+        layout=f"{format_name}, SH degree {sh_degree(_num_rest(rows.dtype) // 3)}",
         format="quantised",
-        encoding="raw",
+        encoding="raw",  # opacities in [0, 1]
         sizes=sizes,
         comments=() if mode is None else (f"{RENDER_COMMENT}: {mode}",),
     )
 
 
 def max_array_bytes(file_bytes: int) -> int:
-    """Return the size in bytes from which an array of Gaussians is mapped from a temporary file.
+    """Return the size in bytes from which an array of Gaussians lies in a temporary file instead of memory.
 
-    Harmonics in memory may be many times as large as the file that is read.
+    Unpacked harmonics may be many times as large as the file that is read.
     """
     return max(1 << 25, 8 * file_bytes)
 
 
 def check_gaussian_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
-    """Raise SceneError if ``count`` Gaussians, with ``packed_bytes`` each, take more memory than the file allows."""
-    harmonics = min(12 * num_higher * count, max_array_bytes(budget.file_bytes))  # bytes in memory
+    """Raise SceneError if ``count`` Gaussians, with ``packed_bytes`` each, take more memory than ``budget`` allows."""
+    # Larger harmonics lie in a temporary file
+    harmonics_bytes = min(12 * num_higher * count, max_array_bytes(budget.file_bytes))
     unpacked_bytes = 16_000_000  # bytes of all blocks that are unpacked at the same time
-    num_bytes = count * (packed_bytes + GAUSSIAN_BYTES) + harmonics + unpacked_bytes
+    num_bytes = count * (packed_bytes + GAUSSIAN_BYTES) + harmonics_bytes + unpacked_bytes
     budget.check_memory(num_bytes, f"{count:,} Gaussians")
 
 
@@ -330,7 +339,7 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
     quats = array(gaussians.quats)
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     quats = np.where(length == 0, (1.0, 0.0, 0.0, 0.0), quats) / np.where(length == 0, 1, length)
-    # Scales of 0 are clipped; negative scales become NaN and are refused
+    # Scales of 0 get the least logarithm. Negative scales become NaN, which is refused below
     log_scales = np.clip(log(array(gaussians.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
     return Columns(
         means=array(gaussians.means),
@@ -343,10 +352,10 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 
 
 def column_blocks(gaussians: Gaussians, max_degree: int, num_rows: int | None = None) -> Iterator[tuple[int, Columns]]:
-    """Yield the number of the first row of each block of Gaussians, and the block as :func:`to_columns` returns it.
+    """Yield each block of Gaussians as :func:`to_columns` returns it, after the number of its first row.
 
-    ``num_rows``: rows of a block; None: ``BLOCK_ROWS``. Blocks save memory, since columns take several times as much as
-    Gaussians.
+    ``num_rows``: rows of a block; None: ``BLOCK_ROWS``. Blocks save memory, since columns take several times as much
+    memory as Gaussians.
     """
     num_rows = num_rows or BLOCK_ROWS
     for start in range(0, len(gaussians), num_rows):
@@ -356,12 +365,12 @@ def column_blocks(gaussians: Gaussians, max_degree: int, num_rows: int | None = 
 def rotator(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
     """Return a function that rotates Gaussians by an orthogonal matrix ``[3,3]``, which may mirror them.
 
-    ``num_higher``: number of the Gaussians' harmonics above degree 0.
+    ``num_higher``: number of harmonics of each Gaussian above degree 0.
     """
     if np.array_equal(rotation, np.eye(3)):
         return lambda columns: columns
-    # A mirror acts on an ellipsoid as the rotation by the negative matrix does; the sign is that of the determinant
-    sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())
+    # A matrix that mirrors maps an ellipsoid as its negative does, which is a rotation
+    sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())  # of the determinant
     quat = rotmat_to_quat(sign * rotation[None])[0]
     rotate_harmonics = _harmonics_rotator(rotation, num_higher)
     return lambda columns: replace(
@@ -375,9 +384,10 @@ def rotator(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Column
 def _harmonics_rotator(rotation: np.ndarray, num_higher: int) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that rotates ``harmonics [n,num_higher,3]`` by a matrix ``[3,3]``."""
     matrix = harmonics_rotation(num_higher, rotation) if num_higher else np.zeros((0, 0))
+    # Rounding errors of whole numbers are removed, so that the matrix of half a turn is exactly diagonal
     matrix = np.where(np.abs(matrix - np.round(matrix)) < _EXACT, np.round(matrix), matrix)
     signs = np.diagonal(matrix)[:, None]
-    if np.array_equal(matrix, np.diag(np.diagonal(matrix))):  # such as that of half a turn
+    if np.array_equal(matrix, np.diag(np.diagonal(matrix))):
         return lambda harmonics: harmonics * signs
     return lambda harmonics: apply_harmonics_rotation(harmonics, matrix)
 
@@ -399,7 +409,7 @@ def from_smallest_three(largest: np.ndarray, smallest: np.ndarray) -> np.ndarray
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split unit quaternions ``[n,4]`` into the index ``[n]`` of the largest component and the other three ``[n,3]``.
 
-    The sign is chosen so that the largest component is positive. Therefore it need not be stored.
+    Signs are chosen so that the largest component is positive. Files leave it out, since it follows from the others.
     """
     largest, rows = np.abs(quats).argmax(1), np.arange(len(quats))
     quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]

@@ -15,7 +15,7 @@ _SAME_COLOR = 1.5 / 255  # largest difference of a float and a byte of the same 
 
 @dataclass(frozen=True)
 class ColorUnits:
-    """The values of ``f_dc_*`` that stand for black and white."""
+    """Units of RGB in the columns ``f_dc_*``: the numbers that stand for black and for white."""
 
     black: float
     white: float
@@ -34,28 +34,32 @@ _UNITS = (
 
 
 def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUnits, str] | None:
-    """Judge a sample of stored colours ``[n,3]``; return their units and a clause that says why; None for harmonics.
+    """Judge a sample of stored colours ``[n,3]``; return units of RGB and a clause that says why; None for harmonics.
 
-    ``plain [n,3]`` are the bytes of the columns red, green and blue, if the file has these, too. Harmonics of a scene
-    go far below zero, where colours are darker than grey. RGB ends at black and at white.
+    ``plain [n,3]`` are the bytes of the columns red, green and blue if the file has these, too. Many harmonics are far
+    below zero, since they stand for colours darker than grey. No value of RGB is below black or above white.
     """
-    # RGB covers at least this part of the range from black to white. Harmonics of faint scenes cover less
+    # RGB of a scene covers more than this part of the range from black to white. Harmonics of a scene with little
+    # contrast cover less
     min_spread = 0.5
     for units in _UNITS if len(stored) >= MIN_JUDGED else ():
         rgb = units.rgb(stored)
         if plain is not None and (np.abs(rgb - plain / np.float32(255)) <= _SAME_COLOR).mean() > 1 - arrays.MAX_STRAY:
             return units, "the columns red, green and blue are the same"
-        if arrays.are_shares(rgb) and np.ptp(np.quantile(rgb, (arrays.MAX_STRAY, 1 - arrays.MAX_STRAY))) > min_spread:
+        if (
+            arrays.lie_in_unit_range(rgb)
+            and np.ptp(np.quantile(rgb, (arrays.MAX_STRAY, 1 - arrays.MAX_STRAY))) > min_spread
+        ):
             return units, f"all lie in [{units.black:g}, {units.white:g}]"
     return None
 
 
 def find_units(stored: np.ndarray) -> ColorUnits | None:
-    """Return the units in which hardly any colour ``[n,3]`` lies outside black to white; None if there are none."""
-    shares = ((units, np.abs(units.rgb(stored) - 0.5) <= 0.5) for units in _UNITS)
-    return next((units for units, is_inside in shares if is_inside.mean() > 1 - arrays.MAX_STRAY), None)
+    """Return the units of RGB in which hardly any of the colours ``[n,3]`` is impossible; None if there are none."""
+    inside_by_units = ((units, np.abs(units.rgb(stored) - 0.5) <= 0.5) for units in _UNITS)
+    return next((units for units, is_inside in inside_by_units if is_inside.mean() > 1 - arrays.MAX_STRAY), None)
 
 
 def choose_units(stored: np.ndarray) -> ColorUnits:
-    """Return the most likely units of colours ``[n,3]`` that the caller calls RGB; by default, RGB in [0, 1]."""
-    return next((units for units in _UNITS if arrays.are_shares(units.rgb(stored))), _UNITS[0])
+    """Return the most likely units of colours ``[n,3]`` that are known to be RGB."""
+    return next((units for units in _UNITS if arrays.lie_in_unit_range(units.rgb(stored))), _UNITS[0])

@@ -22,11 +22,11 @@ class ColumnKind:
 
     what: str  # their content; empty for columns that do not change renders
     names: str  # regular expression of their names
-    effect: str = ""  # what changes without them
-    remedy: str = ""  # files with these columns are refused with it; empty: a note names the columns
+    effect: str = ""  # how renders look without them
+    remedy: str = ""  # in the error of files with these columns; empty: a note names the columns
 
 
-# The first kind that matches a name counts. The note lists columns of floats that match no kind as unknown
+# A column belongs to the first kind whose pattern matches its name. A note lists other columns of floats as unknown
 COLUMN_KINDS = (
     ColumnKind(
         "when each Gaussian appears",
@@ -77,28 +77,28 @@ COLUMN_KINDS = (
         r".*",
     ),
 )  # fmt: skip
-# PLY's types of whole numbers, of 1, 2 and 4 bytes
+# PLY's names of the integer types with 1, 2 and 4 bytes: signed, unsigned
 _WHOLE_TYPES = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}
 
 
 def _find_kind(name: str) -> ColumnKind | None:
-    """Return the first kind whose pattern a column's name matches; None for an unknown name."""
+    """Return the first kind whose pattern matches the name of a column; None for an unknown name."""
     return next((kind for kind in COLUMN_KINDS if re.fullmatch(kind.names, name, re.IGNORECASE)), None)
 
 
-def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
-    """Return a note on columns and elements that are not used, though they would change renders; empty without any.
+def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
+    """Note columns and elements that are not used, though they would change renders; empty if there are none.
 
-    ``layers``: names of elements with more Gaussians. SceneError if a column shows that the file alone is no scene, or
-    if a column of Gaussians is stored as whole numbers.
+    ``layers``: names of other elements that hold Gaussians. SceneError if a column shows that Gaussians are incomplete
+    without other data, or if a column of Gaussians has an integer type.
     """
-    _check_types(path, row)
+    _check_types(path, row_type)
     by_kind: dict[ColumnKind | None, list[str]] = {}
-    for name in row.names or ():
+    for name in row_type.names or ():
         if name in arrays.REQUIRED_COLUMNS or name.startswith("f_rest_"):
             continue
         kind = _find_kind(name)
-        if kind is not None or row[name].kind == "f":
+        if kind is not None or row_type[name].kind == "f":
             by_kind.setdefault(kind, []).append(name)
     for kind, names in by_kind.items():
         if kind is not None and kind.remedy:
@@ -111,11 +111,11 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
     return (UNUSED + "; ".join(parts),) if parts else ()
 
 
-def _check_types(path: Path, row: np.dtype[np.void]) -> None:
-    """Raise SceneError if a column of Gaussians is stored as whole numbers; plain colours may be bytes."""
-    colors = arrays.color_columns(row.names)
-    for name in row.names or ():
-        dtype, is_used = row[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
+def _check_types(path: Path, row_type: np.dtype[np.void]) -> None:
+    """Raise SceneError if a column of Gaussians has an integer type; columns such as ``red`` may be bytes."""
+    colors = arrays.color_columns(row_type.names)
+    for name in row_type.names or ():
+        dtype, is_used = row_type[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
         is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
         if is_used and dtype.kind != "f" and not is_color_byte:
             type_name = _WHOLE_TYPES[dtype.kind][dtype.itemsize // 2]
@@ -125,14 +125,14 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
 
 
 def describes_places(name: str) -> bool:
-    """Return whether a column may hold positions or directions, such as a motion; False for labels and weights."""
+    """Return whether a column may hold positions or directions, such as motion, rather than labels or weights."""
     kind = _find_kind(name)
     return kind is None or bool(kind.what)
 
 
 def list_names(names: Sequence[str]) -> str:
     """List the names of columns for a message: the first six names, and the number of further names."""
-    max_names, max_characters = 6, 60  # names in a list of columns, and characters of each
+    max_names, max_characters = 6, 60  # most listed names, and most characters of each
     num_unlisted = len(names) - max_names
     listed = ", ".join(name[:max_characters] for name in names[:max_names])
     return listed + (f" and {num_unlisted} more" if num_unlisted > 0 else "")

@@ -1,10 +1,10 @@
 """Read compressed PLY files of PlayCanvas, SuperSplat and gsplat.
 
-Each Gaussian has four packed words, and each chunk of 256 Gaussians has ranges of their values.
+Each Gaussian has four packed words. Each chunk of 256 Gaussians has the least and the largest of their values.
 
 The layout is that of PlayCanvas' reader. Positions and scales have 11, 10 and 11 bits between a chunk's minimum and
-maximum. Rotations are their three smaller components at 10 bits, colours and opacities have 8 bits, and harmonics are
-bytes in the element ``sh``.
+maximum. Rotations are the three smaller components of quaternions at 10 bits. Colours and opacities have 8 bits.
+Harmonics are bytes in the element ``sh``.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from gsmerge.io.formats import arrays
 from gsmerge.io.formats.arrays import PACKED
 from gsmerge.kernels.elementary import log, log1p
 
-CHUNK = 256  # Gaussians that share a range
+CHUNK = 256  # Gaussians in a chunk
 _POSITION_RANGES = tuple(f"{bound}_{axis}" for bound in ("min", "max") for axis in "xyz")
 _SCALE_RANGES = tuple(f"{bound}_scale_{axis}" for bound in ("min", "max") for axis in "xyz")
-# Columns that a chunk must have; those of colours may be missing
+# Columns that a chunk must have. It may lack the columns COLOR_RANGES
 RANGE_COLUMNS = (*_POSITION_RANGES, *_SCALE_RANGES)
-COLORS = tuple(f"{bound}_{channel}" for bound in ("min", "max") for channel in "rgb")
+COLOR_RANGES = tuple(f"{bound}_{channel}" for bound in ("min", "max") for channel in "rgb")
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
-# Value of each stored byte
+# Harmonic of each stored byte
 _HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE
 
 
@@ -47,7 +47,7 @@ def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
 
 
 def _check_types(path: Path, element: PlyElement, columns: tuple[str, ...], types: tuple[str, str]) -> None:
-    """Raise SceneError if an element lacks a column, or stores it in another type than ``types``."""
+    """Raise SceneError if an element lacks one of ``columns``, or has it in a type that is not in ``types``."""
     stored = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
     wrong = next((name for name in columns if stored.get(name) not in types), None)
     if wrong is not None:
@@ -60,52 +60,57 @@ def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
     vertex, chunk = data["vertex"].data[block], data["chunk"].data
     words = {name: vertex[name].astype(np.uint32) for name in PACKED}
     chunk_ids = np.arange(block.start, block.stop) // CHUNK
-    *colors, alpha = _shares(words["packed_color"], (8, 8, 8, 8))
+    *colors, alpha = _unpack_words(words["packed_color"], (8, 8, 8, 8))
     largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # index of a component of wxyz
-    smallest = np.stack(_shares(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
+    smallest = np.stack(_unpack_words(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
     codes = np.empty((len(vertex), 3 * num_higher), np.uint8)
     for i in range(3 * num_higher):
         codes[:, i] = data["sh"].data[f"f_rest_{i}"][block]
     return arrays.Columns(
-        means=_between(_shares(words["packed_position"], (11, 10, 11)), chunk, _POSITION_RANGES, chunk_ids),
+        means=_interpolate(_unpack_words(words["packed_position"], (11, 10, 11)), chunk, _POSITION_RANGES, chunk_ids),
         quats=arrays.from_smallest_three(largest, smallest * np.sqrt(2.0)),
-        log_scales=_between(_shares(words["packed_scale"], (11, 10, 11)), chunk, _SCALE_RANGES, chunk_ids),
+        log_scales=_interpolate(_unpack_words(words["packed_scale"], (11, 10, 11)), chunk, _SCALE_RANGES, chunk_ids),
         opacities=log(alpha) - log1p(-alpha),  # infinite for 0 and 1, which the reader accepts
-        sh0=rgb_to_sh0(_between(colors, chunk, COLORS, chunk_ids)),
+        sh0=rgb_to_sh0(_interpolate(colors, chunk, COLOR_RANGES, chunk_ids)),
         harmonics=_HARMONICS[codes.reshape(len(vertex), 3, num_higher).transpose(0, 2, 1)],
     )
 
 
 def _num_rest(path: Path, data: PlyData, count: int) -> int:
-    """Count the columns of harmonics above degree 0; SceneError if it is no number of a degree from 0 to 3."""
+    """Count the columns of harmonics above degree 0; SceneError unless they make up degree 0, 1, 2 or 3."""
     if "sh" not in data:
         return 0
-    names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}
-    number = len(names)
-    if number not in (9, 24, 45) or names != {f"f_rest_{i}" for i in range(number)} or data["sh"].count != count:
+    names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}  # columns of bytes
+    num_rest = len(names)
+    if num_rest not in (9, 24, 45) or names != {f"f_rest_{i}" for i in range(num_rest)} or data["sh"].count != count:
         problem = f"expected 9, 24 or 45 harmonics of {count} Gaussians in element 'sh', found others"
         raise SceneError(path, problem, "export it again")
-    return number
+    return num_rest
 
 
-def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...], chunk_ids: np.ndarray) -> np.ndarray:
-    """Interpolate between the minima and maxima of chunks; return values ``[n,3]``.
+def _interpolate(
+    weights: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...], chunk_ids: np.ndarray
+) -> np.ndarray:
+    """Interpolate from the minimum to the maximum of each Gaussian's chunk; return values ``[n,3]``.
 
-    If the file lacks these ranges, the values are the shares themselves.
-
-    ``shares``: three arrays ``[n]`` in [0, 1]. ``ranges``: names of the columns with the minima, then of those with the
-    maxima. ``chunk_ids [n]``: the chunk of each Gaussian.
+    ``weights``: three arrays ``[n]`` of weights of the maximum, in [0, 1]. They are the result if the file lacks the
+    columns ``ranges``. ``ranges``: names of the three columns with minima, then of those with maxima. ``chunk_ids
+    [n]``: the chunk of each Gaussian.
     """
     if all(name in (chunk.dtype.names or ()) and chunk.dtype[name].kind == "f" for name in ranges):
         bounds = [chunk[name][chunk_ids].astype(np.float32) for name in ranges]
-        shares = [
-            low * (1 - share) + high * share for share, low, high in zip(shares, bounds[:3], bounds[3:], strict=True)
+        weights = [
+            low * (1 - weight) + high * weight
+            for weight, low, high in zip(weights, bounds[:3], bounds[3:], strict=True)
         ]
-    return np.stack(shares, 1)
+    return np.stack(weights, 1)
 
 
-def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
-    """Unpack numbers in [0, 1] from words; ``bits`` are their widths, and the last number has the lowest bits."""
+def _unpack_words(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
+    """Unpack several numbers in [0, 1] from each word, the first from the highest of the used bits.
+
+    ``bits``: how many bits each number has.
+    """
     out = []
     for i, width in enumerate(bits):
         shifted = words >> np.uint32(sum(bits[i + 1 :]))

@@ -30,8 +30,10 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
 
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """Join the rows of files; also return the names of columns that some files lack or have in another type."""
-    types = [{name: part.dtype[name] for name in part.dtype.names or ()} for part in parts]  # by column, for each file
+    """Join the rows of files in the columns that all have; also return the names of the columns left out."""
+    types = [
+        {name: part.dtype[name] for name in part.dtype.names or ()} for part in parts
+    ]  # of each file: name -> type
     names = dict.fromkeys(name for file_types in types for name in file_types)
     common = [name for name in names if len({file_types.get(name) for file_types in types}) == 1]
     out = np.empty(sum(map(len, parts)), [(name, types[0][name]) for name in common])
@@ -41,9 +43,9 @@ def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[st
 
 
 def describe_extra_columns(columns: np.ndarray, missing: Sequence[str], format_: Format, *, moves: bool) -> list[str]:
-    """Note which additional columns a file of a format keeps: one sentence each, without a full stop.
+    """Note which additional columns an output in a format keeps: one sentence each, without a full stop.
 
-    ``missing``: columns that some inputs lack. ``moves``: whether Gaussians are moved or rotated.
+    ``missing``: columns that some inputs lack. ``moves``: whether the positions of Gaussians are changed.
     """
     names, notes = list(columns.dtype.names or ()), list[str]()
     if missing:

@@ -3,8 +3,8 @@
 The axis y points up in glTF, and down in a ``.ply``. Therefore the writer rotates Gaussians by half a turn about z, and
 the reader rotates them back. Viewers that do not know the extension show points in the base colours.
 
-Files with a packed ``.spz`` in place of the values are read as well. Files of the extension's drafts, whose scales are
-logarithms, are refused.
+The reader also accepts files in which a packed ``.spz`` replaces the separate values. It refuses files of the
+extension's drafts, whose scales are logarithms.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import json
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -53,10 +53,10 @@ READ_EXTENSIONS = {NAME, COMPRESSED, "KHR_mesh_quantization", "KHR_materials_unl
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
 _TYPE_NAMES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # width of a value -> its type in glTF
 _WIDTHS = {name: width for width, name in _TYPE_NAMES.items()}
-# NumPy's types -> the numbers of glTF's types of components, and back
+# NumPy's type -> glTF's number of this type, and back
 _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-# The file: mark, version and length. A chunk: length and kind
+# The first bytes of the file are a mark, the version and the length. Those of a chunk are its length and kind
 _FILE_HEAD, _CHUNK_HEAD = struct.Struct("<4sII"), struct.Struct("<I4s")
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # turns the axes of a ``.ply`` to those of glTF, and back
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
@@ -70,17 +70,17 @@ def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
     """
     cameras = contents.cameras if contents.options.viewer_cameras else NO_CAMERAS
     names = contents.names or number_views(len(cameras))
-    nodes, lenses, ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
-    near = 0.01  # near plane of camera nodes, world units, as of `render`
-    for i, view in enumerate(ids):
+    nodes, gltf_cameras, view_ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
+    near = 0.01  # distance of the near plane in world units, which `gsmerge render` uses, too
+    for i, view_id in enumerate(view_ids):
         pose = np.eye(4)  # of glTF's cameras, which look along -z with y up
-        pose[:3, :3], pose[:3, 3] = cameras.viewmats[view, :3, :3].T * (1, -1, -1), cameras.centres[view]
+        pose[:3, :3], pose[:3, 3] = cameras.viewmats[view_id, :3, :3].T * (1, -1, -1), cameras.centres[view_id]
         pose = matmul(HALF_TURN, pose)
-        nodes.append({"name": names[view], "camera": i, "matrix": pose.T.reshape(-1).tolist()})
-        ratio = float(cameras.width * cameras.Ks[view, 1, 1] / (cameras.height * cameras.Ks[view, 0, 0]))
-        lens = {"yfov": vertical_field(cameras, view), "aspectRatio": ratio, "znear": near}
-        lenses.append({"name": names[view], "type": "perspective", "perspective": lens})
-    return glb_bytes(gaussians, nodes=nodes, cameras=lenses)
+        nodes.append({"name": names[view_id], "camera": i, "matrix": pose.T.reshape(-1).tolist()})
+        ratio = float(cameras.width * cameras.Ks[view_id, 1, 1] / (cameras.height * cameras.Ks[view_id, 0, 0]))
+        perspective = {"yfov": vertical_field(cameras, view_id), "aspectRatio": ratio, "znear": near}
+        gltf_cameras.append({"name": names[view_id], "type": "perspective", "perspective": perspective})
+    return glb_bytes(gaussians, nodes=nodes, cameras=gltf_cameras)
 
 
 def glb_bytes(
@@ -88,7 +88,7 @@ def glb_bytes(
 ) -> bytes:
     """Encode a ``.glb`` file without comments; ValueError if there is NaN or inf.
 
-    ``nodes`` and ``cameras`` are those of glTF, and are added to its document.
+    ``nodes`` and ``cameras``: entries of these lists in the glTF document.
 
     Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
@@ -99,6 +99,7 @@ def glb_bytes(
     views, accessors = _describe_arrays(list(attributes.values()))
     for name, bound in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
         accessors[0][name] = bound(attributes["POSITION"], axis=0).tolist()
+    # Padded rows are written from the array of which they are a view
     content = b"".join((array if array.base is None else array.base).tobytes() for array in attributes.values())
     splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
     splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
@@ -115,7 +116,7 @@ def glb_bytes(
 
 
 def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
-    """Encode a ``.glb`` from its binary ``content`` and a ``document``; version, scene and buffer are added to this."""
+    """Encode a ``.glb`` from its binary ``content`` and a ``document``, which gets a version, a scene and a buffer."""
     document = {
         "asset": {"version": "2.0", "generator": "gsmerge"},
         "scene": 0,
@@ -129,17 +130,17 @@ def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
 
 
 def _join(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """Join blocks ``[n,width]``; if they are views of padded rows, the result is such a view as well."""
+    """Join blocks ``[n,width]`` of rows. If each block is a view of padded rows, so is the result."""
     return np.concatenate([block if block.base is None else block.base for block in blocks])[:, : blocks[0].shape[1]]
 
 
 def _describe_arrays(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return the buffer views and the accessors in glTF of arrays ``[n,width]`` that follow each other in a buffer."""
+    """Return glTF's buffer views and accessors of arrays ``[n,width]`` that follow each other in a buffer."""
     views, accessors, offset = list[dict[str, Any]](), list[dict[str, Any]](), 0
     for view_id, array in enumerate(arrays):
         row_bytes, width = array.strides[0], array.shape[1]
         size = len(array) * row_bytes
-        stride = {"byteStride": 4} if row_bytes == 4 and width == 1 else {}  # rows of two bytes are padded
+        stride = {"byteStride": 4} if row_bytes == 4 and width == 1 else {}  # rows of two bytes are padded to four
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, **stride, "target": _VERTICES})
         component: dict[str, Any] = {"componentType": _COMPONENTS[array.dtype.str]}
         component |= {} if array.dtype.kind == "f" else {"normalized": True}
@@ -185,7 +186,7 @@ def holds_gaussians(path: Path) -> bool:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if it has none or is damaged."""
+    """Read all Gaussians of a ``.glb``, with the axes of a ``.ply``; SceneError if it has none or is damaged."""
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
     with _damage_errors(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
         document, total = _read_document(file, budget)
@@ -205,7 +206,7 @@ def read_rows(path: Path) -> StoredRows:
 
 @contextmanager
 def _damage_errors(path: Path) -> Iterator[None]:
-    """Convert all errors that damaged or foreign files cause in the reader to a SceneError."""
+    """Convert errors of the block that a damaged or unsupported file causes to a SceneError."""
     try:
         with read_errors(path):
             yield
@@ -215,22 +216,22 @@ def _damage_errors(path: Path) -> Iterator[None]:
 
 
 class _ForeignError(ValueError):
-    """The reader does not support the content; the message follows "expected a .glb of Gaussians, found"."""
+    """The content is not supported. The error's text continues "expected a .glb of Gaussians, found"."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Values:
-    """Stored values ``[n,width]`` of an accessor; an index with a slice returns its rows as float64."""
+    """Values ``[n,width]`` of an accessor as they are stored; an index with a slice returns real values as float64."""
 
     stored: np.ndarray
-    unit: int  # the number by which 1 is stored; 1 if stored numbers are the values
+    unit: int  # the stored number that stands for 1; 1 if stored numbers are the values
 
     def __getitem__(self, block: slice) -> np.ndarray:
         rows = self.stored[block]
         return np.maximum(rows / self.unit, -1) if self.unit > 1 else rows.astype(np.float64)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Content:
     """The content of a ``.glb``, whose binary chunk is read part by part."""
 
@@ -238,21 +239,21 @@ class _Content:
     file: IO[bytes]
     document: dict[str, Any]
     start: int  # of the binary chunk, in bytes from the start of the file
-    end: int  # of this chunk, likewise
-    num_read: list[int] = field(default_factory=lambda: [0])  # bytes read so far, at most the size of the chunk
+    end: int  # of the same, in bytes from the start of the file
+    num_read: int = 0  # bytes read so far, at most the size of the chunk
 
     def read_view(self, view_id: int) -> bytes:
-        """Read the bytes of a buffer view, which must lie in the chunk."""
+        """Read a buffer view of bytes, which are those of a ``.spz``; the view must lie in the binary chunk."""
         view = self.document["bufferViews"][view_id]
         at, length = view.get("byteOffset", 0), view["byteLength"]
-        self.num_read[0] += length
-        if min(at, length) < 0 or self.start + at + length > self.end or self.num_read[0] > self.end - self.start:
+        self.num_read += length
+        if min(at, length) < 0 or self.start + at + length > self.end or self.num_read > self.end - self.start:
             raise _ForeignError(f"a truncated one, of {self.end} bytes without {length} of a .spz")
         self.file.seek(self.start + at)
         return self.file.read(length)
 
     def read_values(self, accessor_id: int) -> _Values:
-        """Read the values of an accessor, which must lie in the chunk."""
+        """Read the values of an accessor; they must lie in the binary chunk."""
         accessor = self.document["accessors"][accessor_id]
         if "sparse" in accessor or "bufferView" not in accessor:
             raise _ForeignError("one with sparse values")
@@ -262,23 +263,25 @@ class _Content:
         dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
         row_bytes, offset = dtype.itemsize * width, accessor.get("byteOffset", 0)
         count, stride = check_whole(accessor["count"], "count", 1), view.get("byteStride", row_bytes)
-        span, at = (count - 1) * stride + row_bytes, self.start + view.get("byteOffset", 0) + offset
-        self.num_read[0] += count * row_bytes
-        in_view = offset >= 0 and offset + span <= view["byteLength"]
-        in_chunk = self.start <= at and at + span <= self.end
+        num_bytes, position = (count - 1) * stride + row_bytes, self.start + view.get("byteOffset", 0) + offset
+        self.num_read += count * row_bytes
+        in_view = offset >= 0 and offset + num_bytes <= view["byteLength"]
+        in_chunk = self.start <= position and position + num_bytes <= self.end
         max_stride = 252  # bytes from a value to the next, the limit of glTF
         if not row_bytes <= stride <= max_stride or not (in_view and in_chunk):
             raise _ForeignError(f"a truncated one, of {self.end} bytes without {count} values of {row_bytes} bytes")
-        if self.num_read[0] > self.end - self.start:
+        if self.num_read > self.end - self.start:
             raise _ForeignError("one that uses the same values several times")
-        self.file.seek(at)
-        rows = np.ndarray((count, width), dtype, self.file.read(span), strides=(stride, dtype.itemsize))
+        self.file.seek(position)
+        rows = np.ndarray((count, width), dtype, self.file.read(num_bytes), strides=(stride, dtype.itemsize))
         return _Values(np.ascontiguousarray(rows), np.iinfo(dtype).max if accessor.get("normalized") else 1)
 
 
 def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any], int]:
-    """Return the JSON of a ``.glb`` and the length that its header states; the file is then at its binary chunk."""
-    size = budget.file_bytes
+    """Return the JSON of a ``.glb`` and the length that its header states.
+
+    The next bytes to read from ``file`` are then the content of the binary chunk.
+    """
     start = file.read(_FILE_HEAD.size + _CHUNK_HEAD.size)
     if len(start) < _FILE_HEAD.size + _CHUNK_HEAD.size:
         raise _ForeignError("an early end of file")
@@ -288,15 +291,15 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any],
     )
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
         raise _ForeignError("a file that is no binary glTF 2.0")
-    if total > size or length > total - len(start):
-        raise _ForeignError(f"a truncated one, of {size} bytes instead of {max(total, length)}")
+    if total > budget.file_bytes or length > total - len(start):
+        raise _ForeignError(f"a truncated one, of {budget.file_bytes} bytes instead of {max(total, length)}")
     document = parse_json(file.read(length).decode("utf-8-sig"), budget)
     if not isinstance(document, dict):
         raise _ForeignError("one whose JSON is no object")
     missing = set(document.get("extensionsRequired", ())) - READ_EXTENSIONS
     if missing and NAME in str(document.get("extensionsUsed")):
         raise _ForeignError(f"one that requires {', '.join(sorted(map(str, missing)))}, which is not supported")
-    file.read(_CHUNK_HEAD.size)
+    file.read(_CHUNK_HEAD.size)  # of the binary chunk
     return document, total
 
 
@@ -318,7 +321,7 @@ def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple
 
 
 def _node_matrix(node: dict[str, Any]) -> np.ndarray:
-    """Return the matrix ``[4,4]`` by which a node moves its mesh and its children."""
+    """Return the matrix ``[4,4]`` by which a node transforms its mesh and its children."""
     if "matrix" in node:
         return np.ascontiguousarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
     x, y, z, w = node.get("rotation", (0, 0, 0, 1))
@@ -330,27 +333,30 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Attributes:
-    """The attributes of a primitive, and the bytes that were read of them."""
+    """The attributes of a primitive. Reading one adds its number of bytes to ``sizes``."""
 
     content: _Content
     ids: dict[str, Any]  # of accessors, by name of the attribute
     sizes: dict[str, int]  # attribute of Gaussians -> bytes
 
     def read(self, kind: str, width: int, name: str) -> _Values:
-        """Read the glTF attribute ``name``, whose values have ``width`` numbers; add its bytes to those of ``kind``."""
+        """Read the glTF attribute ``name`` with ``width`` numbers per Gaussian; add its size to ``sizes[kind]``."""
         if name not in self.ids:
             raise _ForeignError(f"one whose Gaussians have no {name}")
-        bytes_before = self.content.num_read[0]
+        bytes_before = self.content.num_read
         values = self.content.read_values(self.ids[name])
         if values.stored.shape[1] != width:
             raise _ForeignError(f"one with {values.stored.shape[1]} numbers of {name} per Gaussian")
-        self.sizes[kind] = self.sizes.get(kind, 0) + self.content.num_read[0] - bytes_before
+        self.sizes[kind] = self.sizes.get(kind, 0) + self.content.num_read - bytes_before
         return values
 
 
 def _read_splats(content: _Content, primitive: dict[str, Any], transform: np.ndarray, sizes: dict[str, int]) -> Packed:
-    """Read a primitive, and add its bytes to ``sizes``; the matrix ``transform [4,4]`` is applied to its Gaussians."""
-    splats, attributes = primitive["extensions"][NAME], _Attributes(content, primitive.get("attributes", {}), sizes)
+    """Read the Gaussians of a primitive, and apply the matrix ``transform [4,4]`` of its node to them.
+
+    The bytes of each attribute are added to ``sizes``.
+    """
+    splats = primitive["extensions"][NAME]
     if COMPRESSED in splats.get("extensions", {}):
         packed = content.read_view(splats["extensions"][COMPRESSED]["bufferView"])
         _, rows, column_bytes, _ = read_packed(content.budget.path, packed)
@@ -360,6 +366,7 @@ def _read_splats(content: _Content, primitive: dict[str, Any], transform: np.nda
     kind = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
     if splats.get("extensions") or kind != ("ellipse", COLOR_SPACE):
         raise _ForeignError(f"Gaussians of another kind ({', '.join(map(str, splats.get('extensions') or kind))})")
+    attributes = _Attributes(content, primitive.get("attributes", {}), sizes)
     means, scales = attributes.read("means", 3, "POSITION"), attributes.read("scales", 3, f"{NAME}:SCALE")
     quats, opacities = attributes.read("quats", 4, f"{NAME}:ROTATION"), attributes.read("opacities", 1, _OPACITY)
     degree = max((degree for degree in range(MAX_DEGREE + 1) if HARMONICS[degree**2] in attributes.ids), default=0)
@@ -373,6 +380,7 @@ def _read_splats(content: _Content, primitive: dict[str, Any], transform: np.nda
 
     def unpack(block: slice) -> Columns:
         means_block = means[block]
+        # np.stack needs an array even without harmonics, so zeros are put first and cut off
         return transform_columns(
             Columns(
                 means=means_block,

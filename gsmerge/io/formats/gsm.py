@@ -1,8 +1,9 @@
-"""Read and write states (``.gsm``), safetensors files with a header in which ``extend`` stores batches of views.
+"""Read and write states (``.gsm``), the files in which ``extend`` stores batches of views.
 
-The only metadata entry is the header in JSON, with checksums of itself and of each array. Files of the kind ``scene``
-hold results with their cameras and pictures, which are read here. Files of the kind ``features`` hold Feature Gaussians
-(:mod:`gsmerge.states.features`). No content of a file is executed, and each array is checked before it is used.
+They are safetensors files. Their only metadata entry is a header in JSON, with checksums of itself and of each array.
+Files of the kind ``scene`` hold results with their cameras and pictures, and this module reads them. Files of the kind
+``features`` hold Feature Gaussians, and :mod:`gsmerge.states.features` reads them. No content of a file is executed,
+and each array is checked before it is used.
 """
 
 from __future__ import annotations
@@ -49,11 +50,11 @@ class GsmFile:
     arrays: Mapping[str, np.ndarray]
 
     def error(self, problem: str) -> SceneError:
-        """Make the SceneError for a damaged file."""
+        """Return the SceneError for a damaged file."""
         return SceneError(self.path, problem, "copy it again, or " + REMEDY)
 
     def array(self, name: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
-        """Return the array of a name; SceneError unless it has this type and shape, in which None is any size."""
+        """Return the array ``name``; SceneError if its type or shape differs. None in ``shape`` allows any size."""
         array = self.arrays.get(name)
         expected = f"{name}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
         if array is None:
@@ -74,15 +75,15 @@ class GsmFile:
 def write_gsm(
     path: StrPath, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, overwrite: bool, mode: int
 ) -> None:
-    """Write a ``.gsm`` with the entries of a header; schema, version and checksums are added.
+    """Write a ``.gsm`` with ``arrays`` and a header, to which schema, version and checksums are added.
 
-    ``mode``: the most rights of a new file, which holds pictures.
+    ``mode``: the largest permissions of the file, since its pictures may be private.
     """
     header = {"schema": SCHEMA, "gsmerge": __version__, **header}
     data = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     with atomic_output(path, overwrite=overwrite, mode=mode) as temporary:
         header["checksums"] = _checksums(header, data)
-        # One entry, since safetensors writes several in an order that varies
+        # Metadata is a single entry, since safetensors writes several entries in an order that varies
         temporary.write_bytes(save(data, {HEADER: json.dumps(header)}))
 
 
@@ -115,7 +116,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Parse the header of a file; SceneError if there is none, or if its schema or an entry is wrong."""
+    """Parse the header of a file; SceneError if the file has no header, or if its schema or an entry is wrong."""
     text = metadata.get(HEADER, metadata.get(ENCODED))
     if text is None:
         raise SceneError(path, "expected a .gsm of gsmerge, found another safetensors file", "name the .gsm")
@@ -178,7 +179,7 @@ def read_rows(path: Path) -> StoredRows:
 
 
 def _picture_notes(about: Mapping[str, Any]) -> tuple[str, ...]:
-    """Note which pictures replace photos in batches without photos."""
+    """Note if batches have no photos, and which pictures replace these."""
     names = about.get("pictures")
     replacements = sorted({str(name)[:40] for name in names if name != "photos"}) if isinstance(names, list) else []
     return (f"some batches have no photos; {' and '.join(replacements)} replace them",) if replacements else ()
@@ -191,7 +192,7 @@ def list_batches(path: Path) -> list[dict[str, Any]]:
 
 
 def _describe_batch(batch: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the counts of a batch, and the names of its views in the file; entries of other types are left out."""
+    """Return the counts of a batch, and the names of its views; entries of a wrong type are left out."""
     views = batch.get("views")
     counts = {name: batch.get(name) for name in ("num_views", "num_input", "num_new")}
     known: dict[str, Any] = {name: count for name, count in counts.items() if isinstance(count, int)}
@@ -213,8 +214,10 @@ def read_views(source: CameraSource) -> StoredCameras:
     names = stored_names(file, len(cameras))
     size = cameras.width, cameras.height
     images = file.array("images", np.uint8, len(cameras), cameras.height, cameras.width, 3)
-    views = [StoredView(*view, size) for view in zip(names, cameras.viewmats, cameras.Ks, strict=True)]
-    return StoredCameras(views, images, "none")
+    views = [
+        StoredView(name, viewmat, K, size) for name, viewmat, K in zip(names, cameras.viewmats, cameras.Ks, strict=True)
+    ]
+    return StoredCameras(views, images, order="none")
 
 
 def stored_names(file: GsmFile, num_views: int) -> tuple[str, ...]:

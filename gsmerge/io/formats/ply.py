@@ -29,10 +29,10 @@ from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import quiet_warnings
 from gsmerge.types import Gaussians
 
-_PACKED_ROWS = LazyFunction("gsmerge.io.formats.compressed", "packed_rows")
-_HOLDS_CAMERAS = LazyFunction("gsmerge.io.cameras.read", "holds_cameras")
+_compressed_rows = LazyFunction("gsmerge.io.formats.compressed", "packed_rows")
+_holds_cameras = LazyFunction("gsmerge.io.cameras.read", "holds_cameras")
 MAX_DEGREE = 3  # of the harmonics in results; splat-transform 3.7 and gsply refuse a .ply with more
-# Size of the longest comment on new views
+# Bytes of the longest comment on the expected scores of new views
 COMMENT_BYTES = len(f"comment {arrays.new_views_comment(arrays.ExpectedScores(-100, -100, -100, -100))}\n")
 MAX_READ_DEGREE = 4  # of harmonics in files of other programs
 THIN = 1e-3  # third scale of a 2D Gaussian, relative to its smaller scale
@@ -54,26 +54,26 @@ _SIZES = {  # names of types -> bytes of a number
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Open the rows of a PLY file for :func:`open_rows`; SceneError if it holds no Gaussians."""
+    """Open a PLY file, whose rows :func:`open_rows` then reads block by block; SceneError if it holds no Gaussians."""
     data, num_left = open_ply(path)
     elements = {element.name: {column.name for column in element.properties} for element in data.elements}
-    compressed = "chunk" in elements and elements.get("vertex", set()) >= set(arrays.PACKED)
-    rows, prefix = (_PACKED_ROWS(path, data), "") if compressed else _vertex_rows(path, data)
+    is_compressed = "chunk" in elements and elements.get("vertex", set()) >= set(arrays.PACKED)
+    rows, prefix = (_compressed_rows(path, data), "") if is_compressed else _vertex_rows(path, data)
     extra_elements = tuple(name for name in elements if name != "vertex")
     layers = [f"element {name}" for name in extra_elements if {"opacity", arrays.QUATS[0]} <= elements[name]]
     unused = check_columns(path, rows.dtype, layers)
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(comment for element in data.elements for comment in element.comments))
-    white, notes = _find_white(path, rows)
+    white, notes = _white_of_floats(path, rows)
     if arrays.SCALES[2] not in names:
         notes += [f"2D Gaussians have two scales; the third is set to {THIN:g} of the smaller one"]
         comments += (arrays.FLAT_COMMENT,)
     return arrays.StoredRows(
         rows=rows,
-        layout=_layout_name(names, _num_rest(path, names), compressed=compressed),
+        layout=_layout_name(names, _num_rest(path, names), is_compressed=is_compressed),
         format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
-        encoding="logit" if compressed or is_from_gsmerge(comments) else None,
-        sizes=_packed_bytes(rows) if compressed else _bytes_by_attribute(rows.dtype, len(rows)),
+        encoding="logit" if is_compressed or is_from_gsmerge(comments) else None,
+        sizes=_packed_bytes(rows) if is_compressed else _bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
         extra_elements=extra_elements,
         notes=(
@@ -86,11 +86,11 @@ def read_rows(path: Path) -> arrays.StoredRows:
     )
 
 
-def _find_white(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[float, list[str]]:
-    """Find the number that stands for a full channel of plain colours as floats, 1 or 255; also return notes."""
+def _white_of_floats(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[float, list[str]]:
+    """Return the number that stands for white in columns of RGB as floats, 1 or 255; also return notes on a guess."""
     colors = arrays.color_columns(rows.dtype.names)
-    float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
-    if float_colors and np.nanmedian(read_columns(path, rows, colors[:1])[colors[0]]) > 1:
+    has_float_rgb = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
+    if has_float_rgb and np.nanmedian(read_columns(path, rows, colors[:1])[colors[0]]) > 1:
         return 255.0, [f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1"]
     return 1.0, []
 
@@ -108,15 +108,15 @@ def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequen
 
 
 def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
-    """Return a block of rows with three log scales, and with plain colours divided by ``white``.
+    """Return a copy of a block of rows with three log scales, and with RGB colours in [0, 1].
 
-    2D Gaussians get a thin third scale.
+    The third scale of 2D Gaussians is :data:`THIN` times the smaller one. ``white``: the stored number for white.
     """
     columns = {name: rows[name] for name in rows.dtype.names or ()}
     if white != 1:
         columns |= {name: columns[name] / white for name in arrays.color_columns(rows.dtype.names)}
     scales = [columns[name].astype(np.float64) for name in arrays.SCALES if name in columns]
-    with np.errstate(all="ignore"):  # scales that are not finite
+    with np.errstate(all="ignore"):  # scales may be NaN or infinite
         scales = scales if len(scales) == 3 else [*scales, np.minimum(*scales) + float(log(THIN))]
         columns |= {name: scale.astype(np.float32) for name, scale in zip(arrays.SCALES, scales, strict=True)}
     out = np.empty(len(rows), [(name, column.dtype) for name, column in columns.items()])
@@ -126,12 +126,12 @@ def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
 
 
 def is_from_gsmerge(comments: Sequence[str]) -> bool:
-    """Return whether header comments say that gsmerge wrote the file, as a result or a copy of other Gaussians."""
+    """Return whether header comments say that gsmerge wrote the file, be it a result or a copy."""
     return arrays.LOGIT_COMMENT in comments or arrays.RESULT_COMMENT in comments
 
 
 def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
-    """Return the rows of the Gaussians without a prefix in the names of columns, and this prefix.
+    """Return the rows of the Gaussians with the usual names of columns, and the prefix that the names had.
 
     SceneError if required columns are missing, or if there is no row.
     """
@@ -141,10 +141,11 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
     vertex = data["vertex"]
     rows, prefix = _without_prefix(vertex.data)
     columns = set(rows.dtype.names or ())
+    # 2D Gaussians have no third scale, and files with plain colours no harmonics of degree 0
     optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
     missing = [name for name in arrays.REQUIRED_COLUMNS if name not in columns | optional]
     if missing:
-        check_columns(path, rows.dtype, ())  # other columns may give the reason
+        check_columns(path, rows.dtype, ())  # raises a clearer error if other columns show the reason
         remedy = "name a .ply of Gaussians, since this one has none"
         if any(name.startswith("packed_") for name in columns):
             remedy = "export it again, since it is compressed but lacks its element 'chunk'"
@@ -159,9 +160,10 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
 
 
 def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return rows without a prefix in the names of columns, and this prefix; "" if there is none.
+    """Return rows after removing a prefix from the names of their columns; also return the prefix, or "" if none.
 
-    Columns ``rotation_0`` to ``rotation_3`` get their usual names. CloudCompare writes "scalar_" before names that are
+    Columns ``rotation_0`` to ``rotation_3`` get their usual names. Nothing changes if names are usual or would not be
+    unique, or if a column has lists. CloudCompare writes "scalar_" before names that are
     not its own, and "scalar_scal_" if it writes the file again.
     """
     names, known_name = tuple(rows.dtype.names or ()), arrays.QUATS[0]
@@ -177,7 +179,7 @@ def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
-    """Count the columns ``f_rest_*``; SceneError if they are not those of a degree."""
+    """Count the columns ``f_rest_*``; SceneError unless they make up all harmonics of a degree."""
     names = {name for name in columns if name.startswith("f_rest_")}
     if len(names) not in (0, 9, 24, 45, 72) or names != {f"f_rest_{i}" for i in range(len(names))}:
         numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
@@ -186,9 +188,9 @@ def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
     return len(names)
 
 
-def _layout_name(names: tuple[str, ...], num_rest: int, *, compressed: bool) -> str:
-    """Name the layout of a file's columns for people."""
-    if compressed:
+def _layout_name(names: tuple[str, ...], num_rest: int, *, is_compressed: bool) -> str:
+    """Name the layout of a file's columns for the user."""
+    if is_compressed:
         return f"compressed, SH degree {arrays.sh_degree(num_rest // 3)}"
     if arrays.SH0[0] not in names:
         return "columns of red, green and blue"
@@ -198,62 +200,63 @@ def _layout_name(names: tuple[str, ...], num_rest: int, *, compressed: bool) -> 
     return f"INRIA, SH degree {arrays.sh_degree(num_rest // 3)}" + ("" if normals else " (no normals)")
 
 
-def _bytes_by_attribute(row: np.dtype[Any], count: int) -> dict[str, int]:
-    """Count the bytes of ``count`` rows by attribute."""
+def _bytes_by_attribute(row_type: np.dtype[Any], count: int) -> dict[str, int]:
+    """Count the bytes of ``count`` rows for each attribute, such as "means" or "scales"."""
     columns = {
         "means": arrays.MEANS,
         "normals": arrays.NORMALS,
-        "sh0": arrays.color_columns(row.names),
+        "sh0": arrays.color_columns(row_type.names),
         "opacities": ("opacity",),
         "scales": arrays.SCALES,
         "quats": arrays.QUATS,
     }
     attributes = {name: attribute for attribute, names in columns.items() for name in names}
     sizes: Counter[str] = Counter()
-    for name in row.names or ():
+    for name in row_type.names or ():
         attribute = attributes.get(name, "shN" if name.startswith("f_rest_") else "extra")
-        sizes[attribute] += row[name].itemsize * count
+        sizes[attribute] += row_type[name].itemsize * count
     return dict(sizes)
 
 
 def _packed_bytes(rows: np.ndarray | arrays.PackedRows) -> dict[str, int]:
-    """Count the bytes of packed rows by attribute.
+    """Count the bytes of the rows of a compressed file for each attribute.
 
-    A row has four words of 4 bytes, one of which holds colour and opacity, and a byte for each higher harmonic.
+    A row has four words of 4 bytes, one of them for colour and opacity, and a byte for each harmonic above degree 0.
     """
     num_rest = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
     each = {"means": 4, "quats": 4, "scales": 4, "sh0": 3, "opacities": 1, "shN": num_rest}
     return {name: size * len(rows) for name, size in each.items() if size}
 
 
-def no_ply(path: Path) -> SceneError:
-    """Make the error of a file that is no PLY file, which says so if it is a picture or holds cameras."""
+def no_ply_error(path: Path) -> SceneError:
+    """Return the error for a file that is no PLY file; a picture and a file of cameras are recognised."""
     if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES:
         remedy = "make Gaussians from photos with a model first, and name its .ply"
         return SceneError(path, "expected Gaussians, found a picture", remedy)
-    if _HOLDS_CAMERAS(path):
+    if _holds_cameras(path):
         return SceneError(path, "expected Gaussians, found cameras", "name the .ply, and this file with --cameras")
     problem = "expected a PLY file, found a file that does not start with the line 'ply'"
     return SceneError(path, problem, "name a .ply of Gaussians")
 
 
 def open_ply(path: Path) -> tuple[PlyData, int]:
-    """Open a PLY file, and count the bytes after its last element.
+    """Open a PLY file; also return the number of bytes after its last element.
 
-    Binary vertices that are not packed are mapped, and :func:`open_rows` reads them. SceneError if the file is no PLY
-    file, is damaged, or is shorter than its header says.
+    Everything is read but binary vertices that are not compressed. These stay in the file as a memory map, from which
+    :func:`open_rows` reads. SceneError if the file is no PLY file, is damaged, or is shorter than its header says.
     """
     budget = read_budget(path)
     try:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
         if start[:4] not in (b"ply\n", b"ply\r"):
-            raise no_ply(path)
-        end, text = _check_header(start, budget)
-        with _stream(path, end, text=text) as file, quiet_warnings():  # about an empty list, or too large a number
+            raise no_ply_error(path)
+        end, is_text = _check_header(start, budget)
+        # plyfile warns of empty lists and of numbers that are too large
+        with _open_for_parser(path, end, is_text=is_text) as file, quiet_warnings():
             data = PlyData.read(file, mmap="r")
-            num_left = len(file.read().strip()) if text else budget.file_bytes - file.tell()
-        # Windows cannot replace a mapped file
+            num_left = len(file.read().strip()) if is_text else budget.file_bytes - file.tell()
+        # On Windows nothing stays mapped, since a mapped file cannot be replaced
         mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)
         for element in data.elements:
             if isinstance(element.data, np.memmap) and element.name not in mapped:
@@ -271,12 +274,12 @@ def open_ply(path: Path) -> tuple[PlyData, int]:
         raise SceneError(path, problem, arrays.EXPORT_AGAIN) from error
 
 
-def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
-    """Open a PLY file for the parser, which gets only ASCII in the header, and no empty lines of text.
+def _open_for_parser(path: Path, end: int, *, is_text: bool) -> IO[Any]:
+    """Open a PLY file for plyfile's parser, which refuses other bytes than ASCII in the header, and empty lines.
 
-    ``end``: the size of the header in bytes. ``text``: whether the rows are text.
+    ``end``: the size of the header in bytes. ``is_text``: whether the rows are text.
     """
-    if text:
+    if is_text:
         return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
     file = _BinaryRows(FileIO(str(path)))
     file.end = end
@@ -284,9 +287,9 @@ def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
 
 
 class _TextRows(TextIOWrapper):
-    """A PLY file of text that skips empty lines."""
+    """A PLY file of text whose empty lines are skipped."""
 
-    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # bytes in the base of all
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # bytes in the base class
         line = super().readline(MAX_LINE)
         while line and not line.strip():
             line = super().readline(MAX_LINE)
@@ -294,7 +297,7 @@ class _TextRows(TextIOWrapper):
 
 
 class _BinaryRows(BufferedReader):
-    """A binary PLY file; bytes beyond ASCII in its header are read as "?"."""
+    """A binary PLY file in whose header each byte beyond ASCII becomes "?"."""
 
     end = 0  # of the header, in bytes
 
@@ -309,8 +312,8 @@ class _BinaryRows(BufferedReader):
 def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
-    Rows of a mapped file are read from the file, not from the mapped memory. If the file becomes shorter, access to
-    that memory would end the process, while reading the file raises SceneError.
+    Mapped rows are read from the file, not from the mapped memory. If another program shortened the file, access to
+    this memory would end the process, while reading the file raises SceneError.
     """
     if not isinstance(rows, np.memmap):
         yield rows.__getitem__
@@ -333,7 +336,7 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
 
 
 def header_counts(path: Path, *, check_size: bool = False) -> tuple[int, int]:
-    """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if it is unreadable.
+    """Return the numbers of Gaussians and of columns ``f_rest_*`` in a PLY file's header; zeros if it is unreadable.
 
     ``check_size``: also return zeros if the file is too short for the rows in its header.
     """
@@ -352,8 +355,8 @@ def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
     if arrays.RESULT_COMMENT in _list_comments(header):
         return "result"
     columns = re.findall(r"^property .*?(\w+)\s*$", header, re.MULTILINE)
-    expected = ("scale_", "rot_", "f_dc_", "packed_")
-    has_gaussians = any(stem in name for name in columns for stem in expected)  # names may have a prefix
+    stems = ("scale_", "rot_", "f_dc_", "packed_")  # names may have a prefix before these
+    has_gaussians = any(stem in name for name in columns for stem in stems)
     return "Gaussians" if has_gaussians or not columns else "other"
 
 
@@ -363,7 +366,7 @@ def is_file_from_gsmerge(path: Path) -> bool:
 
 
 def _read_header(path: Path, *, check_size: bool = False) -> str:
-    """Return a PLY file's header of at most 64 KiB; "" if it is longer or unreadable.
+    """Return a PLY file's header; "" if it has more than 64 KiB or cannot be read.
 
     ``check_size``: also return "" if :func:`_check_header` refuses the file.
     """
@@ -385,9 +388,9 @@ def _list_comments(header: str) -> list[str]:
 
 
 def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
-    """Return the size of a header in bytes, and whether rows are text; SceneError if the file is too short for them.
+    """Return the size of a header in bytes, and whether rows are text; SceneError if the file is too short for rows.
 
-    ``start``: the first bytes of the file. The parser checks what this function does not.
+    ``start``: the first bytes of the file. The header may have other errors, which plyfile's parser finds later.
     """
     path, size = Path(budget.path), budget.file_bytes
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
@@ -396,14 +399,15 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     if end < 0:
         found = f"no 'end_header' within {MAX_HEADER_BYTES >> 20} MiB" if size > len(start) else "an early end of file"
         raise SceneError(path, f"expected a PLY header, found {found}", arrays.EXPORT_AGAIN)
-    words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
-    is_text = ["format", "ascii", "1.0"] in words
-    elements = _parse_elements(words)
-    steps_per_element = 50  # steps of 20 microseconds in a ReadBudget; several readers open a file one after another
+    lines = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
+    is_text = ["format", "ascii", "1.0"] in lines
+    elements = _parse_elements(lines)
+    steps_per_element = 50  # steps of 20 microseconds for all readers that open the file one after another
     budget.check_steps(steps_per_element * len(elements), "steps for elements")
     bytes_left = size - end - len(last_line)
     for element in elements:
         _check_element(budget, element)
+        # Text has a digit and a space per number. A list has at least its length, whose type is its second word
         row_bytes = sum(2 if is_text else _SIZES.get((words[1:2] or words)[0], 1) for words in element.properties)
         bytes_before, bytes_left = bytes_left, bytes_left - element.count * row_bytes
         if bytes_left < -1:  # the last row of a text may end without a new line
@@ -421,12 +425,12 @@ class _Element:
 
     name: str
     count: int  # number of rows
-    # Of each column the words between "property" and its name: a type, or "list" with the types of length and values
+    # Words of each column: [its type], or ["list", the type of the length, the type of the values]
     properties: list[list[str]] = field(default_factory=list)
 
 
 def _parse_elements(lines: list[list[str]]) -> list[_Element]:
-    """Return the elements of a header, whose ``lines`` are split into words."""
+    """Return the elements of a header; each of its ``lines`` is a list of words."""
     elements: list[_Element] = []
     for words in lines:
         if words[:1] == ["element"] and len(words) == 3 and re.fullmatch(r"[+-]?\d[\d_]*", words[2]):
@@ -437,7 +441,7 @@ def _parse_elements(lines: list[list[str]]) -> list[_Element]:
 
 
 def _check_element(budget: ReadBudget, element: _Element) -> None:
-    """Raise SceneError if an element has no columns, a negative count, or lists in vertices or in too many rows."""
+    """Raise SceneError if an element has no columns, a negative count, vertices with lists, or too many lists."""
     path, name, count, num_columns = Path(budget.path), element.name, element.count, len(element.properties)
     has_lists = any(words[0] == "list" for words in element.properties)
     if count < 0:
@@ -454,9 +458,9 @@ def _check_element(budget: ReadBudget, element: _Element) -> None:
         raise SceneError(path, problem, "export it again with columns of float")
     if has_lists and name == "vertex":
         raise SceneError(path, "expected one number per column and vertex, found a list property", arrays.EXPORT_AGAIN)
-    max_list_values = 1_000_000  # most lists of an element, since they are read one value at a time
-    if has_lists and count * num_columns > max_list_values:
-        problem = f"expected at most {max_list_values:,} lists, found element '{name}' with lists in {count:,} rows"
+    max_lists = 1_000_000  # most lists of an element, since each value of a list is read by itself
+    if has_lists and count * num_columns > max_lists:
+        problem = f"expected at most {max_lists:,} lists, found element '{name}' with lists in {count:,} rows"
         raise SceneError(path, problem, "export it without this element")
     if has_lists:
         list_bytes = 140  # bytes of memory for each list
@@ -511,7 +515,7 @@ def _header(
 ) -> tuple[bytes, int]:
     """Return the header of a ``.ply`` of ``count`` Gaussians, and its number of float32 columns.
 
-    ``extra``: name of each column that follows these -> NumPy's name of its type.
+    ``extra``: name of each additional column -> NumPy's name of its type.
     """
     num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
     names = [
@@ -521,6 +525,7 @@ def _header(
         *(f"f_rest_{i}" for i in range(num_rest)),
     ]
     names += ["opacity", *arrays.SCALES, *arrays.QUATS]
+    # Either comment states that opacities are logits, so that readers need not guess it
     comments = comments if arrays.RESULT_COMMENT in comments else (arrays.LOGIT_COMMENT, *comments)
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
@@ -530,7 +535,7 @@ def _header(
 
 
 def file_bytes(count: int, sh_degree: int) -> int:
-    """Return the size in bytes of a ``.ply`` with ``count`` Gaussians, whose only comment is that on opacities."""
+    """Return the size in bytes of a ``.ply`` with ``count`` Gaussians, and with no comment but that of gsmerge."""
     header, num_columns = _header(count, min(sh_degree, MAX_DEGREE))
     return len(header) + 4 * num_columns * count
 
@@ -538,7 +543,7 @@ def file_bytes(count: int, sh_degree: int) -> int:
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits.
 
-    The longest comment on new views is counted, whether the result has one or not.
+    The size includes the longest comment on new views, even if the result will have none.
     """
     if not 0 <= sh_degree <= MAX_READ_DEGREE:
         raise ValueError(f"sh_degree: expected 0 to {MAX_READ_DEGREE}, got {sh_degree}")

@@ -25,21 +25,21 @@ from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
-MAX_HARMONIC = 1e6  # no scene has larger harmonics; float32 can square and sum rendered values below
-FREED_ROWS = 1 << 17  # the memory of large columns is freed each time when this number of rows is converted
+MAX_HARMONIC = 1e6  # no scene has larger harmonics; squares and sums of such renders are finite in float32
+FREED_ROWS = 1 << 17  # number of converted rows after which the memory of large columns is freed
 
 
 @dataclass(frozen=True)
 class FileInfo:
-    """Facts about a file of Gaussians; its columns are those of a PLY file with the same content."""
+    """Facts about a file of Gaussians, whose columns are named as in a PLY file, whatever the format is."""
 
     path: str
     layout: str  # name of the column layout, such as "17-column export" or "INRIA, SH degree 3"
     format: str  # "ascii", "binary little-endian" or "binary big-endian"
     count: int  # number of rows, including unusable ones
     file_bytes: int  # bytes of the file; of levels of detail, also of the chunks of the level that is read
-    # Bytes of the rows by attribute: means, normals, sh0, shN, opacities, scales, quats, extra. For an ascii file, the
-    # bytes of the binary types; for .spz, before compression; for .sog, of the textures (sh0 includes the opacities)
+    # Attribute (means, normals, sh0, shN, opacities, scales, quats, extra) -> its bytes. Numbers of an ascii file count
+    # as binary ones. For .spz, bytes before compression. For .sog, bytes of textures; those of sh0 include opacities
     bytes_by_attribute: dict[str, int]
     columns: tuple[str, ...]  # all columns of the vertex element, in the file's order
     extra_columns: tuple[str, ...]  # the columns that do not belong to Gaussians
@@ -52,11 +52,11 @@ class FileInfo:
     num_nonfinite: int  # rows with NaN, inf, a log scale above 30 or a harmonic beyond +-1e6, which are set aside
     num_empty: int  # rows that only pad the file, which are set aside
     num_zero_quats: int  # Gaussians with a zero quaternion, read as the identity
-    # Why the scales are likely wrong, in one sentence without a full stop; empty if they are plausible
+    # Says in one sentence without a full stop why the scales are likely wrong; empty if they are plausible
     odd_scales: str = ""
     color_units: ColorUnits | None = None  # units of RGB in the columns of harmonics; None if these hold harmonics
     color_note: str = ""  # says that these units were guessed, in one sentence without a full stop
-    open_units: ColorUnits | None = None  # units in which the columns hold RGB if photos show it; None: no such units
+    open_units: ColorUnits | None = None  # units of RGB that the columns may have if photos confirm it; None: none
     adapted: tuple[str, ...] = ()  # how the content was adapted, one sentence each without a full stop
 
 
@@ -64,8 +64,8 @@ class FileInfo:
 class GaussianFile:
     """The n Gaussians of a file, row by row, as float32; means are float64 if the file stores them as float64.
 
-    ``valid [n]`` is False for rows that are no Gaussians, because they are not finite or empty. Such a row is fully
-    transparent and grey, and has the position and scales of the Gaussian before it.
+    ``valid [n]`` is False for rows that are not finite or only pad the file. Such a row is fully transparent and grey,
+    and has the position and scales of the Gaussian before it.
     """
 
     gaussians: Gaussians
@@ -82,22 +82,22 @@ def kept_comments(info: FileInfo) -> tuple[str, ...]:
 
 
 def file_notes(info: FileInfo) -> tuple[str, ...]:
-    """Describe adapted or unusual content of a file: one sentence each, without a full stop."""
-    counted = {
-        ("row", "with NaN, inf or numbers that no scene has, set aside"): info.num_nonfinite,
-        ("empty row", "at the origin, set aside"): info.num_empty,
-        ("Gaussian", "with a zero quaternion, read as the identity"): info.num_zero_quats,
-    }
+    """Describe adapted or unusual content of a file for the user: one sentence each, without a full stop."""
+    counts = (
+        (info.num_nonfinite, "row", "with NaN, inf or numbers that no scene has, set aside"),
+        (info.num_empty, "empty row", "at the origin, set aside"),
+        (info.num_zero_quats, "Gaussian", "with a zero quaternion, read as the identity"),
+    )
     raw = ("opacities lie in [0, 1] and are read as such; if they are logits, use --hint opacity=logit",)
     color_notes = (info.color_note,) if info.color_note else ()
     raw_notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
     scale_notes = (Doubt(info.odd_scales),) if info.odd_scales else ()
-    count_notes = (count_words(count, noun, rest) for (noun, rest), count in counted.items() if count)
+    count_notes = (count_words(count, noun, rest) for count, noun, rest in counts if count)
     return (*info.adapted, *color_notes, *raw_notes, *scale_notes, *count_notes)
 
 
 def degree_notes(info: FileInfo) -> tuple[str, ...]:
-    """Note harmonics of a degree that few programs read in a ``.ply``, in the form of :func:`file_notes`."""
+    """Note, as :func:`file_notes` does, if a ``.ply`` has harmonics of a degree that other programs refuse."""
     if info.sh_degree <= ply.MAX_DEGREE or not PLY.names(info.path):
         return ()
     return (f"splat-transform 3.7 and gsply refuse a .ply with harmonics of degree {info.sh_degree}, as this one has",)
@@ -119,7 +119,7 @@ def read_ply(
             as logits. Infinite logits are opacities of 0 and 1.
         scales: How scales are stored. "auto" reads them as logarithms, unless the size of the scene shows that
             they are linear.
-        colors: What ``f_dc_*`` hold. "auto" reads them as harmonics, unless they end at black and white as RGB does.
+        colors: What ``f_dc_*`` hold. "auto" reads them as harmonics, unless they fill the range of RGB and end there.
 
     Raises:
         SceneError: If the file cannot be read, lacks columns, or has fewer than 2 finite Gaussians in 1,000 rows.
@@ -162,12 +162,12 @@ def read_parts(
 def read_gaussians(
     path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto", colors: ColorChoice = "auto"
 ) -> GaussianFile:
-    """Read a file of Gaussians; the ending of its name tells the format.
+    """Read a file of Gaussians in the format that its ending names.
 
     Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``. The finest level of a
-    ``lod-meta.json`` is read; ``meta.json`` or its folder is a ``.sog`` without its zip. Everything else is read by
-    :func:`read_ply`; only this uses ``opacity``, ``scales`` and ``colors``. SceneError if the file cannot be read, is
-    damaged, or holds no finite Gaussian. ValueError for an unknown encoding.
+    ``lod-meta.json`` is read. ``meta.json`` or its folder is a ``.sog`` without its zip. :func:`read_ply` reads
+    everything else, with ``opacity``, ``scales`` and ``colors``, which other formats do not need. SceneError if the
+    file cannot be read, is damaged, or holds no finite Gaussian. ValueError for an unknown encoding.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
@@ -192,9 +192,9 @@ def convert_files(
     scales: ScaleChoice = "auto",
     colors: ColorChoice = "auto",
 ) -> GaussianFile:
-    """Convert the rows of files to Gaussians, file by file.
+    """Convert the rows of one or several files to Gaussians; damaged or empty rows become invalid.
 
-    Counts and bytes in the facts are sums over the files, and all other facts are those of the first file.
+    Counts and bytes in ``info`` are sums over the files. Everything else in it is that of the first file.
     """
     path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
     names = tuple(dtype.names or ())
@@ -250,7 +250,8 @@ def convert_files(
 def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.ndarray]:
     """Make uninitialised arrays of ``n`` Gaussians by name, and the array ``valid``.
 
-    ``dtype``: the columns of the stored rows. ``file_bytes``: the size of the files, which limits arrays in memory.
+    ``dtype``: the columns of the stored rows. ``file_bytes``: the size of the files. Arrays that are many times as
+    large lie in a temporary file.
     """
     names = tuple(dtype.names or ())
     num_higher = sum(name.startswith("f_rest_") for name in names) // 3
@@ -274,35 +275,37 @@ def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[s
 def _judge_scales(
     paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray], choice: ScaleChoice
 ) -> ScaleJudgement:
-    """Judge whether stored scales are linear; ``out`` has the scales that follow if they are logarithms.
+    """Judge whether stored scales are linear or logarithms; ``out`` was filled as if they were logarithms.
 
     Only the scales of a PLY file may be linear. Those in a file of gsmerge are logarithms, unless the caller states
     something else.
     """
-    judgement, columns = judge_scales(out), arrays.color_columns(parts[0].rows.dtype.names)
+    judgement = judge_scales(out)
+    # Only the rows of a PLY file are a NumPy array
     if not isinstance(parts[0].rows, np.ndarray) or (choice == "auto" and parts[0].encoding is not None):
-        return ScaleJudgement(False, "" if judgement.linear else judgement.why)
+        return ScaleJudgement(linear=False, why="" if judgement.linear else judgement.why)
     if choice == "linear":
         with np.errstate(all="ignore"):
-            # ``out`` has the exponentials of the stored numbers, which are below 1 for negative numbers
+            # ``out`` has the exponential of each stored number, which is below 1 if the number is negative
             negative = 100 * float(np.count_nonzero(out["scales"][out["valid"]] < 1)) / max(1, 3 * out["valid"].sum())
         if negative > 100 * arrays.MAX_STRAY:
             problem = f"expected scales of at least 0, as --hint scales=linear says, found {negative:.3g} % below"
             raise SceneError(paths[0], f"{problem}, like logarithms", "leave out --hint scales=linear")
     if choice != "auto":
-        return ScaleJudgement(choice == "linear", "")
+        return ScaleJudgement(linear=choice == "linear", why="")
+    columns = arrays.color_columns(parts[0].rows.dtype.names)
     if columns == arrays.PLAIN_COLORS[1] and not arrays.are_logarithms(log(out["scales"][:, 0])):
-        return ScaleJudgement(True, "the columns are r, g and b and hardly any scale is negative")
+        return ScaleJudgement(linear=True, why="the columns are r, g and b and hardly any scale is negative")
     return judgement
 
 
 def _choose_colors(
     part: StoredRows, out: dict[str, np.ndarray], choice: ColorChoice
 ) -> tuple[ColorUnits | None, str, ColorUnits | None]:
-    """Choose the units of stored colours, None for harmonics; return them, a note, and units that photos may confirm.
+    """Choose the units of stored colours: those of RGB, or None for harmonics of degree 0.
 
-    Only a PLY file may have RGB in place of harmonics. A file of gsmerge has harmonics, unless the caller states
-    something else.
+    Also return a note on a guess, and the units of RGB that the colours may have if photos confirm it. Only a PLY file
+    may have RGB. A file of gsmerge has harmonics, unless the caller states something else.
     """
     names = part.rows.dtype.names or ()
     is_stated = choice == "sh" or (choice == "auto" and part.encoding is not None)
@@ -314,27 +317,25 @@ def _choose_colors(
     if choice == "rgb":
         return choose_units(stored), "", None
     has_plain = all(name in names and part.rows.dtype[name] == np.uint8 for name in arrays.PLAIN_COLORS[0])
-    first = rows[rows < len(part.rows)]
-    plain = np.stack([part.rows[name][first] for name in arrays.PLAIN_COLORS[0]], 1) if has_plain else None
-    judged = judge_colors(stored[: len(first)], plain)
-    if judged is None:
-        return None, "", find_units(stored)
-    return judged[0], RGB_NOTE.format(judged[0].name, judged[1]), judged[0]
+    part_rows = rows[rows < len(part.rows)]
+    plain = np.stack([part.rows[name][part_rows] for name in arrays.PLAIN_COLORS[0]], 1) if has_plain else None
+    units, reason = judge_colors(stored[: len(part_rows)], plain) or (None, "")
+    return (None, "", find_units(stored)) if units is None else (units, RGB_NOTE.format(units.name, reason), units)
 
 
 def _with_linear_scales(part: StoredRows) -> StoredRows:
-    """Return rows that convert their linear scales to log scales when a block is read."""
+    """Return rows whose linear scales become log scales when a block of rows is read."""
     adapt = part.adapt
     return replace(part, adapt=lambda rows: log_of_scales(rows) if adapt is None else adapt(log_of_scales(rows)))
 
 
 def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with the rows of one file; return counts as :func:`_fill_arrays` does."""
+    """Fill arrays with the rows of one file; return the numbers of rows with clipped values and with zero quats."""
     n, block_rows = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
     with ply.open_rows(path, stored.rows) as read:
 
         def convert(start: int) -> tuple[int, int]:
-            """Convert the block of rows from ``start`` on; return its counts."""
+            """Convert the block of rows from ``start`` on; return its two numbers."""
             block = slice(start, min(start + block_rows, n))
             rows = read(block) if stored.adapt is None else stored.adapt(read(block))
             counts = _convert(rows, {name: array[block] for name, array in out.items()})
@@ -342,23 +343,23 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
                 free_pages(out.values())
             return counts
 
-        num_clipped, num_zero = map(sum, zip(*parallel_map(convert, range(0, n, block_rows)), strict=True))
-    return num_clipped, num_zero
+        num_clipped, num_zero_quats = map(sum, zip(*parallel_map(convert, range(0, n, block_rows)), strict=True))
+    return num_clipped, num_zero_quats
 
 
 def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of a block of rows, with opacities as stored; return counts as :func:`_convert_file` does."""
-    num_plain = _convert_plain(rows, out)
-    out["valid"][:num_plain] = True
-    if num_plain == len(rows):
+    """Fill arrays with a block of rows, but leave opacities as stored; return numbers as :func:`_fill_arrays` does."""
+    num_done = _convert_with_kernel(rows, out)
+    out["valid"][:num_done] = True
+    if num_done == len(rows):
         return 0, 0
-    return _convert_columns(rows[num_plain:], {name: array[num_plain:] for name, array in out.items()})
+    return _convert_with_numpy(rows[num_done:], {name: array[num_done:] for name, array in out.items()})
 
 
-def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
-    """Fill arrays with the plain rows at the start of a block, and return the number of these rows.
+def _convert_with_kernel(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
+    """Fill arrays with the first rows of a block by the compiled kernel; return the number of these rows.
 
-    :func:`gsmerge.kernels.stored_rows.convert_rows` says which rows are plain. The number is 0 if a used column
+    The kernel stops before rows with numbers that are not finite or beyond the limits. The number is 0 if a used column
     is missing or any column is not float32.
     """
     columns: dict[str, Any] = dict(rows.dtype.fields or {})  # name -> type and offset in bytes
@@ -378,10 +379,10 @@ def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
     )
 
 
-def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of rows with columns of any kind; return counts as :func:`_convert_file` does.
+def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Fill arrays with rows of any type; return the numbers of rows with clipped values and with zero quats.
 
-    A row is valid if all its values are finite, except for infinite logits and scales of zero.
+    A row is valid if all its values are finite. Logits may be infinite, and scales may be zero.
     """
     color_names, num_higher = arrays.color_columns(rows.dtype.names), out["shN"].shape[1]
     rest_names = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
@@ -406,8 +407,8 @@ def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int,
         for j, name in enumerate(arrays.MEANS):
             out["means"][:, j] = rows[name]
         for j, name in enumerate(color_names):
-            full = 255 if rows.dtype[name].kind == "u" else 1
-            out["sh0"][:, 0, j] = colors[:, j] if name in arrays.SH0 else rgb_to_sh0(colors[:, j] / full)
+            white = 255 if rows.dtype[name].kind == "u" else 1
+            out["sh0"][:, 0, j] = colors[:, j] if name in arrays.SH0 else rgb_to_sh0(colors[:, j] / white)
         out["shN"][:] = rest.reshape(out["shN"].shape)
         out["scales"][:], out["opacities"][:] = exp(log_scales), opacities
         is_zero = _normalise(list(quats.T), out["quats"])
@@ -415,33 +416,37 @@ def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int,
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions to ``out [n,4]``, and the identity for zero quaternions; return which are zero ``[n]``."""
+    """Write unit quaternions to ``out [n,4]``, and the identity where a quaternion is zero; return where ``[n]``."""
     w, x, y, z = quats
-    squared = w * w + x * x + y * y + z * z
-    inverse = 1 / np.sqrt(squared)
+    squared_lengths = w * w + x * x + y * y + z * z
+    inverse_lengths = 1 / np.sqrt(squared_lengths)
     for j, column in enumerate(quats):
-        np.multiply(column, inverse, out=out[:, j])
-    zero = np.zeros(len(w), np.bool_)
-    extreme = np.flatnonzero(~((squared > 1e-30) & (squared < 1e30)))  # float32 squares under- or overflow
+        np.multiply(column, inverse_lengths, out=out[:, j])
+    is_zero = np.zeros(len(w), np.bool_)
+    # Rows whose squares under- or overflow in float32 are computed again in float64
+    extreme = np.flatnonzero(~((squared_lengths > 1e-30) & (squared_lengths < 1e30)))
     if len(extreme):
         exact = np.stack([column[extreme].astype(np.float64) for column in quats], 1)
         length = np.linalg.norm(exact, axis=1)
-        zero[extreme] = length == 0
+        is_zero[extreme] = length == 0
         exact[length == 0] = (1, 0, 0, 0)
         out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
-    return zero
+    return is_zero
 
 
 def _choose_encoding(
     paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray, empty: np.ndarray, choice: OpacityChoice
 ) -> tuple[str, bool]:
-    """Choose the encoding of opacities, and also return whether it is guessed; ``empty`` rows do not count."""
+    """Choose the encoding of opacities, "logit" or "raw", and return whether it is a guess.
+
+    A guess ignores the rows ``empty``, which only pad the file.
+    """
     if choice == "raw":
         _check_raw(paths[0], opacities)
     if choice != "auto":
         return choice, False
     values = opacities if len(empty) == 0 else opacities.copy()
-    values[empty] = np.nan
+    values[empty] = np.nan  # ignored below
     declared = _declared_encoding(paths, parts, values)
     finite = values[np.isfinite(values)] if declared is None else values[:0]
     if len(finite) and finite.min() >= 0 and finite.max() <= 255:
@@ -449,22 +454,22 @@ def _choose_encoding(
         if share > 100 * arrays.MAX_STRAY:
             problem = f"expected opacities as logits or in [0, 1], found 0 to 255: {share:.3g} % are above any logit"
             raise SceneError(paths[0], problem, "divide them by 255, or for logits use --hint opacity=logit")
-    return declared or ("raw" if arrays.are_shares(values) else "logit"), declared is None
+    return declared or ("raw" if arrays.lie_in_unit_range(values) else "logit"), declared is None
 
 
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
-    """Return the encoding of opacities that the parts declare; None if no part declares one.
+    """Return the encoding of opacities that a part declares; None if no part declares one.
 
-    SceneError if the encodings of parts differ. If a part declares no encoding, this check guesses it from the part's
-    values, unless they are too few.
+    SceneError if parts have different encodings. For this check, the encoding of a part that declares none is guessed
+    from its values, if they are enough.
     """
     start, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
-    min_judged = 100  # least number of values for a judgement of encodings
+    min_values = 100  # least number of values for a guess
     for path, part in zip(paths, parts, strict=True):
         values = opacities[start : start + len(part.rows)]
         start += len(values)
-        is_clear = len(parts) > 1 and np.isfinite(values).sum() >= min_judged
-        encoding = part.encoding or (("raw" if arrays.are_shares(values) else "logit") if is_clear else None)
+        may_guess = len(parts) > 1 and np.isfinite(values).sum() >= min_values
+        encoding = part.encoding or (("raw" if arrays.lie_in_unit_range(values) else "logit") if may_guess else None)
         if encoding is not None:
             part_names.setdefault(encoding, path.name)
         if len(part_names) > 1:
@@ -475,7 +480,7 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
 
 
 def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
-    """Convert stored opacities to [0, 1] in place; an infinite raw value makes its row invalid."""
+    """Convert stored opacities to [0, 1], in place; rows with infinite values become invalid unless they are logits."""
     if encoding == "raw":
         valid &= np.isfinite(opacities)
         np.clip(opacities, 0, 1, out=opacities)
@@ -487,9 +492,9 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
 
 
 def _check_raw(path: Path, opacities: np.ndarray) -> None:
-    """Raise SceneError if values that the caller declares as opacities in [0, 1] are logits."""
+    """Raise SceneError if stored values that the caller declares as opacities in [0, 1] lie outside, as logits do."""
     finite = np.isfinite(opacities)
-    outside = (np.abs(opacities - 0.5) > 0.5 + arrays.SHARE_ROUNDING) & finite
+    outside = (np.abs(opacities - 0.5) > 0.5 + arrays.UNIT_ROUNDING) & finite
     if outside.sum() > arrays.MAX_STRAY * finite.sum():
         share = 100 * outside.sum() / finite.sum()
         problem = f"expected opacities in [0, 1], as --hint opacity=raw says, found {share:.3g} % outside, like logits"
@@ -497,9 +502,10 @@ def _check_raw(path: Path, opacities: np.ndarray) -> None:
 
 
 def _spread_low_degree(shN: np.ndarray) -> None:
-    """Move harmonics of a low degree to their places in ``shN [n,15,3]``, in place.
+    """Mend ``shN [n,15,3]``, in place, if a file of Long-LRM has harmonics of degree 1 or 2.
 
-    Long-LRM writes 45 columns for every degree. Harmonics of degree 1 or 2 are channel-major in the first 9 or 24.
+    Long-LRM writes 45 columns for every degree, and fills only the first 9 or 24. They hold all harmonics of red, then
+    of green, then of blue.
     """
     if shN.shape[1] != 15:
         return
@@ -513,12 +519,12 @@ def _spread_low_degree(shN: np.ndarray) -> None:
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
-    """Make invalid rows transparent, in place, and return their number; SceneError if hardly any row is valid."""
+    """Make invalid rows transparent, in place, and return their number; SceneError if too few rows are valid."""
     valid = out["valid"]
     invalid = np.flatnonzero(~valid)
     num_valid = len(valid) - len(invalid)
-    min_finite = 0.002  # least share of finite rows; a file with fewer is refused
-    if len(invalid) and num_valid < min_finite * len(valid):
+    min_valid = 0.002  # least share of valid rows in a file
+    if len(invalid) and num_valid < min_valid * len(valid):
         number = f"{len(invalid):,} of" if num_valid else "all"
         rows = f"{number} {len(valid):,} rows"
         problem = f"expected finite Gaussians, found NaN, inf or numbers that no scene has in {rows}"
@@ -528,11 +534,10 @@ def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
 
 
 def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the valid rows that only pad the file.
+    """Return the valid rows that are no Gaussians, but only pad the file.
 
-    A row at the origin pads the file if it is not rotated, round and grey, as a row of zeros is. Many equal rows at
-    the origin also pad the file; VolSplat writes these. If a file has only such rows, a few of them count as Gaussians,
-    and many raise SceneError.
+    A row at the origin pads the file if it is not rotated, round and grey, as a row of zeros is. VolSplat pads with
+    many equal rows at the origin. If all valid rows are such, a few count as Gaussians, and many raise SceneError.
     """
     rows = np.flatnonzero((out["means"][:, 0] == 0) & out["valid"])
     rows = rows[(out["means"][rows] == 0).all(1)]
@@ -540,21 +545,24 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
         return rows
     scales, sh0 = out["scales"][rows], out["sh0"][rows, 0]
     empty = (out["quats"][rows] == (1, 0, 0, 0)).all(1) & (scales == scales[:, :1]).all(1) & (sh0 == 0).all(1)
-    min_padding = 16  # number of equal rows at the origin that are padding; fewer may be Gaussians
+    min_padding = 16  # from this number on, equal rows at the origin are padding; fewer may be Gaussians
     if len(rows) >= min_padding:
         attributes = np.concatenate([scales, out["opacities"][rows, None], sh0], 1)
         empty |= (attributes == lower_median(attributes)).all(1)
     rows = rows[empty]
     if len(rows) == np.count_nonzero(out["valid"]):
         if len(rows) < min_padding:
-            return rows[:0]
+            return rows[:0]  # none
         problem = f"expected Gaussians, found only {len(rows):,} rows at the origin that are empty or equal"
         raise SceneError(path, problem, "export it again, since the export may have been interrupted")
     return rows
 
 
 def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
-    """Make ``rows`` invalid, transparent and grey, in place, with position and scales of the valid row before them."""
+    """Make ``rows`` invalid, transparent and grey, in place.
+
+    They get the position and scales of the valid row before them, so that they do not enlarge the scene.
+    """
     if len(rows) == 0:
         return
     out["valid"][rows] = False
@@ -567,7 +575,7 @@ def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
 
 
 def _set_aside_impossible(out: dict[str, np.ndarray]) -> list[str]:
-    """Make rows invalid, in place, if they have numbers that no scene has; return a doubt if these rows are many."""
+    """Make rows invalid, in place, if they have numbers that no scene has; warn if these rows are many."""
     is_possible = (out["scales"] < exp(np.float32(arrays.MAX_LOG_SCALE))).all(1)
     is_possible &= (np.abs(out["means"]) <= arrays.MAX_POSITION).all(1)
     is_possible &= (np.abs(np.concatenate([out["sh0"], out["shN"]], 1)) < MAX_HARMONIC).all((1, 2))
@@ -578,7 +586,7 @@ def _set_aside_impossible(out: dict[str, np.ndarray]) -> list[str]:
 
 
 def _describe_incomplete(valid: np.ndarray) -> tuple[str, ...]:
-    """Return a doubt about an export in which the last rows, or most rows, are no Gaussians; empty for other files."""
+    """Warn if the last rows, or most rows, of a file are invalid; empty for other files."""
     valid_rows = np.flatnonzero(valid)
     num_last = len(valid) - 1 - int(valid_rows[-1])  # rows after the last Gaussian
     num_invalid = len(valid) - len(valid_rows)

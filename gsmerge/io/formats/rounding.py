@@ -15,30 +15,32 @@ from gsmerge.io.formats.write import limit_notes, write_gaussians
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arrays import distinct
 
-# Renders change visibly, by .05 dB of 27, if the mean square of the Gaussians' moves is above this. A move is in units
-# of the Gaussian's size, and at most 1. Scenes around their origin have at most a tenth of this mean square.
-SHOWN_MOVE = 0.005
+# Renders change visibly if the mean square of the Gaussians' moves is above this: at this value, a PSNR of 27 dB drops
+# by .05 dB. A move is divided by the Gaussian's size, and at most 1. In scenes around the origin, the mean square is at
+# most a tenth of this.
+VISIBLE_MEAN_SQUARE = 0.005
 ROUNDING_GAUSSIANS = 1 << 17  # number of Gaussians from which the mean is estimated
 
 
 def format_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
-    """Note what a file's format leaves out of Gaussians, and how it moves them; UsageError for an unknown ending."""
+    """Note what the format of a path leaves out, and how far it moves Gaussians; UsageError for an unknown format."""
     return limit_notes(path, gaussians.sh_degree, len(gaussians)) + rounding_notes(path, gaussians)
 
 
 def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
-    """Note how far a format's rounding moves Gaussians, and the remedy; empty if renders do not change visibly."""
+    """Note how far the rounding of positions in a format moves Gaussians; empty if renders do not change visibly."""
     if len(gaussians) == 0:
         return []
     format_, columns = output_format(path), gaussians.numpy()
-    extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # from them formats choose their steps
+    # The sample has the extreme positions, since formats choose the steps of their rounding by these
+    extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)
     rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // ROUNDING_GAUSSIANS + 1), *extremes]))
     means, scales = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0)
     sizes = np.sort(scales, axis=1)[:, 1]  # a Gaussian is as large as its second largest scale
     with np.errstate(over="ignore"):
         moves = np.abs(format_.round_means(means) - means).max(axis=1)
     mean_square = float(np.square(np.minimum(moves / np.maximum(sizes, 1e-30), 1)).mean())
-    if mean_square <= SHOWN_MOVE:
+    if mean_square <= VISIBLE_MEAN_SQUARE:
         return []
     center = medians(means)
     shift = ",".join(f"{-float(f'{coordinate:.3g}'):.0f}" for coordinate in center)
@@ -50,9 +52,10 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
 
 
 def round_as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
-    """Return Gaussians as a file of the format of ``path`` has them; unchanged if rounding is invisible.
+    """Return Gaussians as they are after writing and reading a file in the format of ``path``.
 
-    A temporary file is written and read. If the format cannot be read, only positions are rounded.
+    They are written to a temporary file. If the format cannot be read, only their positions are rounded. They are
+    returned unchanged if the rounding of positions is invisible.
     """
     if not rounding_notes(path, gaussians):
         return gaussians

@@ -1,8 +1,9 @@
 """Read and write ``.sog`` version 2 (developer.playcanvas.com, "The SOG format"): WebP textures in a zip or a folder.
 
-The textures are lossless, and each pixel is a Gaussian. Positions are signed logarithms at 16 bits. Rotations are their
-three smaller components at 8 bits. Log scales, colours and harmonics are indices of codebooks of 256 values. All
-harmonics of a Gaussian are one entry of a palette of at most 65,536.
+The textures are lossless, and each pixel is a Gaussian. Positions are signed logarithms of 16 bits. Rotations are the
+three smaller components of quaternions, of 8 bits each. Log scales and colours are indices of codebooks with 256
+values. The harmonics of a Gaussian are the index of one entry in a palette of at most 65,536 entries, which has a
+codebook, too.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ MAX_DEGREE = 3  # of harmonics, the highest of the format
 VERSION = 2  # of the format, as its metadata states it
 MODELS = {arrays.MIP: "antialiased", arrays.FLAT: "2dgs"}  # splat-transform's names of the modes of rendering
 GENERATOR = "gsmerge"
-# All files that writers make
+# Names of all files that writers of the format make
 SOG_FILES = (
     "means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_centroids.webp", "shN_labels.webp",
     META,
@@ -59,18 +60,18 @@ _CELLS = 1 << 11  # number of cells of equal width, and of cells with equal coun
 
 
 @dataclass(frozen=True)
-class _Bundle:
-    """The files of a ``.sog`` in a zip; a file is refused if it unpacks to more bytes than the whole zip has."""
+class _ZipFiles:
+    """The files of a ``.sog`` in a zip; a file that unpacks to more bytes than the zip has is refused."""
 
     archive: zipfile.ZipFile
     size: int  # bytes of the zip
 
     def num_bytes(self, name: str) -> int:
-        """Return the bytes of a file in the zip."""
+        """Return the number of bytes that a file takes in the zip."""
         return self.archive.getinfo(name).compress_size
 
-    def member(self, name: str) -> bytes:
-        """Read the content of a file; ValueError if it is refused."""
+    def read(self, name: str) -> bytes:
+        """Read a file; ValueError if it is larger than the zip."""
         info = self.archive.getinfo(name)
         if info.file_size > self.size:
             raise ValueError(f"{name} of {info.file_size} bytes")
@@ -78,29 +79,29 @@ class _Bundle:
 
 
 @dataclass(frozen=True)
-class _Folder:
-    """The files of a ``.sog`` in a folder; files outside it are refused."""
+class _FolderFiles:
+    """The files of a ``.sog`` in a folder."""
 
     folder: Path
-    size: int  # bytes of all files
+    size: int  # bytes of all files of the ``.sog``
 
     def num_bytes(self, name: str) -> int:
-        """Return the bytes of a file; ValueError if it is refused."""
+        """Return the number of bytes of a file; ValueError if it is outside the folder."""
         path = self.folder / name
         inside = Path(os.path.realpath(path)).parent == Path(os.path.realpath(self.folder))
         if path.name != name or "\\" in name or not inside:
             raise ValueError(f"{name!r}, which is outside the folder")
         return check_file(path)
 
-    def member(self, name: str) -> bytes:
-        """Read the content of a file; ValueError if it is refused."""
+    def read(self, name: str) -> bytes:
+        """Read a file; ValueError if it is outside the folder, or larger than all files of the ``.sog``."""
         size = self.num_bytes(name)
         if size > self.size:
             raise ValueError(f"{name} of {size} bytes")
         return (self.folder / name).read_bytes()
 
 
-_Files = _Bundle | _Folder
+_Files = _ZipFiles | _FolderFiles
 
 
 @dataclass(frozen=True)
@@ -117,28 +118,31 @@ def read_rows(path: Path) -> arrays.StoredRows:
     """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or damaged."""
     budget = read_budget(path)
     with _damage_errors(path), open_archive(path) as archive:
-        content = _read_content(_Bundle(archive, budget.file_bytes), budget)
+        content = _read_content(_ZipFiles(archive, budget.file_bytes), budget)
     return arrays.to_stored([content.packed], f".sog version {VERSION}", content.sizes, content.mode)
 
 
-def read_unbundled(path: Path) -> SogContent:
-    """Read the Gaussians of a ``meta.json`` and the textures beside it; SceneError as in :func:`read_rows`."""
-    text = read_text(path)
+def read_unzipped(path: Path) -> SogContent:
+    """Read a ``.sog`` without its zip from its ``meta.json`` and the textures beside it.
+
+    SceneError as in :func:`read_rows`.
+    """
+    text = read_text(path)  # the size of the files that it names limits the memory of the reader
     with _damage_errors(path):
         entries = (entry for entry in os.scandir(path.parent) if f'"{entry.name}"' in text or entry.name == path.name)
         size = sum(entry.stat().st_size for entry in entries)
-        return _read_content(_Folder(path.parent, size), ReadBudget(path, size))
+        return _read_content(_FolderFiles(path.parent, size), ReadBudget(path, size))
 
 
 def read_folder(path: Path) -> arrays.StoredRows:
-    """Read the Gaussians of a ``.sog`` without its zip, by its ``meta.json``; SceneError as in :func:`read_rows`."""
-    content, own_bytes = read_unbundled(path), check_file(path)
+    """Read the rows of a ``.sog`` without its zip, by its ``meta.json``; SceneError as in :func:`read_rows`."""
+    content, meta_bytes = read_unzipped(path), check_file(path)
     rows = arrays.to_stored([content.packed], f"unzipped .sog version {VERSION}", content.sizes, content.mode)
-    return replace(rows, bytes_beside=content.num_bytes - own_bytes)
+    return replace(rows, bytes_beside=content.num_bytes - meta_bytes)
 
 
-def is_folder(path: Path) -> bool:
-    """Return whether a ``meta.json`` belongs to a ``.sog``, and not to another program."""
+def is_sog_meta(path: Path) -> bool:
+    """Return whether a file of the name ``meta.json`` belongs to a ``.sog``, rather than to another program."""
     try:
         document = read_json(path)
     except SceneError:
@@ -148,7 +152,7 @@ def is_folder(path: Path) -> bool:
 
 @contextmanager
 def _damage_errors(path: Path) -> Iterator[None]:
-    """Convert all errors that a damaged file causes in the block to a SceneError."""
+    """Convert errors of the block that a damaged file causes to a SceneError."""
     try:
         with read_errors(path):
             yield
@@ -166,7 +170,7 @@ def _damage_errors(path: Path) -> Iterator[None]:
 
 def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
     """Read the ``meta.json`` of a ``.sog``, and the textures that it names."""
-    meta = parse_json(files.member(META).decode("utf-8-sig"), budget)
+    meta = parse_json(files.read(META).decode("utf-8-sig"), budget)
     version = meta.get("version", 1) if isinstance(meta, dict) else "none"
     if version != VERSION:
         problem = f"expected .sog version {VERSION}, found {version}"
@@ -174,8 +178,8 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
     count = check_whole(meta["count"], "count", 1)
     bands = check_whole(meta["shN"]["bands"], "bands", 1, MAX_DEGREE) if meta.get("shN") else 0
     arrays.check_gaussian_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)
-    models = {model: mode for mode, model in MODELS.items()}
-    mode = models.get(str(meta.get("model")), arrays.MIP if meta.get("antialias") is True else None)
+    modes_by_model = {model: mode for mode, model in MODELS.items()}
+    mode = modes_by_model.get(str(meta.get("model")), arrays.MIP if meta.get("antialias") is True else None)
     packed = _read_packed(files, meta, count, budget)
     keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
     sizes = {key: sum(files.num_bytes(name) for name in meta[key]["files"]) for key in keys}
@@ -184,24 +188,25 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
 
 def _image_size(data: bytes) -> tuple[int, int]:
     """Return width and height of a lossless WebP image; ValueError for any other file."""
-    at = 12  # position after "RIFF", the file's size and "WEBP", bytes
+    at = 12  # bytes before the first chunk: "RIFF", the size of the file, "WEBP"
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         # A chunk has 4 bytes of name, 4 bytes of size, and content that is padded to an even number of bytes
         while at + 8 <= len(data) and data[at : at + 4] in (b"VP8X", b"ICCP"):  # chunks before the image
             at += 8 + (int.from_bytes(data[at + 4 : at + 8], "little") + 1) // 2 * 2
         if data[at : at + 4] == b"VP8L" and len(data) >= at + 13:
-            bits = int.from_bytes(data[at + 9 : at + 13], "little")  # width and height, less 1, of 14 bits each
+            bits = int.from_bytes(data[at + 9 : at + 13], "little")  # width - 1 and height - 1, of 14 bits each
             return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     raise ValueError("no WebP texture without loss")
 
 
 def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> np.ndarray:
     """Decode the first ``count`` pixels of a texture to RGBA ``[count,4]``; alpha is 255 if it has none."""
-    data = files.member(name)
+    data = files.read(name)
     width, height = _image_size(data)
     if not count <= width * height <= 4 * count + (1 << 16):
         raise ValueError(f"{name} of {width} x {height} pixels for {count}")
-    budget.check_memory(12 * width * height, f"{name} of {width} x {height} pixels")  # decoded, in two channel orders
+    # The memory of the image in two orders of channels
+    budget.check_memory(12 * width * height, f"{name} of {width} x {height} pixels")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -216,24 +221,24 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
     """Decode the textures and codebooks, and return the Gaussians in them; ValueError for damaged content."""
 
     def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
-        """Decode the first channels of one of the textures under a key of ``meta``."""
+        """Decode a texture that ``meta`` names under ``key``, to the first ``channels`` numbers of each Gaussian."""
         pixels = _read_texture(files, meta[key]["files"][index], count, budget)
         return pixels[:, :channels].copy()  # a copy, so that unused channels take no memory
 
-    low, high = (_check_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
+    mins, maxs = (_to_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
     low_bytes, high_bytes, scales = texture("means"), texture("means", 1), texture("scales")
     quats, sh0 = texture("quats", channels=4), texture("sh0", channels=4)
-    scale_codes, color_codes = (_check_numbers(meta[key]["codebook"], CODES) for key in ("scales", "sh0"))
+    scale_codes, color_codes = (_to_numbers(meta[key]["codebook"], CODES) for key in ("scales", "sh0"))
     if quats[:, 3].min() < FIRST_MODE:
         raise ValueError(f"rotations of mode {quats[:, 3].min()}")
     labels, palette = _read_palette(files, meta["shN"], count, budget) if meta.get("shN") else (None, np.zeros((0, 3)))
-    harmonic_codes = np.zeros(CODES) if labels is None else _check_numbers(meta["shN"]["codebook"], CODES)
+    harmonic_codes = np.zeros(CODES) if labels is None else _to_numbers(meta["shN"]["codebook"], CODES)
 
     def unpack(block: slice) -> arrays.Columns:
         largest, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
         codes = np.zeros((len(largest), 0, 3), np.uint8) if labels is None else palette[labels[block]]
         return arrays.Columns(
-            means=_decode_means(low_bytes[block] + 256.0 * high_bytes[block], low, high),
+            means=_decode_means(low_bytes[block] + 256.0 * high_bytes[block], mins, maxs),
             quats=arrays.from_smallest_three(largest, smallest),
             log_scales=scale_codes[scales[block]],
             opacities=sh0[block, 3] / 255,
@@ -244,8 +249,8 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
     return arrays.Packed(count, 0 if labels is None else palette.shape[1], unpack)
 
 
-def _check_numbers(values: Any, length: int) -> np.ndarray:
-    """Convert a list to an array ``[length]``; ValueError if it has another length."""
+def _to_numbers(values: Any, length: int) -> np.ndarray:
+    """Convert a list of ``meta.json`` to an array ``[length]``; ValueError if it has another length."""
     numbers = np.asarray(values, np.float64)
     if numbers.shape != (length,):
         raise ValueError(f"{numbers.shape} numbers instead of {length}")
@@ -253,19 +258,20 @@ def _check_numbers(values: Any, length: int) -> np.ndarray:
 
 
 def _read_palette(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of each Gaussian in the palette ``[count]``, and the palette ``[n,num_higher,3]`` of codes."""
+    """Return the index ``[count]`` of each Gaussian's entry, and the palette ``[n,num_higher,3]`` of codes."""
     size, num_higher = check_whole(meta["count"], "count", 1, 2**PALETTE_BITS), (meta["bands"] + 1) ** 2 - 1
-    name, labels_name = meta["files"]
+    palette_name, labels_name = meta["files"]
     labels = _read_texture(files, labels_name, count, budget)[:, :2].copy().view("<u2")[:, 0]
+    # Rows of the texture; a label may exceed the stated size of the palette
     rows = max(-(-size // PALETTE_COLUMNS), int(labels.max()) // PALETTE_COLUMNS + 1)
-    centroids = _read_texture(files, name, rows * PALETTE_COLUMNS * num_higher, budget)[:, :3]
+    centroids = _read_texture(files, palette_name, rows * PALETTE_COLUMNS * num_higher, budget)[:, :3]
     return labels, centroids.reshape(-1, num_higher, 3)
 
 
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     """Encode a ``.sog``, with rows in the order of a space-filling curve; ValueError if there is NaN or inf.
 
-    ``comments`` may have the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
+    ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
     columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     content = io.BytesIO()
@@ -276,7 +282,7 @@ def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 
 
 def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, bytes]:
-    """Encode the files of a ``.sog`` by name: textures in the order of the rows, then ``meta.json``."""
+    """Encode the files of a ``.sog`` by name: textures, whose pixels have the order of the rows, and ``meta.json``."""
     count = len(columns)
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": GENERATOR}, "count": count}
     meta["antialias"] = mode == arrays.MIP
@@ -285,13 +291,13 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
     textures: dict[str, bytes] = {}
 
     def add(key: str, files: dict[str, bytes], **numbers: Any) -> None:
-        """Add textures, and an entry of ``meta`` with their names and numbers."""
+        """Add textures, and an entry of ``meta`` with their names and the given numbers."""
         meta[key] = {**numbers, "files": list(files)}
         textures.update(files)
 
-    fixed, low, high = _quantise_means(columns.means)
-    means_bytes = {"means_l.webp": _encode_texture(fixed & 255), "means_u.webp": _encode_texture(fixed >> 8)}
-    add("means", means_bytes, mins=low, maxs=high)
+    codes, mins, maxs = _quantise_means(columns.means)
+    means_files = {"means_l.webp": _encode_texture(codes & 255), "means_u.webp": _encode_texture(codes >> 8)}
+    add("means", means_files, mins=mins, maxs=maxs)
     scales, sh0 = fit_codebook(columns.log_scales), fit_codebook(columns.sh0)
     add(
         "scales", {"scales.webp": _encode_texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales)
@@ -308,7 +314,7 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
 
 
 def _encode_palette(harmonics: np.ndarray) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Encode ``harmonics [n,num_higher,3]`` as a palette; return its textures, and its numbers in ``meta.json``."""
+    """Encode ``harmonics [n,num_higher,3]`` as a palette; return its textures, and its numbers for ``meta.json``."""
     count, num_higher = harmonics.shape[:2]
     palette, labels = fit_palette(harmonics.reshape(count, -1), PALETTE_BITS)
     codebook = fit_codebook(palette)
@@ -323,32 +329,32 @@ def _encode_palette(harmonics: np.ndarray) -> tuple[dict[str, bytes], dict[str, 
 
 
 def round_means(means: np.ndarray) -> np.ndarray:
-    """Return means ``[n,3]`` after rounding as in a ``.sog``."""
+    """Round means ``[n,3]`` as writing and reading a ``.sog`` does."""
     fixed, low, high = _quantise_means(means)
     return to_float32(_decode_means(fixed, np.array(low), np.array(high)))
 
 
 def _quantise_means(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
-    """Quantise the signed logarithms of means to 16 bits; also return their minima and maxima as written."""
+    """Quantise the signed logarithms of means to 16 bits; also return their minima and maxima for ``meta.json``."""
     logs = np.sign(means) * log1p(np.abs(means))
-    low, high = logs.min(axis=0), logs.max(axis=0)
-    fixed = np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
-    return fixed, _shorten(low), _shorten(high)
+    mins, maxs = logs.min(axis=0), logs.max(axis=0)
+    codes = np.round((logs - mins) / np.where(maxs > mins, maxs - mins, 1) * 65535).astype(int)
+    return codes, _shorten(mins), _shorten(maxs)
 
 
-def _decode_means(fixed: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Invert :func:`_quantise_means`."""
-    logs = low + (high - low) * fixed / 65535
+def _decode_means(codes: np.ndarray, mins: np.ndarray, maxs: np.ndarray) -> np.ndarray:
+    """Restore means from the results of :func:`_quantise_means`."""
+    logs = mins + (maxs - mins) * codes / 65535
     return np.asarray(np.sign(logs) * expm1(np.abs(logs)))
 
 
 def _shorten(values: np.ndarray) -> list[float]:
-    """Round values to eight digits, which are enough for float32, so that the text of the file is short."""
+    """Round values to eight digits for ``meta.json``. They keep it short, and are enough for float32."""
     return [float(f"{value:.8g}") for value in values]
 
 
 def _encode_texture(values: np.ndarray) -> bytes:
-    """Encode rows of channels as a lossless, roughly square WebP image, padded with zeros."""
+    """Encode rows of channels as the pixels of a lossless, roughly square WebP image, padded with zeros."""
     width = max(4, math.ceil(math.sqrt(len(values)) / 4) * 4)
     height = max(4, math.ceil(len(values) / width / 4) * 4)
     pixels = np.zeros((height * width, values.shape[1]), np.uint8)
@@ -357,17 +363,17 @@ def _encode_texture(values: np.ndarray) -> bytes:
 
 
 def _encode_webp(image: np.ndarray) -> bytes:
-    """Encode a lossless WebP image; only the colours of pixels whose alpha is 0 may change."""
-    bgra = [2, 1, 0, 3][: image.shape[2]]  # OpenCV's order of channels
+    """Encode a lossless WebP image. The colours of a pixel may change if its alpha is 0."""
+    bgr_or_bgra = [2, 1, 0, 3][: image.shape[2]]  # OpenCV's order of channels
     lossless = 101  # OpenCV's WebP quality
-    _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., bgra]), [cv2.IMWRITE_WEBP_QUALITY, lossless])
+    _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., bgr_or_bgra]), [cv2.IMWRITE_WEBP_QUALITY, lossless])
     return data.tobytes()
 
 
 def fit_codebook(values: np.ndarray) -> np.ndarray:
     """Choose ``[256]`` rising values that represent finite numbers of any shape, by 1-D k-means.
 
-    The values are first divided into thousands of narrow cells. Each step merges the two neighbours with the least
+    The values are first divided into thousands of cells. Each step merges the two neighbours with the least
     added squared error (Ward 1963), until 256 cells are left. Isolated values thus keep their own codes. Lloyd's
     algorithm then improves the codes. Unused codes repeat the last one.
     """
@@ -376,14 +382,14 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
     if len(distinct) <= CODES:
         return np.pad(distinct, (0, CODES - len(distinct)), "edge" if len(distinct) else "constant")
     sums = np.concatenate([[0], np.cumsum(ordered)])
+    # Cells of equal width keep isolated values apart, and cells of equal counts divide dense ranges
     equal_width = np.searchsorted(ordered, np.linspace(ordered[0], ordered[-1], _CELLS))
     equal_count = np.linspace(0, len(ordered), _CELLS).astype(int)
     ends = np.unique([*equal_width, *equal_count])
     codes = _merge_cells(np.diff(ends).astype(float), np.diff(sums[ends]) / np.diff(ends))
     max_steps = 200  # steps of Lloyd's algorithm
     for _ in range(max_steps):
-        ends = np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2)
-        ends = np.concatenate([[0], ends, [len(ordered)]])
+        ends = np.concatenate([[0], np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2), [len(ordered)]])
         numbers, totals = np.diff(ends), np.diff(sums[ends])
         cell_means = np.where(numbers > 0, totals / np.maximum(numbers, 1), codes)
         if np.array_equal(cell_means, codes):
@@ -400,12 +406,13 @@ def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
     count, mean = numbers.tolist(), means.tolist()
     previous, following = list(range(-1, len(count) - 1)), list(range(1, len(count) + 1))
 
-    def merger(i: int) -> tuple[float, int, int, float, float]:
-        """Return the squared error that merging a cell with the next one adds, both cells, and their counts."""
+    def merge_entry(i: int) -> tuple[float, int, int, float, float]:
+        """Return the error that merging cell ``i`` with the next one adds, both cells, and their counts of values."""
         j = following[i]
-        return count[i] * count[j] / (count[i] + count[j]) * (mean[i] - mean[j]) ** 2, i, j, count[i], count[j]
+        added_error = count[i] * count[j] / (count[i] + count[j]) * (mean[i] - mean[j]) ** 2
+        return added_error, i, j, count[i], count[j]
 
-    heap = [merger(i) for i in range(len(count) - 1)]
+    heap = [merge_entry(i) for i in range(len(count) - 1)]
     heapq.heapify(heap)
     for _ in range(len(count) - CODES):
         _, i, j, *counts = heapq.heappop(heap)
@@ -416,9 +423,9 @@ def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
         following[i] = following[j]
         if following[i] < len(count):
             previous[following[i]] = i
-            heapq.heappush(heap, merger(i))
+            heapq.heappush(heap, merge_entry(i))
         if previous[i] >= 0:
-            heapq.heappush(heap, merger(previous[i]))
+            heapq.heappush(heap, merge_entry(previous[i]))
     return np.array([m for m, n in zip(mean, count, strict=True) if n > 0])
 
 
@@ -428,10 +435,10 @@ def nearest_codes(codebook: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def fit_palette(vectors: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Choose a palette of at most ``2**max_bits`` entries for ``vectors [n,d]``; return it and each vector's index.
+    """Choose a palette of at most ``2**max_bits`` entries for ``vectors [n,d]``; also return each vector's entry.
 
     Groups of vectors are halved ``max_bits`` times at the median of the coordinate with the largest spread. The entries
-    are the means of the final groups. If there are few enough vectors, each vector is its own entry.
+    are the means of the final groups. If there are at most ``2**max_bits`` vectors, each of them is an entry.
     """
     count = len(vectors)
     if count <= 2**max_bits:

@@ -1,7 +1,7 @@
 """Read and write ``.splat``, the format of antimatter15/splat, which most viewers read.
 
-It has 32 bytes per Gaussian and no header. Quaternions wxyz are bytes 128 + 128 q. Harmonics above degree 0 cannot be
-stored.
+It has 32 bytes per Gaussian and no header. A component q of a quaternion wxyz is the byte 128 + 128 q. Harmonics above
+degree 0 cannot be stored.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ TIME_LIMIT = 1800  # seconds after which the program is stopped
 
 
 def find_program() -> str:
-    """Find the path of the program; UsageError, which says how to install it, if there is none."""
+    """Return the path of the program; UsageError if it is not installed."""
     named = os.environ.get(VARIABLE)
     program = shutil.which(named or SPLAT_TRANSFORM_PROGRAM)
     if program is None:
@@ -47,8 +47,8 @@ def run_program(*arguments: object) -> None:
 
 
 @contextmanager
-def name_file(path: Path) -> Iterator[None]:
-    """Name the user's file ``path`` in errors of the block, instead of the program's temporary file."""
+def blame_program(path: Path) -> Iterator[None]:
+    """Convert errors in reading the program's temporary file to errors of the user's output ``path``."""
     try:
         yield
     except SceneError as error:

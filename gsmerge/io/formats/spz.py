@@ -1,13 +1,13 @@
 """Read and write ``.spz``, a format of quantised columns (github.com/nianticlabs/spz, README and load-spz.cc).
 
 Positions are fixed-point numbers of 24 bits. Log scales are steps of 1/16 from -10 on. Opacities and colours are bytes.
-Rotations are their three smaller components, each with a sign and 9 bits. Harmonics are bytes of which 5 bits (degree
-1) or 4 bits are used. Version 3 is one gzip stream, with harmonics up to degree 3. Version 4 has an uncompressed
-header, a table of compressed and uncompressed sizes, and one Zstandard stream for each column.
+Rotations are the three smaller components of quaternions, each with a sign and 9 bits. Harmonics are bytes, rounded to
+their 5 highest bits (degree 1) or 4 highest bits. Version 3 is one gzip stream, with harmonics up to degree 3. Version
+4 has an uncompressed header, a table of compressed and uncompressed sizes, and one Zstandard stream for each column.
 
-The README says that axes are right, up and back. Its converters, splat-transform and SuperSplat use the axes of the
-``.ply`` instead. This module does the same, so that a file looks like its ``.ply``. A file whose extension
-``SPZ_ADOBE_coordinate_system`` names its axes is turned to those of a ``.ply``: right, down and front.
+The README says that axes point right, up and back. However, Niantic's converters, splat-transform and SuperSplat keep
+the axes of a ``.ply``: right, down and front. This module keeps them, too. The extension
+``SPZ_ADOBE_coordinate_system`` may state other axes, and then the reader rotates the Gaussians to those of a ``.ply``.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.types import SH_C0, Gaussians, StrPath
 from gsmerge.values.arrays import as_array, to_float32
 
-# Default version, and largest degree of harmonics, of written files. Spark 2.2 does not read version 4, and old readers
-# read only version 2
+# Default version of written files, and their largest degree of harmonics. Spark 2.2 does not read version 4, and old
+# readers read only version 2
 VERSION, MAX_DEGREE = 3, 3
 MAGIC = 0x5053474E  # "NGSP", the first bytes of the header
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, number of streams or zero
@@ -42,7 +42,8 @@ TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in 
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
 MIP_FLAG = 1  # flag of Gaussians that are rendered antialiased
 EXTENSION_RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
-# Directions of x, y and z, such as left, down and back. The extension states the number of one of these, counted from 1
+# Directions of the axes x, y and z, such as left, down and back. The extension states the number of a row, counted from
+# 1
 AXIS_SYSTEMS = (
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
@@ -53,18 +54,18 @@ _OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
 _MAX_EXTENSIONS = 1 << 20  # most bytes of all extension records
 GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # first bytes of versions 1 to 3, and of 4
 SYSTEM, UNIX = 9, b"\3"  # position of the operating system in a gzip header, and the value that is always written
-FINE = 14  # bits of a position within the scene: steps of a sixteenth of a pixel if the scene fills 1,000 pixels
+SCENE_BITS = 14  # bits of a position within the scene: steps of a sixteenth of a pixel if the scene fills 1,000 pixels
 LARGEST_POSITION = 2**23 - 1
 _SHIFTS = (20, 10, 0)  # lowest bits of the three smaller components of a rotation in its word
 COLOR_SCALE = 0.15  # factor of sh0, so that colours slightly outside [0, 1] can be stored
-# Attributes in the order of the file
+# Names of the attributes in the order of the file
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
 
 
 @dataclass(frozen=True)
 class Header:
-    """The header of a file, without its magic number."""
+    """The numbers in the header of a file, after its magic number."""
 
     version: int
     count: int  # of Gaussians
@@ -80,7 +81,7 @@ class Header:
 
     @property
     def widths(self) -> tuple[int, ...]:
-        """Bytes per Gaussian of each attribute."""
+        """Bytes of each attribute of a Gaussian, in the order of ``ATTRIBUTES``."""
         return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3, 3 * self.num_higher
 
 
@@ -89,7 +90,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
     check_file(path)
     with read_errors(path), path.open("rb") as file:
         packed = file.read(len(ZSTANDARD_MAGIC))
-        if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # other files are refused without reading them
+        if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # the rest of other files is not read
             file.seek(0)
             packed = file.read()
     header, rows, sizes, notes = read_packed(path, packed)
@@ -99,17 +100,16 @@ def read_rows(path: Path) -> arrays.StoredRows:
 
 
 def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, dict[str, int], tuple[str, ...]]:
-    """Read the bytes ``packed`` of a ``.spz``; return its header, Gaussians, bytes of each attribute, and notes.
+    """Read the content ``packed`` of a ``.spz``; return its header, its Gaussians, bytes by attribute, and notes.
 
-    ``path``: the file that holds the bytes, for errors.
+    The Gaussians have the axes of a ``.ply``. ``path``: the file that holds the content, for errors.
     """
-    read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
-    header, parts, extensions, num_left = read(ReadBudget(path, len(packed)), packed)
+    read_parts = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
+    header, parts, extensions, num_left = read_parts(ReadBudget(path, len(packed)), packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
-    # Records of extensions are before the table in version 4, and after the columns in older versions
-    extensions_flag = 2
+    extensions_flag = 2  # flag of a file with extensions
     axes = _stored_axes(path, extensions) if header.flags & extensions_flag else PLY_AXES
-    # The rotation from these axes to those of a .ply. It mirrors if one system is left-handed and the other is not
+    # From these axes to those of a .ply: a rotation, or a mirror image if these axes are left-handed
     rotation = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
     rotate = arrays.rotator(rotation * (1, -1, -1) if axes in _REVERSED else rotation, header.num_higher)
     rows = arrays.Packed(
@@ -121,15 +121,15 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
 
 
 def _stored_axes(path: StrPath, extensions: bytes) -> str:
-    """Return the axes that the extensions name, by default those of a ``.ply``; SceneError if they are unknown."""
-    at = 0
-    # Kind of SPZ_ADOBE_coordinate_system. Its content is 1 for the first of AXIS_SYSTEMS, or 0 for unknown
+    """Return the axes that an extension states, or else those of a ``.ply``; SceneError if it is damaged."""
+    position = 0  # in ``extensions``
+    # Kind of SPZ_ADOBE_coordinate_system. Its content is 1 for the first of AXIS_SYSTEMS, and 0 for unknown axes
     axes_kind = 0xADBE0003
-    while at + EXTENSION_RECORD.size <= len(extensions):
-        kind, size = EXTENSION_RECORD.unpack_from(extensions, at)
-        at += EXTENSION_RECORD.size + size
+    while position + EXTENSION_RECORD.size <= len(extensions):
+        kind, size = EXTENSION_RECORD.unpack_from(extensions, position)
+        position += EXTENSION_RECORD.size + size
         if kind == axes_kind:
-            content = extensions[at - size : at]
+            content = extensions[position - size : position]
             number = int.from_bytes(content, "little") if len(content) == size == 4 else -1
             if not 0 <= number <= len(AXIS_SYSTEMS):
                 found = f"number {number}" if number > 0 else "a damaged record"
@@ -140,7 +140,7 @@ def _stored_axes(path: StrPath, extensions: bytes) -> str:
 
 
 def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int]) -> Header:
-    """Read a header at the ``start`` of the unpacked bytes; SceneError if it is invalid, or its count is too large."""
+    """Read the header from ``start``, its unpacked bytes; SceneError if it is invalid or has too many Gaussians."""
     path = budget.path
     if len(start) < HEADER.size:
         raise SceneError(path, FOUND_EARLY_END, arrays.EXPORT_AGAIN)
@@ -166,7 +166,8 @@ def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndar
     try:
         header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
-        # This also checks the checksum. At the end of the stream it gets no bytes, which would count twice as unused
+        # This call also checks the checksum. It gets no bytes if the stream has ended, since ``unused_data`` would then
+        # count them twice
         extensions = stream.decompress(b"" if stream.eof else stream.unconsumed_tail, _MAX_EXTENSIONS)
     except zlib.error as error:
         raise SceneError(
@@ -181,14 +182,14 @@ def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndar
 
 
 def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
-    """Read version 4; return header, columns ``[n,width]`` uint8, extensions, and number of bytes after them."""
+    """Read version 4, with a stream per column; return the same as :func:`_gzip_parts`."""
     import zstandard  # few files need it
 
     path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,))
     sizes = [header.count * width for width in header.widths if width]
     table_start, ends = _read_table(path, packed, header, sizes)
     streams = [packed[start:end] for start, end in pairwise(ends)]
-    try:  # only whole streams, with their checksums if there are any; a stream may not state its size
+    try:  # streams must be whole, and fit their checksums if they have any; a stream may not state its size
         if any(
             zstandard.frame_content_size(stream) not in (-1, size) for stream, size in zip(streams, sizes, strict=True)
         ):
@@ -205,16 +206,16 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np
             "truncated or damaged: expected whole Zstandard streams with the sizes of its table, found others",
             arrays.EXPORT_AGAIN,
         ) from error
-    columns += [b""] * (len(header.widths) - len(columns))
+    columns += [b""] * (len(header.widths) - len(columns))  # degree 0 has no stream of harmonics
     parts = [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
     return header, parts, packed[HEADER.size + TABLE_START.size : table_start][:_MAX_EXTENSIONS], len(packed) - ends[-1]
 
 
 def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) -> tuple[int, np.ndarray]:
-    """Return the start of the table of version 4, and the start of each stream with the end of the last one.
+    """Return where the table of version 4 starts, and the start of each stream followed by the end of the last one.
 
-    All are in bytes from the start of the file. ``sizes``: bytes of each unpacked column. SceneError if the table does
-    not fit to these sizes or to the file.
+    They are positions in the file, in bytes. ``sizes``: bytes of each unpacked column. SceneError if the table has
+    other sizes, or if the file is too short for it.
     """
     try:
         (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
@@ -233,10 +234,11 @@ def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) 
 
 
 def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
-    """Convert a block of each stored column to Gaussians."""
+    """Convert a block of rows, given as a part of each stored column, to Gaussians."""
     version, fraction = header.version, header.fraction
     means, opacities, colors, scales, rotations, harmonics = parts
-    words = np.zeros((len(means), 3, 4), np.uint8)  # signed numbers of three little-endian bytes
+    # Three little-endian bytes of a signed number are the upper bytes of an int32, which keeps the sign when shifted
+    words = np.zeros((len(means), 3, 4), np.uint8)
     if version > 1:
         words[..., 1:] = means.reshape(-1, 3, 3)
     return arrays.Columns(
@@ -250,7 +252,7 @@ def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
 
 
 def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
-    """Restore quaternions ``[n,4]`` wxyz from xyz as bytes before version 3, or from packed words since then."""
+    """Restore quaternions ``[n,4]`` wxyz from their bytes, as :func:`_pack_rotations` packs them."""
     if version < 3:
         xyz = stored / 127.5 - 1
         w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
@@ -267,27 +269,27 @@ def _octave(size: float) -> int:
 
 
 def round_means(means: np.ndarray) -> np.ndarray:
-    """Return means ``[n,3]`` after rounding as in a ``.spz``."""
-    fraction = choose_fraction(means, FINE)
-    return to_float32(fix_means(means, fraction) / 2.0**fraction)
+    """Round means ``[n,3]`` as writing and reading a ``.spz`` does."""
+    fraction = choose_fraction(means, SCENE_BITS)
+    return to_float32(quantise_means(means, fraction) / 2.0**fraction)
 
 
-def choose_fraction(means: np.ndarray, fine: int) -> int:
-    """Choose how many bits of quantised means follow the binary point, by the scene's size and its farthest Gaussian.
+def choose_fraction(means: np.ndarray, scene_bits: int) -> int:
+    """Choose how many bits of quantised means follow the binary point.
 
-    ``fine``: number of bits of a position within the scene.
+    Means near the center of the scene then need ``scene_bits`` bits, or fewer if the farthest mean would overflow.
     """
     if not len(means):
         return 0
     size = np.median(reduce(np.maximum, (np.abs(axis - np.median(axis)) for axis in means.T)))
-    wanted_bits = fine - _octave(max(size, 1e-6))
+    wanted_bits = scene_bits - _octave(max(size, 1e-6))
     bits_without_overflow = _octave(LARGEST_POSITION / max(np.abs(means).max(), 1e-6))
     max_fraction = 23  # bits; a position has 24, one of them for its sign
     return int(np.clip(min(wanted_bits, bits_without_overflow), 0, max_fraction))
 
 
-def fix_means(means: np.ndarray, fraction: int) -> np.ndarray:
-    """Quantise means to whole numbers int32, of which ``fraction`` bits follow the binary point."""
+def quantise_means(means: np.ndarray, fraction: int) -> np.ndarray:
+    """Quantise means to fixed-point numbers int32 with ``fraction`` bits after the binary point."""
     return np.clip(np.round(means * 2.0**fraction), -LARGEST_POSITION, LARGEST_POSITION).astype("<i4")
 
 
@@ -299,8 +301,8 @@ def spz_columns(
     ``version``: 2 or 3. ValueError if there is NaN or inf.
     """
     means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
-    # Means that are not finite are refused below
-    fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], FINE)
+    # Means that are not finite raise an error below
+    fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], SCENE_BITS)
     header = Header(version, count, degree, fraction, MIP_FLAG * mip, 0)
     parts = tuple(np.empty((count, width), np.uint8) for width in header.widths)
     for start, columns in arrays.column_blocks(gaussians, max_degree):
@@ -311,7 +313,7 @@ def spz_columns(
 
 def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]:
     """Quantise a block of Gaussians to columns of bytes."""
-    fixed = fix_means(columns.means, header.fraction)
+    fixed = quantise_means(columns.means, header.fraction)
     return (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes for each coordinate
         arrays.to_bytes(255 * columns.opacities)[:, None],
@@ -323,7 +325,7 @@ def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]
 
 
 def _quantise_harmonics(harmonics: np.ndarray) -> np.ndarray:
-    """Quantise ``harmonics [n,num_higher,3]`` to bytes ``[n,3 num_higher]``; degree 1 in steps of 8, others of 16."""
+    """Quantise ``harmonics [n,num_higher,3]`` to bytes ``[n,3 num_higher]``, in steps of 8 (degree 1) or 16."""
     count, num_higher = harmonics.shape[:2]
     steps = np.where(np.arange(num_higher) < 3, 8, 16)[:, None]
     stepped = (np.round(np.clip(harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
@@ -333,8 +335,8 @@ def _quantise_harmonics(harmonics: np.ndarray) -> np.ndarray:
 def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
     """Pack unit quaternions ``[n,4]`` wxyz to bytes, which :func:`_read_rotations` unpacks.
 
-    Version 2 has a byte for each of x, y and z of the quaternion whose w is positive. Version 3 has a word. From its
-    highest bit on, it has the index of the largest of xyzw, then sign and magnitude of each other component.
+    Version 2 stores x, y and z as bytes, with signs for which w is positive. Version 3 stores a word. Its two highest
+    bits are the index of the largest of xyzw. The sign and magnitude of each other component follow.
     """
     if version < 3:
         return arrays.to_bytes(127.5 * (np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] + 1))
@@ -350,13 +352,13 @@ def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
 def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     """Encode a ``.spz`` file of version 3; ValueError if there is NaN or inf.
 
-    A comment may mark the Gaussians as antialiased, see :func:`gsmerge.io.formats.arrays.render_mode`.
+    ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
     return encode_contents(gaussians, Contents([gaussians], comments))
 
 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
-    """Encode a ``.spz`` file of the version that the options of the contents name; ValueError if there is NaN or inf.
+    """Encode a ``.spz`` file in the version of ``contents.options``; ValueError if there is NaN or inf.
 
     The file has no extensions, since three 0.187 and mkkellogg's viewer refuse bytes after the columns.
     """
@@ -370,8 +372,8 @@ def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
 def gzip_bytes(
     parts: Iterable[bytes | memoryview], *, level: int = 6, strategy: int = zlib.Z_DEFAULT_STRATEGY
 ) -> bytes:
-    """Compress parts to a gzip stream, whose bytes are equal at any time, on any system and in any Python version."""
-    packer, packed = zlib.compressobj(level, wbits=31, strategy=strategy), bytearray()  # writes no time into the header
+    """Compress parts to a gzip stream, without the time and the system, so that equal parts give equal bytes."""
+    packer, packed = zlib.compressobj(level, wbits=31, strategy=strategy), bytearray()  # zlib writes no time
     for part in parts:
         packed += packer.compress(part)
     packed += packer.flush()

@@ -1,8 +1,9 @@
 """Read and write levels of detail as Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format").
 
-The index ``lod-meta.json`` is a tree of boxes. A leaf names, for each level, a run of rows in a chunk. A chunk is an
-unzipped ``.sog`` in a folder of its own. A viewer loads the visible chunks at the level that suits their distance, and
-always shows the Gaussians of the ``environment``. PlayCanvas' splat-transform writes all these files.
+The index ``lod-meta.json`` is a tree of boxes. For each level of detail, a leaf names a run, which is a range of rows
+in a chunk. A chunk is an unzipped ``.sog`` in a folder of its own. A viewer loads the visible chunks at the level that
+suits their distance, and always shows the Gaussians of the ``environment``. PlayCanvas' splat-transform writes all
+these files.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
 from gsmerge.io.formats.read import GaussianFile, convert_files
-from gsmerge.io.formats.splat_transform import name_file, run_program
+from gsmerge.io.formats.splat_transform import blame_program, run_program
 from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply
 from gsmerge.types import Gaussians, StrPath
@@ -74,9 +75,10 @@ def write_levels(
 
 
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write the files of a Streamed SOG, as :data:`gsmerge.io.formats.table.WriteOutput`.
+    """Write the files of a Streamed SOG.
 
-    The path of a coarser level is the ``meta.json`` of its first chunk.
+    Arguments and result are those of :data:`gsmerge.io.formats.table.WriteOutput`. In the result, the path of a coarser
+    level is the ``meta.json`` of its first chunk.
     """
     with TemporaryDirectory(prefix="gsmerge-") as folder:
         arguments: list[object] = []
@@ -86,7 +88,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
         program_index = Path(folder) / "made" / INDEX
         iterations = 1  # of the program's fit of palettes; ten take four times as long, and renders are not better
         run_program(*arguments, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", iterations, program_index)
-        with name_file(path):
+        with blame_program(path):
             _name_by_content(program_index)
             levels = read_index(program_index).levels
         index.write_bytes(program_index.read_bytes())
@@ -97,10 +99,9 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
             temporaries = [add(target) for target in targets]
             for file, temporary in zip(files, temporaries, strict=True):
                 temporary.write_bytes(file.read_bytes())
-            if not written:  # the finest level
-                written[path] = [index, *temporaries]
-            else:
-                written[next(target for target in targets if target.name == sog.META)] = temporaries
+            is_finest = not written
+            level_path = path if is_finest else next(target for target in targets if target.name == sog.META)
+            written[level_path] = [index, *temporaries] if is_finest else temporaries
     return written
 
 
@@ -163,7 +164,7 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
 
 
 def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int], ...]:
-    """Return the chunks of each level with their numbers of Gaussians; errors as in :func:`_check_index`."""
+    """Return the chunks of each level with their numbers of Gaussians; :func:`_check_index` names the errors."""
     names = document["filenames"]
     max_levels = 64  # no real file has more than a dozen
     num_levels = check_whole(document["lodLevels"], "lodLevels", 1, max_levels)
@@ -180,7 +181,7 @@ def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int],
 
 
 def _chunk_path(index: Path, name: Any) -> Path:
-    """Return the path of a chunk that the ``index`` names; ValueError if it is outside the folder of the index."""
+    """Return the path of the chunk ``name`` of an index; ValueError if it is outside the folder of the index."""
     chunk = PurePosixPath(str(name))
     is_outside = chunk.is_absolute() or ".." in chunk.parts or "\\" in str(name) or "\0" in str(name)
     if is_outside or chunk.name != sog.META:
@@ -189,7 +190,7 @@ def _chunk_path(index: Path, name: Any) -> Path:
 
 
 def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the level of each run of rows, and the run, leaf by leaf; ValueError for an invalid node."""
+    """Yield each run of the tree, leaf by leaf, after its level; ValueError for an invalid node."""
     nodes = [tree]
     while nodes:
         node = nodes.pop()
@@ -205,9 +206,9 @@ def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _count_by_chunk(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
-    """Return the number of Gaussians of each chunk of a level; ValueError if its runs overlap or have gaps.
+    """Return the number of Gaussians in each chunk of a level; ValueError if its runs overlap or have gaps.
 
-    A run is a tuple of the index of its chunk, its first row, and its number of rows.
+    ``runs``: the index of the chunk, the first row, and the number of rows of each run.
     """
     counts: dict[Path, int] = {}
     for file, offset, count in sorted(runs):
@@ -247,9 +248,9 @@ def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> Ga
 
 
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
-    """Read chunks; SceneError if they take more memory than a file of all their bytes may take.
+    """Read chunks; SceneError if they take more memory than a file as large as all of them may take.
 
-    ``chunks``: path of each chunk -> its number of Gaussians by the index; None if the index does not say.
+    ``chunks``: path of each chunk -> the number of Gaussians that the index states for it, or None.
     """
     root, real_paths = os.path.realpath(path.parent), set[Path]()
     contents: list[sog.SogContent] = []
@@ -260,7 +261,7 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
             problem = f"{chunk}: expected a separate file inside the folder, found a link to another file"
             raise SceneError(path, problem, "export it again")
         real_paths.add(real_path)
-        contents.append(sog.read_unbundled(chunk))
+        contents.append(sog.read_unzipped(chunk))
         packed = contents[-1].packed
         if count not in (None, packed.count):
             problem = f"expected {count:,} Gaussians, as {INDEX} says, found {packed.count:,}"
@@ -272,15 +273,15 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
 
 
 def remove_unused_chunks(path: Path) -> None:
-    """Remove the chunks beside an index that it does not name, since they belong to an index that it replaced.
+    """Remove chunks in the folder of an index that it does not name, since they belong to an index that it replaced.
 
-    Other files in their folders stay. Chunks that cannot be removed are ignored.
+    Other files in the chunks' folders stay. A chunk that cannot be removed stays, too.
     """
-    used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
+    used_folders = {chunk.parent.name for level in read_index(path).levels for chunk in level}
     for folder in path.parent.iterdir():
         if (
             _CHUNK_NAME.fullmatch(folder.name)
-            and folder.name not in used
+            and folder.name not in used_folders
             and folder.is_dir()
             and not folder.is_symlink()
         ):

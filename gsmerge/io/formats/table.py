@@ -42,9 +42,9 @@ class Contents:
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
-# A function that writes an output. Its arguments are the function of :func:`gsmerge.io.atomic_outputs` that adds a
-# file, the path of the output, its temporary file, which exists, and the content. It returns the path of each level, in
-# order, with the temporary files of that level.
+# A function that writes the files of an output. Its arguments: the function of :func:`gsmerge.io.atomic_outputs` that
+# adds a temporary file, the path of the output, the temporary file of this path, and the content. It returns a
+# dictionary: path of each level of detail, finest first -> temporary files of the level.
 WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]]
 
 
@@ -52,45 +52,46 @@ WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]
 class Format:
     """A format of files of Gaussians: its ending, and how to read and write it.
 
-    All properties of a format that a run needs are here, so that a new format is one module and one row. Rows name most
-    functions by text, and these are imported at their first use. Writers that draw the scene are in higher layers.
+    All properties of a format that a run needs are here, so that a new format is one module and one row of the table.
+    The table names most functions by text, so that a module is imported when its function is first called. The writers
+    of pages are in another package, since they render the scene.
     """
 
     ending: str  # of names, in lower case; without a leading dot, it is the whole name of a folder's main file
     about: str  # description for people
     read: Callable[[Path], StoredRows] | None  # None: the format is only written
-    # Returns the bytes of one file of Gaussians with comments; None: :func:`gsmerge.io.write_ply` or ``write`` writes
+    # Returns the content of one file with Gaussians and comments; None: ``write_ply`` or ``write`` writes the file
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
     max_degree: int  # largest degree of harmonics that is written; -1: the format is only read
-    # Returns the bytes of one file that also depends on the content's views and options; None: ``encode`` is used
+    # Returns the content of one file if this also depends on cameras and options; None: ``encode`` returns it
     encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
     first_view: bool = False  # True: viewers look from its first camera, so one is placed if there is none
     beside: str = ""  # name of a file that is written beside an output; "": none
-    # Name of a file beside an output that tells viewers where to look first, with the output's {stem}; "": none
+    # Name of a file beside the output that says from where viewers look first. {stem} is the output's name without its
+    # ending. "": there is no such file
     settings: str = ""
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
     finish: Callable[[Path], object] = lambda _: None  # is called with the output's path after all files were renamed
-    holds: Callable[[Path], bool] | None = None  # returns whether a file with this ending has Gaussians; None: it has
+    holds: Callable[[Path], bool] | None = None  # returns whether a file of this name has Gaussians; None: each has
 
-    # Content of its files
-    # Levels of detail: "" for a single one, "apart" for a file for each, "inside" for all in one output
+    # How levels of detail are written: "" if only one can be, "apart" as a file for each, "inside" all in one output
     levels: Literal["", "apart", "inside"] = "apart"
     has_cameras: bool = False  # True: the cameras of views are inside the output, not in a file beside it
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as a file of the format does
     columns: bool = False  # whether the user can choose which of INRIA's columns a file has
     marks: Sequence[str] | None = ()  # comments of the input that a copy keeps; None: all of ``copied_comments``
-    most: float = math.inf  # most Gaussians that its public readers read
+    max_gaussians: float = math.inf  # most Gaussians that its public readers read
     # Note on harmonics that the format leaves out
-    lost: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
+    harmonics_note: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
 
-    # Bytes of a Gaussian for each degree of harmonics; those of packed formats are measured. Empty: budgets in bytes
-    # are refused
-    each: Sequence[float] = ()
-    rest: Callable[[], int] = lambda: 0  # returns the bytes of an output besides those of its Gaussians
-    # Returns the number of Gaussians for a number of bytes and a degree; None if the size depends on the content
+    # Bytes of a Gaussian with harmonics up to degree 0, 1, 2 and 3, which are measured for packed formats. Empty:
+    # budgets in bytes are refused
+    gaussian_bytes: Sequence[float] = ()
+    other_bytes: Callable[[], int] = lambda: 0  # returns the bytes of an output besides those of its Gaussians
+    # Returns how many Gaussians of a degree fit into a number of bytes; None if the size depends on their values
     count: Callable[[int, int], int] | None = None
-    # Returns the bytes of an output of Gaussians, cameras and comments; None: those that ``encode`` returns
+    # Returns the bytes of an output of Gaussians, cameras and comments; None: as many as ``encode`` returns
     measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None
 
     def names(self, path: StrPath) -> bool:
@@ -99,24 +100,24 @@ class Format:
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
     def settings_path(self, output: Path) -> Path | None:
-        """Return the path of the settings for viewers beside an output; None if viewers of this format read none."""
+        """Return the path of the file that says from where viewers look first; None if the format has none."""
         stem = output.name.removesuffix(self.ending)
         return output.with_name(self.settings.format(stem=stem)) if self.settings else None
 
     def beside_path(self, output: Path) -> Path | None:
-        """Return the path of the file that is always written beside an output; None if there is none."""
+        """Return the path of the file that this format always writes beside an output; None if it writes none."""
         return output.with_name(self.beside.format(stem=output.stem)) if self.beside else None
 
 
 _page = lazy_functions("gsmerge.pages")
-# Bytes of a Gaussian with harmonics of degree 0 to 3
+# Bytes of a Gaussian with harmonics up to degree 0, 1, 2 and 3
 _SPZ = 17.0, 18.5, 18.9, 19.2
 _SOG = 13.0, 22.0, 36.5, 56.5
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
-    each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True, marks=None,
-    lost="harmonics above degree {degree} are left out, since few programs read a .ply with them",
+    gaussian_bytes=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True, marks=None,
+    harmonics_note="harmonics above degree {degree} are left out, since few programs read a .ply with them",
 )  # fmt: skip
 LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
@@ -127,49 +128,57 @@ LEVELS = Format(
 TILESET = Format(
     "tileset.json", "3D Tiles for Cesium: a .spz in a .glb beside it", _lazy("tileset.read_rows"), None, 3,
     holds=Path.is_file, write=_lazy("tileset.write_output"), levels="",
-    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), most=10_000_000, beside="tileset.glb",
-    each=_SPZ, rest=_lazy("tileset.most_other_bytes"), measure=_lazy("tileset.most_bytes"),
+    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), max_gaussians=10_000_000, beside="tileset.glb",
+    gaussian_bytes=_SPZ, other_bytes=_lazy("tileset.most_other_bytes"), measure=_lazy("tileset.most_bytes"),
 )  # fmt: skip
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
     write=_page("site.write_output"), levels="", has_cameras=True, round_means=_lazy("sog.round_means"),
-    each=tuple(_IN_TEXT * sog_bytes for sog_bytes in _SOG), rest=_page("site.least_bytes"),
+    gaussian_bytes=tuple(_IN_TEXT * sog_bytes for sog_bytes in _SOG), other_bytes=_page("site.least_bytes"),
     measure=_page("site.measure"),
 )  # fmt: skip
 FILES = (  # the first ending that matches counts, so .compressed.ply comes before .ply
     Format(
-        ".compressed.ply", "PlayCanvas' packed .ply", ply.read_rows, None, -1, each=(16.3, 25.3, 40.4, 61.4),
+        ".compressed.ply", "PlayCanvas' packed .ply", ply.read_rows, None, -1, gaussian_bytes=(16.3, 25.3, 40.4, 61.4),
     ),
     PLY,
     Format(
         ".spz", "Niantic's format; written as version 3 or 2", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
-        encode_contents=_lazy("spz.encode_contents"), most=10_000_000, each=_SPZ,
+        encode_contents=_lazy("spz.encode_contents"), max_gaussians=10_000_000, gaussian_bytes=_SPZ,
         round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,),
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,
-        each=_SOG, round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
+        gaussian_bytes=_SOG, round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
         first_view=True, settings="{stem}.settings.json",
     ),
-    Format(".splat", "antimatter15's format", _lazy("splat.read_rows"), _lazy("splat.splat_bytes"), 0, each=(32.0,)),
+    Format(
+        ".splat", "antimatter15's format", _lazy("splat.read_rows"), _lazy("splat.splat_bytes"), 0,
+        gaussian_bytes=(32.0,),
+    ),
     Format(
         ".glb", "binary glTF with KHR_gaussian_splatting", _lazy("glb.read_rows"), _lazy("glb.glb_bytes"), 3,
         encode_contents=_lazy("glb.encode_contents"), first_view=True, holds=_lazy("glb.holds_gaussians"),
-        each=(52.1, 88.1, 148.1, 232.2),
+        gaussian_bytes=(52.1, 88.1, 148.1, 232.2),
     ),
 )  # fmt: skip
 STATE = Format(
-    STATE_ENDING, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
+    STATE_ENDING,
+    "batches of views: Gaussians, cameras and pictures",
+    _lazy("gsm.read_rows"),
+    None,
+    -1,
+    gaussian_bytes=(56.0,),
 )
 META = "meta.json"  # name of the main file of a .sog that is a folder
 SOG_FOLDER = Format(
-    META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_folder"),
+    META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_sog_meta"),
 )  # fmt: skip
 FORMATS = (*FILES, HTML, LEVELS, TILESET, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 # Endings of results that a page shows
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)
-# Endings of files that may hold no Gaussians; models write cameras and depth maps into .npz
+# Endings of files that may hold something else than Gaussians, such as a .npz of cameras and depth maps
 SEVERAL_USES = (".npz", *(row.ending for row in FORMATS if row.holds))
 READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FILES if row.read is not None))
@@ -182,7 +191,7 @@ def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
     """
     if format_.count is not None:
         return format_.count(max_bytes, sh_degree)
-    gaussian_bytes, fixed_bytes = format_.each[min(sh_degree, len(format_.each) - 1)], format_.rest()
+    gaussian_bytes, fixed_bytes = format_.gaussian_bytes[: sh_degree + 1][-1], format_.other_bytes()
     if max_bytes < fixed_bytes + gaussian_bytes:
         viewer = f"{fixed_bytes / 1e6:.2f} MB for the viewer of a page and " if fixed_bytes else ""
         problem = f"expected at least {viewer}{gaussian_bytes:.0f} bytes for one Gaussian"
@@ -193,20 +202,20 @@ def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
 def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
     """Estimate the number of Gaussians in all files, and the largest number of columns ``f_rest_*`` in any file.
 
-    The header of a ``.ply`` states both exactly; if the file is too short for that, it counts as empty. A file of
-    another format is judged by its size alone, and a file that cannot be read counts as empty.
+    The numbers of a ``.ply`` are those in its header. Files of other formats are judged by their size. A file counts as
+    empty if it cannot be read, or if it is too short for the rows in its header.
     """
     counts = [
-        ply.header_counts(path, check_size=True) if find_format(path).read is ply.read_rows else _by_bytes(path)
+        ply.header_counts(path, check_size=True) if find_format(path).read is ply.read_rows else _count_by_size(path)
         for path in paths
     ]
     return sum(count for count, _ in counts), max((rest for _, rest in counts), default=0)
 
 
-def _by_bytes(path: Path) -> tuple[int, int]:
-    """Estimate the number of Gaussians of a file by its size, as if they had degree 0; the second number is 0."""
+def _count_by_size(path: Path) -> tuple[int, int]:
+    """Estimate the number of Gaussians of a file by its size, as if they had degree 0; also return 0 ``f_rest_*``."""
     try:
-        return int(path.stat().st_size / (find_format(path).each or (math.inf,))[0]), 0
+        return int(path.stat().st_size / (find_format(path).gaussian_bytes or (math.inf,))[0]), 0
     except OSError:
         return 0, 0
 
@@ -217,7 +226,10 @@ def find_format(path: StrPath) -> Format:
 
 
 def may_hold_gaussians(path: Path) -> bool:
-    """Return whether a file may hold Gaussians, by its ending, and by its content if the ending has other uses."""
+    """Return whether a file may hold Gaussians.
+
+    The ending decides. If files with this ending may hold something else, the content decides.
+    """
     holds = find_format(path).holds
     return (holds is None and path.suffix.lower() in SCENE_SUFFIXES) or (holds is not None and holds(path))
 
@@ -225,16 +237,16 @@ def may_hold_gaussians(path: Path) -> bool:
 def output_format(path: StrPath, *, alone: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``alone``: allow only formats of a single file with Gaussians alone: no index with files beside it, and no page.
+    ``alone``: refuse pages, and formats with an index and files beside it.
     """
-    by_name = next((row for row in FORMATS if row.names(path)), None)
-    if alone and by_name is not None and (by_name.has_cameras or by_name.ending[0] != "."):
-        by_name = None
-    if by_name is None or by_name.max_degree < 0:
-        read_only = "" if by_name is None else f"{by_name.ending} can be read but not written; "
+    format_ = next((row for row in FORMATS if row.names(path)), None)
+    if alone and format_ is not None and (format_.has_cameras or format_.ending[0] != "."):
+        format_ = None
+    if format_ is None or format_.max_degree < 0:
+        read_only = "" if format_ is None else f"{format_.ending} can be read but not written; "
         pages = [row.ending for row in FORMATS if row.has_cameras and row.ending[0] == "."]
         endings = join_words(OUTPUT_FORMATS if alone else (*OUTPUT_FORMATS, *pages))
         others = "" if alone else f", or the name {INDEX} or {TILESET.ending}, or a folder"
         raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{others}")
-    by_name.require()
-    return by_name
+    format_.require()
+    return format_

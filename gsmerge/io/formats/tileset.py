@@ -1,8 +1,8 @@
 """Read and write 3D Tiles 1.1 for Cesium: a ``tileset.json`` with one tile, which is a ``.glb`` with a ``.spz`` inside.
 
-The ``.glb`` uses ``KHR_gaussian_splatting_compression_spz_2``, which Cesium requires. A node turns the axes of the
-``.spz`` to those of glTF, and Cesium turns y up to z up. The index adds half a turn, so that x points east, z north and
--y up on the globe.
+The ``.glb`` uses ``KHR_gaussian_splatting_compression_spz_2``, which Cesium requires. A node of the ``.glb`` rotates
+the axes of the ``.spz`` to those of glTF, with y up. Cesium rotates them to z up. The index adds half a turn. On the
+globe, the axes x, y and z of the ``.spz`` then point east, down and north.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  #
 
 
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write the files of a tileset, as :data:`gsmerge.io.formats.table.WriteOutput`."""
+    """Write the files of a tileset; arguments and result are those of :data:`gsmerge.io.formats.table.WriteOutput`."""
     tile = path.with_name(TILESET.beside)
-    # The bounds include the means between these percentiles, since a few far Gaussians would make the scene look small
+    # The bounds are these percentiles of the means, since a few far Gaussians would make the scene look small
     percentiles = 1, 99
     file, low, high = add(tile), *np.percentile(contents.levels[0].means.astype(np.float64), percentiles, axis=0)
     file.write_bytes(_tile_bytes(contents, low, high))
-    turn = matmul(_Z_UP, HALF_TURN)[:3, :3]
-    halves = np.diag(np.abs(matmul(turn, (high - low)[:, None] / 2))[:, 0])
-    box = [*matmul(turn, (low + high)[:, None] / 2)[:, 0].tolist(), *halves.reshape(-1).tolist()]
+    to_z_up = matmul(_Z_UP, HALF_TURN)[:3, :3]
+    half_edges = np.diag(np.abs(matmul(to_z_up, (high - low)[:, None] / 2))[:, 0])
+    box = [*matmul(to_z_up, (low + high)[:, None] / 2)[:, 0].tolist(), *half_edges.reshape(-1).tolist()]
     place = contents.options.place
     root = {"boundingVolume": {"box": box}, "geometricError": 0, "refine": "REPLACE", "content": {"uri": tile.name}}
-    # The half turn lets photos look north
-    on_globe = matmul(np.eye(4) if place is None else globe_matrix(place), HALF_TURN)
-    root["transform"] = on_globe.T.reshape(-1).tolist()
+    # After half a turn, z points north
+    to_globe = matmul(np.eye(4) if place is None else globe_matrix(place), HALF_TURN)
+    root["transform"] = to_globe.T.reshape(-1).tolist()
     extensions = {"extensionsUsed": [NAME, COMPRESSED], "extensionsRequired": [NAME, COMPRESSED]}
     document = {
         "asset": {"version": "1.1", "generator": "gsmerge"},
         "extensionsUsed": ["3DTILES_content_gltf"],
         "extensions": {"3DTILES_content_gltf": extensions},
-        "geometricError": float(np.abs(high - low).max()),  # an empty picture is wrong by the size of the scene
+        "geometricError": float(np.abs(high - low).max()),  # without the tile, a picture lacks the whole scene
         "root": root,
     }
     index.write_text(json.dumps(document), encoding="utf-8")
@@ -66,23 +66,27 @@ def read_rows(path: Path) -> StoredRows:
     try:
         root = document["root"]
         name = PurePosixPath(root["content"]["uri"])
-        is_one = not root.get("children") and name.suffix == ".glb" and len(name.parts) == 1
-        placed = [PLACED] * any(root.get("transform", [])[12:15])
+        has_one_tile = not root.get("children") and name.suffix == ".glb" and len(name.parts) == 1
+        is_placed = any(root.get("transform", [])[12:15])  # translation to a place on the globe
     except (LookupError, TypeError, AttributeError):
-        is_one = False
-    if not is_one:
+        has_one_tile = False
+    if not has_one_tile:
         raise SceneError(path, "expected a tileset with one tile, a .glb beside it, found another", "name its tiles")
     rows = glb.read_rows(path.with_name(name.name))
-    return replace(rows, bytes_beside=path.with_name(name.name).stat().st_size, notes=(*rows.notes, *placed))
+    return replace(
+        rows,
+        bytes_beside=path.with_name(name.name).stat().st_size,
+        notes=(*rows.notes, *([PLACED] if is_placed else [])),
+    )
 
 
 def most_other_bytes() -> int:
-    """Return the largest number of bytes that a tileset has besides those of its ``.spz``."""
+    """Return the largest number of bytes that a tileset may have besides its ``.spz``."""
     return REST
 
 
 def most_bytes(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
-    """Return the largest number of bytes that a tileset of these Gaussians has at any place on the globe."""
+    """Return the largest number of bytes that a tileset of these Gaussians may have, wherever it is placed."""
     return len(_tile_bytes(Contents([gaussians], comments, cameras), np.zeros(3), np.zeros(3))) + REST
 
 
@@ -92,6 +96,7 @@ def _tile_bytes(contents: Contents, low: np.ndarray, high: np.ndarray) -> bytes:
     num_harmonics = (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2
     names = ["POSITION", "COLOR_0", f"{NAME}:ROTATION", f"{NAME}:SCALE", *HARMONICS[1:num_harmonics]]
     accessors: list[dict[str, Any]] = [{"componentType": 5126, "type": "VEC3", "count": len(gaussians)} for _ in names]
+    # glTF requires the bounds of positions. The component types are 5126 for float32 and 5121 for uint8
     accessors[0] |= {"min": low.tolist(), "max": high.tolist()}
     accessors[1] |= {"componentType": 5121, "type": "VEC4", "normalized": True}
     accessors[2]["type"] = "VEC4"
@@ -109,9 +114,9 @@ def _tile_bytes(contents: Contents, low: np.ndarray, high: np.ndarray) -> bytes:
 
 
 def globe_matrix(place: str) -> np.ndarray:
-    """Return the matrix ``[4,4]`` from a local frame (east, north, up, metres) to the earth's, EPSG 4978.
+    """Return the matrix ``[4,4]`` from the frame of a place (east, north, up, metres) to the earth's, EPSG 4978.
 
-    ``place``: longitude and latitude in degrees and height in metres above the ellipsoid, separated by commas.
+    ``place``: longitude and latitude in degrees, and height in metres above the ellipsoid, separated by commas.
     """
     longitude, latitude, height = parse_place(place)
     angles = np.radians([longitude, latitude])

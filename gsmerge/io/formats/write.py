@@ -16,42 +16,51 @@ from gsmerge.values.arguments import check_arguments
 
 
 def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
-    """Note if the format of a path leaves out harmonics, or if its readers do not read so many Gaussians.
+    """Note if the format of a path leaves out harmonics, or if its public readers refuse ``count`` Gaussians.
 
-    UsageError if no format has the ending.
+    UsageError if no format has the ending of the path.
     """
     format_, notes = output_format(path), list[str]()
     if sh_degree > format_.max_degree:
-        notes.append(format_.lost.format(ending=format_.ending, degree=format_.max_degree))
-    if count > format_.most:
-        problem = f"public readers of {format_.ending} stop at {format_.most:,} Gaussians"
+        notes.append(format_.harmonics_note.format(ending=format_.ending, degree=format_.max_degree))
+    if count > format_.max_gaussians:
+        problem = f"public readers of {format_.ending} stop at {format_.max_gaussians:,} Gaussians"
         notes.append(f"{problem}: write a .ply or .sog, or fewer")
     return notes
 
 
 def level_output(output: Path, level: int) -> Path:
-    """Return the path of a coarser level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
+    """Return the path of a coarser level of detail, such as ``out.level1.ply`` for level 1 of ``out.ply``."""
     stem_length = len(output.name) - len(output_format(output, alone=True).ending)
     return output.with_name(f"{output.name[:stem_length]}.level{level}{output.name[stem_length:]}")
 
 
 def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write each level to a separate file, as :data:`gsmerge.io.formats.table.WriteOutput`."""
+    """Write each level of detail to a separate file.
+
+    Arguments and result are those of :data:`gsmerge.io.formats.table.WriteOutput`.
+    """
     written, format_ = {path: [temporary]}, output_format(path, alone=True)
-    ending = format_.ending
     for level in range(1, len(contents.levels)):
         written[level_output(path, level)] = [add(level_output(path, level))]
-    if ending == PLY.ending and contents.extra_columns is not None:
-        (gaussians,), extra = contents.levels, contents.extra_columns
+    if format_ is PLY and contents.extra_columns is not None:
+        (gaussians,) = contents.levels  # additional columns belong to the rows of one level
         degree = min(gaussians.sh_degree, PLY.max_degree)
-        _write_ply(temporary, gaussians, True, degree, contents.comments, contents.options.normals, extra)
+        _write_ply(
+            temporary, gaussians, True, degree, contents.comments, contents.options.normals, contents.extra_columns
+        )
         return written
     for (file,), gaussians in zip(written.values(), contents.levels, strict=True):
         if format_.encode_contents is not None:
             file.write_bytes(format_.encode_contents(gaussians, contents))
             continue
         write_gaussians(
-            file, gaussians, overwrite=True, comments=contents.comments, ending=ending, normals=contents.options.normals
+            file,
+            gaussians,
+            overwrite=True,
+            comments=contents.comments,
+            ending=format_.ending,
+            normals=contents.options.normals,
         )
     return written
 
@@ -77,7 +86,7 @@ def write_gaussians(
         overwrite: Replace an existing file.
         comments: Lines for the header of a ``.ply``; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
         ending: Ending of the format to write, instead of that of the name.
-        normals: Columns of a ``.ply``, as in :func:`write_ply`.
+        normals: Write the columns of normals to a ``.ply``, as :func:`write_ply` does.
 
     Raises:
         UsageError: If the ending is unknown.

@@ -12,7 +12,7 @@ from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.left_out import LEAST_VIEWS, choose_left_out, leave_out, mark_seen, mean_seen
 from gsmerge.compaction.new_views import OWN, SPREAD, NewViews, Trial, shrink_scene
 from gsmerge.facts.prepare import prepare
-from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_new_views
+from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_expected_scores
 from gsmerge.pages.page import describe_gain
 from gsmerge.photos.views import subset
 from gsmerge.settings.stages import PrepareOptions
@@ -146,7 +146,7 @@ def test_small_scenes_keep_places_and_what_they_show(room: Scene) -> None:
 @pytest.mark.parametrize("scores", [(17.25, 21.5, 3.0, 5.5), (-1.5, 0.0, 0.2, 2.75), (30.12, 29.99, -1.4, 1.1)])
 def test_files_say_what_to_expect(scores: tuple[float, ...]) -> None:
     comment = new_views_comment(ExpectedScores(*scores))
-    assert read_new_views(["a comment", 3, comment]) == ExpectedScores(*scores)
+    assert read_expected_scores(["a comment", 3, comment]) == ExpectedScores(*scores)
     assert comment not in copied_comments([comment])  # a result of a result gets its own
 
 
@@ -161,8 +161,8 @@ def test_files_say_what_to_expect(scores: tuple[float, ...]) -> None:
     ],
 )
 def test_other_comments_say_nothing(comment: object) -> None:
-    assert read_new_views([comment]) is None
-    assert read_new_views([]) is None
+    assert read_expected_scores([comment]) is None
+    assert read_expected_scores([]) is None
 
 
 @pytest.mark.parametrize(
