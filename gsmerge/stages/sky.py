@@ -53,7 +53,7 @@ def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict
     skies = {
         view: region
         for view, region in candidates.items()
-        if _pales_downwards(photos[view], region) or _is_far(means, cameras[[view]], region)
+        if _pales_downwards(photos[view], region) or _is_farther_than_rest(means, cameras[[view]], region)
     }
     return skies if len(skies) >= max(LEAST_SKY_VIEWS, LEAST_SKY_SHARE * len(photos)) else {}
 
@@ -72,7 +72,7 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
     return np.asarray((inside > 0) & (inside >= min_share * total))
 
 
-def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
+def _is_farther_than_rest(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
     """Return true if a region ``[h,w]`` of a picture is several times as far away as the rest, by median depth."""
     (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // SKY_GAUSSIANS))], camera)
     inside = (depths > 0) & is_inside(pixels, camera)
