@@ -26,9 +26,8 @@ _region_sums = declare(
 def region_sums(labels, pixels, depths, count, rows):
     """Describe the regions of padded labels in the first ``count`` rows, and return their colour error.
 
-    ``rows`` are ``[2·count,20]``, to have room for merged regions.
-
-    Pixels with a depth of 0 do not count. The coordinates x and y of planes are relative to the middle of the view.
+    ``rows`` are ``[2·count,20]``, to have room for merged regions. Pixels with a depth of 0 do not count. The
+    coordinates x and y of planes are relative to the middle of the view.
     """
     squares = np.empty(1)
     _region_sums(labels, pixels, depths, rows, np.empty((count, 4), np.int32), squares)

@@ -1,4 +1,4 @@
-"""Measure how much each pixel resembles a corner, choose seeds of superpixels by this, and grow regions around seeds."""
+"""Measure how much each pixel resembles a corner, choose seeds of superpixels by this, and grow regions from them."""
 
 from __future__ import annotations
 
