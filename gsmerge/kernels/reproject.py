@@ -31,7 +31,7 @@ _see_points = declare(
 
 
 def see_points(points, viewmats, Ks, depths, width, height, near, behind):
-    """Return two masks ``[v,n]`` of the ``points [n,3]`` that are inside the picture of each camera, and that it sees.
+    """Return a mask ``[v,n]`` of ``points [n,3]`` inside the picture of each camera, and one of those that it sees.
 
     A point is inside only if its depth is more than ``near``. It is seen if its depth is at most ``behind`` times the
     depth of the surface there. ``depths [v,lines,columns]`` are these depths in a grid of cells over each picture.

@@ -42,12 +42,12 @@ class Argument:
         code: NumPy's name of the type.
         shape: Sizes of the array's axes, as numbers or names. A name stands for the same size in all arguments.
         least: Smallest allowed value.
-        below: Number above the largest allowed value.
+        below: Least number above all allowed values.
         most: Largest allowed value.
         ascending: True if no value may be smaller than the value before it.
         out: True if the function writes the array.
-        optional: True if None is allowed, which becomes a null pointer. Another argument must use each name in its
-            shape.
+        optional: True if None is allowed, which becomes a null pointer. Each name in its shape is also in the shape of
+            another argument.
     """
 
     code: str
@@ -72,7 +72,7 @@ class Argument:
 
     @cached_property
     def span(self) -> tuple[int, int]:
-        """The smallest and the largest integer that the type allows, and those limits that are numbers."""
+        """The smallest and the largest integer within the type and within those limits that are numbers."""
         limits = np.iinfo(self.dtype)
         most = self.below - 1 if isinstance(self.below, int) else self.most
         return (
@@ -155,7 +155,7 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
         return None if returns is STATUS else result
 
     def prepare(*values: Any) -> Callable[[], None]:
-        """Check arguments once, and return a function that makes the call with them while they are in memory."""
+        """Check arguments once, and return a function that makes the call. The caller keeps the arrays in memory."""
         sizes: dict[str, int] = {}
         passed = convert(values, sizes)
         passed += [sizes.get(key, 0) for key in names]
@@ -197,7 +197,7 @@ class FilledTable:
             self[key] = size
 
     def point(self, key: str, array: np.ndarray[Any, Any]) -> None:
-        """Let the struct point to an array of the sizes of the one before, or raise ValueError for other sizes."""
+        """Let the struct point to another array, or raise ValueError if its sizes differ from those before."""
         self[key] = _convert(self.table.name, key, self.table.arrays[key], array, self._sizes)
         self.arrays[key] = array
 

@@ -277,7 +277,7 @@ def run_heads(
     count, halves = len(group_features.features), options.max_children > SLOTS[-1]
     starts, sizes, owners = _split_siblings(parents, count, halves=halves)
     # The outputs begin with a row of zeros, for children without a head
-    outputs, output_rows, total = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
+    outputs, output_rows, num_outputs = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
     for slots, min_size in zip(SLOTS, (1, 2, 3), strict=True):  # the heads and their least numbers of children
         rows = np.flatnonzero((sizes >= min_size) & (sizes <= slots))
         if len(rows) == 0:
@@ -286,8 +286,8 @@ def run_heads(
         mask = offsets < sizes[rows, None]
         ids = starts[rows, None] + np.where(mask, offsets, 0)
         outputs.append(_run_head(children, owners[rows], ids, mask, group_features, context))
-        output_rows[ids[mask]] = total + np.flatnonzero(mask)
-        total += mask.size
+        output_rows[ids[mask]] = num_outputs + np.flatnonzero(mask)
+        num_outputs += mask.size
     return scale_outputs(
         concat_rows(outputs)[output_rows], ABSOLUTE_BOUNDS if options.makes_children else options.bounds
     )

@@ -49,7 +49,7 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | PathLike[str], networks: NetworkWeights, training: Mapping[str, Any]) -> None:
-    """Write networks and facts about their training to a file, which may exist, or raise SceneError."""
+    """Write networks and facts about their training to a file, which may exist. Raises SceneError if that fails."""
     header = {"schema": SCHEMA, "gsmerge": __version__, "options": asdict(networks.options), "training": dict(training)}
     with atomic_output(path, overwrite=True) as temporary:
         temporary.write_bytes(

@@ -19,8 +19,7 @@ NEAR_LOG = 0.03  # largest difference of the logarithms of two depths on the sam
 FAR_LOG = 0.3  # differences of the logarithms of depths are clipped to at most this
 MIN_SURFACE_OPACITY = 1 / 255  # a fainter Gaussian is no surface
 STATS_ROWS = 8192  # points per task
-# The search for neighbours compares MAX_COMPARED points for each wanted neighbour, of which it counts at least
-# MIN_NEIGHBORS
+# The search compares MAX_COMPARED points for each wanted neighbour, or for MIN_NEIGHBORS neighbours if fewer are wanted
 MAX_COMPARED, MIN_NEIGHBORS = 64, 16
 
 
@@ -48,7 +47,7 @@ def cross_view_stats(
     neighbors = np.sort(order_others(camera_distances(cameras))[:, :most], 1).astype(np.int32)
 
     def add_sums(begin: int) -> None:
-        """Add up the comparisons of the points from ``begin`` on with all views in ``sums``."""
+        """Compare the points from ``begin`` on with the views, and add the results to ``sums``."""
         end = min(begin + STATS_ROWS, len(points))
         sum_cross_view(
             points, colors, views, neighbors, viewmats, Ks, *size, m.fronts, m.means, m.opacities, m.sh0, *limits,
@@ -68,8 +67,8 @@ def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> 
 
     The finite points ``means [g,3]`` float64 belong to ``views [g]``. A view below 0 differs from all others. Rows with
     fewer than ``count`` points end with -1. The search for a point ends after ``MAX_COMPARED`` times ``count``
-    comparisons, at least 1,024. Most are with points of its own view, and Gaussians farther away do not overlap. The
-    paper matches such neighbours in section 4.4.
+    comparisons, at least 1,024. Most of the compared points are of its own view, and Gaussians farther away do not
+    overlap. The paper matches such neighbours in section 4.4.
     """
     num = len(means)
     neighbors, means = np.empty((num, count), np.int64), np.ascontiguousarray(means)

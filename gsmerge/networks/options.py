@@ -73,7 +73,10 @@ class NetworkOptions(Settings):
 
     @property
     def reads_children(self) -> bool:
-        """True if heads read the Gaussians that they correct. For absolute outputs these tell only the group's size."""
+        """True if heads read the Gaussians that they correct.
+
+        With absolute outputs, these Gaussians tell only the group's size.
+        """
         return self.group_numbers or not self.makes_children
 
     @property

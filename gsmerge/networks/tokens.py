@@ -50,9 +50,9 @@ def describe_features(
     """
     bare = make_group_features(features, views, np.zeros((len(features), GROUP_COLUMNS), np.float32), cameras)
     base, group = bare.base, np.empty((len(features), GROUP_COLUMNS), np.float32)
-    sums = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
+    columns = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
     describe_groups(
-        base.means, base.scales, base.opacities, base.sh0, *sums, num_members, bare.footprints,
+        base.means, base.scales, base.opacities, base.sh0, *columns, num_members, bare.footprints,
         bare.frames, bare.sizes, _viewmats(cameras), views, group,
     )  # fmt: skip
     group[:, GROUP_COLUMNS - NUM_STATS :] = np.nan_to_num(stats)
@@ -164,9 +164,9 @@ def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.nd
     order = np.lexsort((keys, np.repeat(np.arange(len(sizes)), sizes)))
     slots = np.arange(width)[None]
     large = (sizes > width)[:, None]
-    low = slots * sizes[:, None] // width
-    high = (slots + 1) * sizes[:, None] // width
-    draws = low + np.floor(hash_uniform(seeds[:, None], slots.astype(np.uint64)) * (high - low)).astype(np.int64)
+    run_starts = slots * sizes[:, None] // width
+    run_sizes = (slots + 1) * sizes[:, None] // width - run_starts
+    draws = run_starts + np.floor(hash_uniform(seeds[:, None], slots.astype(np.uint64)) * run_sizes).astype(np.int64)
     within = np.where(large, draws, np.minimum(slots, sizes[:, None] - 1))
     mask = large | (slots < sizes[:, None])
     return order[offsets[:, None] + np.where(mask, within, 0)], mask

@@ -50,7 +50,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_images: Tensor, grad_alphas: Tensor, *_: Tensor) -> tuple[Any, ...]:
-        """Return the gradients of the arguments of :meth:`forward`, summed over the views, and None without one."""
+        """Return the gradients of the arguments of :meth:`forward`, summed over the views, and None for the others."""
         *tensors, images, alphas = ctx.saved_tensors
         transmittances = 1 - alphas[..., 0]
         totals = [np.zeros(tensor.shape, np.float32) for tensor in tensors[:-1]]

@@ -17,8 +17,8 @@ from gsmerge.kernels.raster.project import BLOCK, POSE, SUMS, project_backward
 from gsmerge.raster.tiled_view import Array, TiledView, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-# Least number of intersections or Gaussians per thread. That of the forward pass is higher, since it takes less time
-# for each
+# Least number of intersections or Gaussians per thread. The forward pass has a higher number, because it takes less
+# time for each of them
 MIN_PER_THREAD = 1 << 12
 
 
@@ -147,8 +147,8 @@ def pose_gradient(tiled: TiledView, gradients: Gradients, color_grads: ColorGrad
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
     if color_grads is not None:
-        # The eye is -R^T t. Only its position relative to the means counts, so its gradient is minus the sum of the
-        # means' gradients
+        # The eye is -R^T t. Only the position of the eye relative to the means counts, so its gradient is minus the sum
+        # of the gradients of all means
         eye = -color_grads.means.sum(0, dtype=np.float64)
         viewmat[:3, :3] -= np.outer(tiled.viewmat[:3, 3], eye)
         viewmat[:3, 3] -= matmul(tiled.viewmat[:3, :3], eye)

@@ -55,7 +55,7 @@ def psnr_within(image: Array, reference: Array, masks: Sequence[Array | None]) -
 
 def _select(values: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     """Return the values ``[m,c]`` of the pixels in ``mask [h,w]``, or all values ``[h,w,c]`` without a mask."""
-    # NumPy's compress takes a third of the time of an index that is a mask
+    # compress takes a third of the time that indexing by a mask takes
     return values if mask is None else values.reshape(-1, values.shape[2]).compress(mask.reshape(-1), 0)
 
 

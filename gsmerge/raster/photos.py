@@ -23,8 +23,8 @@ Score = TypeVar("Score")
 
 LEAST_OPACITY = 1 / 255  # rasterizers draw no smaller opacity
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
-# Most Gaussians of which several views are rendered at once, since a tiled view takes about as much memory as the
-# Gaussians. With more, all threads share one view
+# Scenes of more Gaussians than this are rendered view by view, because a tiled view takes about as much memory as the
+# Gaussians. Then all threads share one view
 ERRORS_ONE_AT_A_TIME = 400_000
 # Scored tiles are shifted by TILE_STEP columns, a prime, from one line of tiles to the next. At least LEAST_TILES of a
 # view are scored, so small views are scored whole. With 48 tiles, a PSNR gain on six views of 256 x 480 pixels seemed
@@ -113,7 +113,7 @@ class Photos:
     def image(self, view: int, background: np.ndarray | None = None, sample: Sample = WHOLE_PHOTO) -> np.ndarray:
         """Return the photo ``[h,w,3]`` of a view, sRGB in [0, 1], or a sample of its pixels.
 
-        A ``background [3]`` is added where the photo is transparent, as ``empty`` says.
+        Where ``empty`` is above 0, a ``background [3]`` shows through.
         """
         image = self.images[view][sample.pixels]
         image = np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
@@ -303,7 +303,7 @@ def _scored_pixels(photos: Photos, view: int, every: int) -> np.ndarray | None:
     """Return the mask ``[h,w]`` of the pixels that are scored, or None for all pixels.
 
     Pixels are scored inside the photo's mask and inside the scored tiles. If there are none, all pixels of the photo's
-    mask are scored. If the photo's mask is empty, all pixels of the scored tiles are.
+    mask are scored. If the photo's mask is empty, all pixels of the scored tiles are scored.
     """
     tiles = scored_tiles(view, photos.width, photos.height, every)
     in_tiles = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]

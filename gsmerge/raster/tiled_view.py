@@ -150,8 +150,8 @@ def camera_numbers(
 def _corner_sums(tiles: Array, tile_height: int, tile_width: int) -> Array:
     """Count, for each corner of a tile, the True ``tiles`` above and to its left.
 
-    From the counts at four corners follows whether a box contains a True tile. Returns ``[tile_height+1,tile_width+1]``
-    int32. Raises ValueError if ``tiles`` have another shape.
+    The counts at the four corners of a box tell whether it contains a True tile. Returns
+    ``[tile_height+1,tile_width+1]`` int32. Raises ValueError if ``tiles`` have another shape.
     """
     if tiles.shape != (tile_height, tile_width):
         raise ValueError(f"tiles: expected shape {[tile_height, tile_width]}, got {list(tiles.shape)}")
@@ -164,7 +164,7 @@ def _find_visible(
     """Return the ascending ids of the Gaussians that may touch the image or, with ``corner_sums``, its chosen tiles."""
 
     def cull(span: tuple[int, int]) -> Array:
-        """Return such ids from a range of Gaussians."""
+        """Return the ids of such Gaussians from a range of rows."""
         rows, ids = slice(*span), np.empty(span[1] - span[0], np.int32)
         keep_rows = None if keep is None else keep[rows]
         count = projection.cull(
@@ -211,7 +211,7 @@ def _list_by_tile(order: Array, boxes: Array, conics: Array, wanted: Array, thre
     Returns all lists in one array, and their starts. Only ``wanted [tile_height,tile_width]`` tiles get a list, except
     in crowded views, see :func:`hides_most`, where all tiles get a list.
     """
-    # Boxes are sorted first, as one number each, since the loops below would wait for every box elsewhere in memory
+    # Boxes are sorted first, each as one number, because the loops below read neighbours in memory faster
     boxes = boxes.view(np.uint64).reshape(-1).take(order).view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], *wanted.shape), spans))
@@ -269,7 +269,7 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
 def _convert_for_kernels(splats: Splats, opacities: Array | None, keep: Array | None) -> tuple[Array, Array | None]:
     """Convert opacities ``[n]`` and the mask ``keep [n]`` to the types of the kernels.
 
-    The default is the opacities of the splats. Raises ValueError for another length than that of the splats.
+    By default, the opacities are those of the splats. Raises ValueError if the lengths differ from that of the splats.
     """
     opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
     keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)

@@ -17,9 +17,9 @@ from gsmerge.types import Cameras, Gaussians
 
 BOX_QUANTILES = (1, 99)  # the scene's box reaches from the first to the second percentile of positions on each axis
 FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of this many nearest Gaussians
-# A fit may leave Gaussians that hang across the scene like curtains. Their second largest scale exceeds the first share
-# of half the diagonal of the scene's box, or their largest scale exceeds the second share. This scale also exceeds
-# CURTAIN_FACTOR times its median over all Gaussians
+# A fit may leave Gaussians that hang across the scene like curtains. Their second largest scale exceeds CURTAIN[0]
+# times half the diagonal of the scene's box, or their largest scale exceeds CURTAIN[1] times this. The scale is also
+# more than CURTAIN_FACTOR times the median of all Gaussians
 CURTAIN, CURTAIN_FACTOR = (0.1, 0.33), 8.0
 FLOATER_GAUSSIANS = 200_000  # the share of floaters is estimated from at most about this many Gaussians
 
@@ -34,9 +34,9 @@ def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.nda
     if there are no samples.
     """
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
-    half = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
+    half_sides = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
     outlier_box = 10.0  # side of the larger box, in sides of the scene's box
-    return np.asarray((np.abs(means - (low + high) / 2) > outlier_box * half).any(1))
+    return np.asarray((np.abs(means - (low + high) / 2) > outlier_box * half_sides).any(1))
 
 
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
@@ -95,7 +95,7 @@ def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
 
 
 def floater_share(gaussians: Gaussians) -> float:
-    """Estimate, from a sample, the share of finite Gaussians that are :func:`floaters`; without Gaussians return 0."""
+    """Estimate the share of finite Gaussians that are :func:`floaters` from a sample, or return 0 without Gaussians."""
     rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // FLOATER_GAUSSIANS)))
     return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
 
@@ -107,7 +107,7 @@ def clean(
 
     The reasons are ``cropped`` and the names in ``options.drops``. Gaussians and ``cameras`` are canonical. The crop is
     in the world's frame, to which ``to_world`` maps Gaussians. The sky is found in the ``photos [v,h,w,3]``. A Gaussian
-    is unseen if no camera shows it. Without cameras, some are placed for this.
+    is unseen if no camera shows it. If there are no cameras, some are placed.
     """
     rows, counts = np.arange(len(gaussians)), Counts()
 

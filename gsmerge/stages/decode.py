@@ -75,8 +75,8 @@ def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOpti
 def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, options: DecodeOptions) -> Gaussians:
     """Decode ``count`` Gaussians, or K of each Feature Gaussian if ``count`` is None.
 
-    Groups in which more Gaussians lower distortion most get more. Faint Gaussians are left out, so the result may have
-    fewer than ``count``.
+    More Gaussians go to groups in which they lower distortion most. Faint Gaussians are left out, so the result may
+    have fewer than ``count``.
     """
     features, members, networks = merged.features, merged.members, merged.networks
     children = None
@@ -88,7 +88,7 @@ def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, 
 
 
 def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> Gaussians:
-    """Decode exactly ``count`` visible Gaussians. Groups in which more Gaussians lower distortion most get more."""
+    """Decode exactly ``count`` visible Gaussians, with more of them in groups where they lower distortion most."""
     features, members, networks = merged.features, merged.members, merged.networks
     with_faint = replace(options, min_opacity=0.0)
     return deal_visible(
@@ -106,8 +106,8 @@ def deal_visible(
     """Make ``total`` Gaussians that are visible, so not fainter than ``min_opacity``.
 
     Each group gets one Gaussian. Further Gaussians go to the groups in the list ``order [d]``, see :func:`deal_order`.
-    ``make`` makes the given number of Gaussians ``[g]`` for each group. If some are too faint, as many more groups in
-    the list get one more. The result has fewer than ``total`` Gaussians if the groups have too few members.
+    ``make`` makes the given number of Gaussians ``[g]`` for each group. For each Gaussian that is too faint, one more
+    group in the list gets a Gaussian. The result has fewer than ``total`` Gaussians if the groups have too few members.
     """
     extra = max(0, total - num_groups)
     max_retries = 3  # most rounds that replace faint Gaussians, of which a few are faint again
@@ -138,14 +138,14 @@ def mixed_counts(
 
 
 def group_saliency(features: FeatureGaussians, members: Members, saliency: np.ndarray) -> np.ndarray:
-    """Return the mean saliency ``[g]`` of the pixels of each group's members, where no pixel counts as 0."""
+    """Return the mean saliency ``[g]`` of the pixels of each group's members, with 0 for members without a pixel."""
     starts, pixels = features.starts, members.pixels[features.members]
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
     return np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
 
 
 def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarray:
-    """Return K for every group: 1, 2 or 4 for low, middle and high ``saliency [g]``, as percentiles divide them."""
+    """Return a K of 1, 2 or 4 for groups whose ``saliency [g]`` is below, between or above two percentiles of it."""
     low, high = np.percentile(saliency, (options.k_low, options.k_high)) if len(saliency) else (0.0, 0.0)
     counts: np.ndarray = 1 + (saliency > low) + 2 * (saliency > high)
     return counts
@@ -154,9 +154,9 @@ def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarr
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
     """Return the number of Gaussians to decode merged views into, or None for K of each Feature Gaussian.
 
-    If an exact number was requested and no fit grows to it, this number is returned. Otherwise superpixels without
-    members count as well, so that other groups get their Gaussians. A superpixel has no members if its Gaussians belong
-    to a nearer view. Heads that make exactly K Gaussians of every group cannot give one group more.
+    If an exact number was requested and no fit grows to it, this number is returned. Otherwise it is K for each group
+    and for each superpixel without members, whose Gaussians other groups get. A superpixel has no members if its
+    Gaussians belong to a nearer view. Heads that make exactly K Gaussians of every group cannot give one group more.
     """
     segmentation, num_empty = merged.segmentation, len(merged.segmentation.groups) - merged.num_groups
     if segmentation.exact and not grows:
@@ -167,7 +167,7 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
 
 
 def repeat_groups(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Repeat each Feature Gaussian as ``counts [g]`` equal Gaussians, in place of which heads make others.
+    """Repeat each Feature Gaussian ``counts [g]`` times, for heads that make all children themselves.
 
     Returns the Gaussians, and the group ``[n]`` of each.
     """
@@ -207,7 +207,7 @@ def halve_groups(
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
     def halve_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Divide the groups ``rows``; return the size of each child, the members of all, and the group of each."""
+        """Return the sizes, the members and the groups of the children of the groups ``rows``."""
         row_starts, row_ids = gather_groups(starts, ids, rows)
         m = members
         child_starts, child_ids, parents = bisect(
@@ -221,11 +221,11 @@ def halve_groups(
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
-    """Return how many children ``[g]`` each group gets: one, and ``extra`` in all where they lower distortion most.
+    """Return the number of children ``[g]`` of each group, if there are ``extra`` more children than groups.
 
-    The sum is ``g + extra``, or less if there are too few members. If a child lowers distortion only together with the
-    next child, both count with their mean gain, which is a slope of the convex hull of the group's distortion. So no
-    group loses a child if ``extra`` grows.
+    Each group has at least one child. Further children go to groups in which they lower distortion most, as far as the
+    members suffice. If a child lowers distortion only together with the next child, both count with their mean gain,
+    which is a slope of the convex hull of the group's distortion. So no group loses a child if ``extra`` grows.
     """
     if extra < 0:
         raise ValueError(f"extra: expected at least 0, got {extra}")
@@ -250,7 +250,10 @@ def deal_order(features: FeatureGaussians, members: Members, max_children: int =
 
 
 def _child_errors(features: FeatureGaussians, members: Members, max_children: int) -> np.ndarray:
-    """Return the distortion ``[g,max_children]`` of groups with 1, 2 and more children; NaN if members are too few."""
+    """Return the distortion ``[g,max_children]`` of each group with 1, 2 and more children.
+
+    It is NaN for more children than there are members.
+    """
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 

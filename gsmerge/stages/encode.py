@@ -28,9 +28,9 @@ ALONE, DISPUTED = 0.15, 0.39
 
 
 def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
-    """Return what corrects the results of the stages: networks with the scene that they read, or ``ANALYTIC``.
+    """Return an object that corrects the results of the stages by networks, which read the scene.
 
-    ``ANALYTIC`` changes nothing, and is returned if there are no networks.
+    Without networks it is ``ANALYTIC``, which changes nothing.
     """
     if networks is None:
         return ANALYTIC

@@ -31,7 +31,7 @@ from gsmerge.types import Cameras, Gaussians
 FILLED_SHARE = 0.03  # largest number of new Gaussians, as a share of the fitted ones
 FILL_LEVEL = 8  # width of a drawing's pixel, in pixels of the views; it is large, since what fills gaps is blurred
 FILL_MARGIN = 0.05  # margin that is added to each side of a drawing, as a share of its width or height
-# A pixel is a gap above the first transmittance, and shows a surface below the second one
+# Gaps have a transmittance above the first number, and surfaces have a transmittance below the second one
 GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05
 # A surface is not continued if its depth is less than NEARER_SHARE times the largest depth in a window around the
 # pixel. From the pixel, the window reaches WINDOW_SHARE of the picture's width to each side

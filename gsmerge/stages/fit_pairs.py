@@ -17,14 +17,14 @@ from gsmerge.types import Decoded
 
 SHORT = 60  # steps of the short fits that decide between two starts
 # Step sizes of a fit to renders, as a share of the usual ones, if all Gaussians stay. They are small, because the start
-# is close to the renders. If only a share of the Gaussians stays, they are divided by its root
+# is close to the renders. If only a share of the Gaussians stays, step sizes are divided by the root of this share
 RENDERS_STEP = 0.09
 
 
 def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int) -> float:
-    """Return the power of masses in merging costs, one of ``POWERS``, whose Gaussians show the views best.
+    """Return the one of ``POWERS`` with which merged Gaussians show the views best after a short fit.
 
-    Each power is tried by a short fit.
+    Costs of merging are multiplied by masses to this power.
     """
     photos = scene_photos(prepared.scene)
     tuning = replace(options.tuning, outside_from=1.0)  # no steps for views from outside, which are not scored

@@ -50,5 +50,5 @@ def _find_clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchO
     if boxes:
         return connected_components(neighbors, scores, options.iou)
     order = np.lexsort((*means.T, -features.weights[rows]))
-    size = options.cluster_size or len(distinct(views))
-    return leader_clusters(order, neighbors, scores, views, options.overlap, size)
+    max_size = options.cluster_size or len(distinct(views))
+    return leader_clusters(order, neighbors, scores, views, options.overlap, max_size)

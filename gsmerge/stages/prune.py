@@ -20,8 +20,8 @@ from gsmerge.types import Cameras, Gaussians
 ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of the change that rounding to eight bits makes
 TARGET_CHANGE = 0.9 * ROUNDING  # each next limit is chosen so that it should make this change
 ENOUGH_CHANGE = 0.75 * ROUNDING  # change at which the search for a larger limit ends
-# Factors by which pictures are smaller than photos: where blending weights are measured, and where pictures are
-# compared. The low-pass stays that of the photos, so a change has the same root mean square
+# Blending weights are measured in pictures whose sides are divided by the first number, and pictures with sides divided
+# by the second one are compared. Their low-pass is that of the photos, so changes have the same root mean square
 COMPARED_LEVELS = 2, 4
 
 
@@ -43,7 +43,7 @@ def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gau
 
 
 def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> float:
-    """Return the largest of some limits that is not noticed, or 0 if each limit is noticed.
+    """Try some limits, and return the largest one that is not noticed, or 0 if all are noticed.
 
     A limit is noticed if a picture changes by more than ``ROUNDING`` without the Gaussians whose largest blending
     weight, in ``peaks [n]``, is below this limit.

@@ -1,6 +1,6 @@
 """Scene -> groups: cut every view into superpixels, either equally many in each, or as many as a region tree gives it.
 
-The tree merges neighbouring superpixels of all views, those first whose merge adds the least distortion. A cut through
+The tree merges neighbouring superpixels of all views. Merges that add the least distortion come first. A cut through
 the tree has few superpixels where merges lose little, and many elsewhere, so every Gaussian lowers the distortion about
 equally. Distortion is measured in the image. It is the squared error of colours plus the squared relative error of
 depths from a plane. So a flat wall costs nothing from any angle, and far things count as much as near ones.
@@ -157,15 +157,15 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
         rows = np.empty((2 * count, TREE_COLUMNS))
         error = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
         pairs = adjacent_pairs(labels)
-        # Weight of squared distances in pixels, relative to squared differences of colours. With less, regions become
-        # long and winding, so that no Gaussian fits them
+        # Weight of squared distances in pixels, relative to squared differences of colours. With a smaller weight,
+        # regions become long and winding, so that no Gaussian fits them
         compactness = 1e-5
         return *merge_order(pairs, rows, DEPTH_WEIGHT, compactness, max_extent), error, int((usable > 0).sum())
 
     merged_views = parallel_map(merge_view, range(len(images)))
     parents, view_heights, growths, errors, num_pixels = zip(*merged_views, strict=True)
     offsets, heights = np.concatenate([[0], np.cumsum([len(h) for h in view_heights])]), np.concatenate(view_heights)
-    # A parent is at least as high as its children and comes after them, so it does after a stable sort, too
+    # A parent is at least as high as its children, and comes after them. A stable sort keeps this order
     order = np.argsort(heights, kind="stable")
     added = np.concatenate([[sum(errors)], np.concatenate(growths)[order]])
     distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))

@@ -1,9 +1,9 @@
 """Find the Gaussians of the sky in photos, without a network or a download.
 
 In a photo, the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. It also becomes
-paler towards the horizon. A sky with clouds may not, so a region also counts if it is several times as far away as the
-rest. Ceilings and white walls may be smooth, grey and at the upper border as well. But they are seldom paler below or
-far away, and never in several views.
+paler towards the horizon. A cloudy sky may not become paler, so a region also counts if it is several times as far away
+as the rest. Ceilings and white walls may be smooth, grey and at the upper border as well. But they seldom become paler
+or are far away, and never in several views.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
     regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
     if not regions:
         return mask
-    # Most rounds, and share of all sky so far: a round that adds less is the last one
+    # There are at most max_rounds. A round that adds less than last_share of the sky so far is the last one
     max_rounds, last_share = 6, 0.02
     for _ in range(max_rounds):  # each round finds Gaussians that those of earlier rounds have hidden
         rows = np.flatnonzero(~mask)
@@ -120,8 +120,8 @@ def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
     bright = colors.max(1)
     saturation = (bright - colors.min(1)) / np.maximum(bright, 1e-6)
     low, high = np.percentile(saturation, (10, 90))
-    # Least difference between percentiles 10 and 90 of the saturation, and largest correlation of the saturation with
-    # the row. Rows count downwards
+    # Least difference between percentiles 10 and 90 of the saturation, and largest correlation between saturation and
+    # row. Rows are counted downwards
     min_spread, max_correlation = 0.08, -0.12
     if high - low < min_spread or np.ptp(rows) == 0:
         return False

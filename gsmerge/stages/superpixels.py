@@ -68,7 +68,7 @@ def superpixels(
     """Cut an image into exactly ``count`` superpixels, each non-empty and 4-connected.
 
     Args:
-        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
+        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8, as an array or a tensor.
         count: Superpixels, 1 to h·w.
         segmentation: ``rdseg``, ``bass``, ``bass-st`` or ``grid``.
         rectangles: For ``rdseg``: rectangles per superpixel before merging, at least 1.
@@ -76,7 +76,7 @@ def superpixels(
         compactness: Weight of squared pixels, relative to squared colours, in [0, 1] (not for the BASS methods).
 
     Returns:
-        Labels ``[h,w]`` int32 without gaps from 0 on, the same in every run; a tensor for a tensor.
+        Labels ``[h,w]`` int32 from 0 on without gaps, the same in every run. A tensor gives a tensor.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -105,7 +105,7 @@ def superpixels(
 
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
-    """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows, of which no row has two more than another."""
+    """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows of equal or almost equal numbers."""
     min_rows = -(-count // width)  # least number of rows in which each rectangle has a pixel
     num_rows = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
     first_labels = np.arange(num_rows + 1) * count // num_rows  # first label of each row of rectangles
@@ -120,10 +120,10 @@ def saliency(image: Array) -> Array:
     It is the smaller eigenvalue of the structure tensor.
 
     Args:
-        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
+        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8, as an array or a tensor.
 
     Returns:
-        ``[h,w]`` float32, at least 0; 0 everywhere in a flat image; a tensor for a tensor.
+        ``[h,w]`` float32, at least 0, and 0 everywhere in a flat image. A tensor gives a tensor.
 
     Raises:
         ValueError: If the image has the wrong shape or range.

@@ -25,11 +25,12 @@ def gather_groups(starts, ids, rows):
 
 
 def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children):
-    """Divide the members of every group into ``num_children`` children, which are one number or ``[g]``, at least 1.
+    """Divide the members of every group into ``num_children`` children, by halving.
 
-    In each step, the child with the largest spread of features is halved. The features of a member are its colour, and
-    its position relative to ``centres [g,3]`` in units of ``footprints [g]``. A group with equal members gives fewer
-    children. Two children of a group are unions of its four children.
+    ``num_children`` is one number for all groups or ``[g]``, at least 1. In each step, the child with the largest
+    spread of features is halved. The features of a member are its colour, and its position relative to ``centres
+    [g,3]`` in units of ``footprints [g]``. A group with equal members gives fewer children. Two children of a group are
+    unions of its four children.
 
     Returns the start ``[m+1]`` of each child in a list of members, this list, and the group ``[m]`` of each child.
     """

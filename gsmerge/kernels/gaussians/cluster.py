@@ -41,7 +41,7 @@ def edge_scores(neighbors, means, covars, colors, latents, views, max_color, sim
         max_color: Largest difference of the colours of similar Gaussians, if there are no latents.
         similarity: Least cosine of the latents of similar Gaussians.
         boxes: 1 to measure overlap by :func:`box_overlap`, 0 to measure it by :func:`bhattacharyya`.
-        out: ``[g,k]`` float64, written: overlaps, or -1 without a neighbour of another view that is similar.
+        out: ``[g,k]`` float64, written: overlaps with similar neighbours of other views, and -1 for all others.
     """
 
 

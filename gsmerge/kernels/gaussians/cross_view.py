@@ -52,7 +52,7 @@ def nearest_of_others(points, views, order, axes, splits, first, last, most, out
         order, axes, splits: Results of :func:`build_tree`.
         first: First row.
         last: Last row, exclusive.
-        most: Most points with which a point is compared before its search ends.
+        most: Largest number of points with which a point is compared.
         out: ``[n,k]`` int64, written: rows of the k nearest points, nearest first, and -1 if there are fewer.
     """
     _search_tree(points, views, order, axes, splits, first, last, most, np.empty(out.shape[1]), out)
@@ -87,7 +87,8 @@ def sum_cross_view(
 
     Args:
         colors: ``[g,3]`` float32 base colours minus 0.5.
-        own: ``[g]`` int64 view of each point, with which it is not compared, or a number below 0.
+        own: ``[g]`` int64 own view of each point, with which it is not compared. Points with a number below 0 are
+            compared with all views.
         asked: ``[v,most]`` int32 views with which the points of each view are compared.
         width: Width of the views, pixels.
         height: Height of the views, pixels.

@@ -41,11 +41,11 @@ _agglomerate = declare(
 def agglomerate(
     means, covars, masses, weights, colors, order, starts, color_weight, least_share, first, last, pairs, costs
 ):
-    """Plan merges in some cells, without changing the Gaussians. Each merge of a cell is that of its cheapest pair.
+    """Plan merges in some cells, without changing the Gaussians. The cheapest pair of a cell is always merged next.
 
-    The cost of a pair is a sum times both weights together. The sum has Runnalls' bound (2007) on the divergence that
-    the merge causes, per mass, and the squared difference of colours. A merge costs at least as much as the merge
-    before it in the same cell. So the merges up to any cost are the first merges of each cell.
+    The cost of a pair is a difference times the sum of both weights. The difference is Runnalls' bound (2007) on the
+    divergence that the merge causes, per mass, plus the squared difference of colours. A merge costs at least as much
+    as the merge before it in the same cell. So the merges up to any cost are the first merges of each cell.
 
     Args:
         covars: ``[n,6]`` float32, upper triangles.

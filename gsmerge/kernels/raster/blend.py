@@ -52,7 +52,7 @@ def weighted_sums(conics, flatten_ids, isect_offsets, tile_width, first, last, i
 def add_slots(flatten_ids, slots, ids, first, sums):
     """Add the ``slots [intersections,CHANNELS]`` of each Gaussian, in the order of the lists, to ``sums [n,c]``.
 
-    ``first`` is the channel of the sums that the first channel of the slots is added to.
+    The channels of the slots are added to the channels of the sums from ``first`` on.
     """
 
 

@@ -55,6 +55,7 @@ def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, coun
     """
     num, last_line = len(conics), -(-labels.shape[0] // TILE) - 1  # lines of tiles
     values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
+    # Scratch for superpixels, then the first pair of each Gaussian, the Gaussians with pairs, and `counts`
     stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
     heads, active, counts = np.full(num, -1, np.int32), np.empty(num + 1, np.int32), np.zeros(PAIR_COUNTS, np.int64)
     pairs = np.empty((FIRST_PAIRS, PAIR))

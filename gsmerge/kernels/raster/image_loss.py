@@ -1,7 +1,7 @@
 """Compute the gradient of the fit's image loss in one pass over the rows, without images of intermediate values.
 
-Structural similarity needs sums of the image, the photo and their products over windows. From these follow derivatives,
-which are summed over windows in turn. Differences between neighbouring pixels are computed row by row. Each sum is
+Structural similarity needs sums of the image, the photo and their products over windows. Derivatives follow from these
+sums, and are summed over windows as well. Differences between neighbouring pixels are computed row by row. Each sum is
 added up in the same order wherever a range of rows begins. So results do not depend on how rows are divided among
 threads.
 """

@@ -20,7 +20,7 @@ ENTRIES = {
 }
 
 
-# Appends the entries of tiles, from tile progress[0] on, to the progress[1] entries so far, until the next do not fit
+# Appends the entries of further tiles, as far as they fit. progress has the next tile, and the number of entries so far
 _list_weights = declare(
     "list_weights", STATUS, **blend.LISTS, height=i8(least=1), width=i8(least=1), starts=i8("more", out=True),
     lanes=u1("room", out=True), weights=f4("room", out=True), progress=i8(2, least=0, out=True),

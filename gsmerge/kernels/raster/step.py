@@ -13,7 +13,7 @@ from gsmerge.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
 from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
 
 # Phases of a step. If most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces
-# "deal". They end the list of a tile at its last visible Gaussian
+# "deal". Then the list of a tile ends at its last visible Gaussian
 PHASES = ("cull", "project", "count", "count_open", "deal", "deal_open", "blend", "loss", "backward", "update")
 THREAD_GAUSSIANS = 1 << 13  # number of Gaussians that a thread culls or projects at a time
 

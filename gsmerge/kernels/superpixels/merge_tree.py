@@ -34,7 +34,8 @@ def region_sums(labels, pixels, depths, count, rows):
     return float(squares[0])
 
 
-# Writes the growth of two errors if regions u and v merge: of colour and depth, and of position times the compactness
+# Writes by how much two errors grow if regions u and v merge. The first is the error of colour and depth, the second
+# that of position times the compactness
 merge_growth = declare(
     "merge_growth", rows=f8("capacity", TREE_COLUMNS), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"),
     depth_weight=f8(), compactness=f8(), growth=f8(2, out=True),
@@ -70,6 +71,7 @@ def merge_order(pairs, rows, depth_weight, compactness, max_extent):
     num_leaves, last = num_nodes // 2, max(num_nodes - 1, 0)
     parents, heads, marks = (np.empty(num_nodes, np.int32) for _ in range(3))
     heights, growths, costs = np.empty(num_nodes), np.empty(num_nodes), np.empty(num_pairs)
+    # Scratch for the pairs of each region, and for a heap of all pairs by their costs
     nexts, ends = np.empty(2 * num_pairs, np.int32), np.empty(2 * num_pairs, np.int32)
     heap, places = np.empty(num_pairs, np.int32), np.empty(num_pairs, np.int32)
     _merge_order(

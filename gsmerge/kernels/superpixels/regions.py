@@ -1,8 +1,8 @@
 """Describe the regions of a picture by padded labels and a row of numbers, and move pixels between regions.
 
 Padded labels are ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel has to check for the border. The row of a
-region has its mean features (5), its number of pixels, and two columns for the algorithm that uses it. These eight
-float32 numbers, half a cache line, are all that costs are computed from. The features of a pixel are r, g, b, y·spread
+region has its mean features (5), its number of pixels, and two columns for the algorithm that uses it. Costs are
+computed from these eight float32 numbers, which are half a cache line. The features of a pixel are r, g, b, y·spread
 and x·spread, where spread² is the weight of squared distances in pixels, relative to squared differences of colours.
 Rows have means instead of sums, because means are exact enough in float32 for pictures of any size.
 """

@@ -79,6 +79,7 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
         before their parents.
     """
     parents, best_costs = np.empty(len(rows), np.int32), np.empty(len(rows), np.float32)
+    # Costs of the edges, and the edges above the ceiling with their costs
     costs, parked_costs = np.empty(len(pairs), np.float32), np.empty(len(pairs) + 1, np.float32)
     parked = np.empty((len(pairs) + 1, 2), np.int32)
     num_nodes = _merge_tree(
