@@ -23,8 +23,9 @@ def compare_views(
 ):  # fmt: skip
     """Compare pixels of one view with the photo of another, for the pairs of views from ``first`` to before ``last``.
 
-    The sums measure how the second camera has to move so that both pictures agree. Each pixel is given by its point in
-    the frame of its camera. The points of view i are the rows from ``starts[i]`` to before ``starts[i + 1]``.
+    For each pair, sums over the pixels tell how the second camera has to move so that both pictures agree. A pixel is
+    given by its point in the frame of its camera. The points of view i are the rows from ``starts[i]`` to before
+    ``starts[i + 1]``.
 
     Args:
         greys: For each pair, the grey levels that the second view should show at the pixels of the first.

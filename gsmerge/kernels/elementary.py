@@ -41,6 +41,7 @@ def _make_function(name: str, doc: str, arguments: tuple[str, ...] = ("values",)
         of_floats = declare(f"{name}_floats", **{key: f4("n") for key in arguments}, out=f4("n", out=True))
 
     def function(*arrays: ArrayLike) -> Any:
+        """Broadcast the arrays, convert them to one type, and call the function of the library."""
         if all(isinstance(a, float) for a in arrays):  # for single numbers this takes half of the time
             single = np.empty(1)
             of_doubles(*(np.array([a]) for a in arrays), single)

@@ -118,6 +118,7 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
     """
 
     def wrap(function: Callable[..., Any]) -> Any:
+        """Check the names of the parameters, and return the native function with the docstring."""
         code = function.__code__
         if code.co_varnames[: code.co_argcount] != tuple(arguments):
             raise TypeError(f"{function.__name__}: expected parameters {list(arguments)}, as they are declared")

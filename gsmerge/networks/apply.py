@@ -138,7 +138,7 @@ class NetworkContext(Corrector):
             tokens = concat_columns([relative, is_same_view, features.latents[ids]]).reshape(len(rows), width, -1)
             return self.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
 
-        max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
+        max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent  # width up to a power of two
         outputs = self.run_tables(np.full(count, width), max_width, columns, run_table)
         return _apply_outputs(group_features, outputs, self)
 

@@ -166,8 +166,10 @@ def _mlp(name: str, *widths: int) -> dict[str, tuple[int, ...]]:
 
 
 def _linear(name: str, inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the weights of a linear layer."""
     return {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
 
 
 def _norm(name: str, width: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the weights of a layer norm."""
     return {f"{name}.weight": (width,), f"{name}.bias": (width,)}

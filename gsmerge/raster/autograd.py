@@ -33,6 +33,7 @@ class _Render(torch.autograd.Function):
         tiled_views: dict[int, TiledView] = {}
 
         def tile_one(view: int) -> TiledView:
+            """Tile a view, and keep the result for the backward pass."""
             tiled_views[view] = tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
             return tiled_views[view]
 

@@ -43,6 +43,7 @@ def blend(tiled: TiledView, colors: Array, background: Array) -> tuple[Array, Ar
     transmittance = np.empty((tiled.height, tiled.width), np.float32)
 
     def blend_tiles(span: tuple[int, int]) -> None:
+        """Blend a range of tiles."""
         kernels.blend(*tiled.lists, colors, *span, tiled.top, background, image, transmittance)
 
     with use_threads() as threads:
@@ -91,6 +92,7 @@ def splat_adjoint(tiled: TiledView, image: Array) -> Array:
     slots = np.empty((len(tiled.flatten_ids), kernels.CHANNELS), np.float32)
 
     def sum_tiles(span: tuple[int, int]) -> None:
+        """Write the sums over each of a range of tiles to ``slots``."""
         kernels.weighted_sums(*tiled.lists, *span, channels, slots)
 
     with use_threads() as threads:
@@ -186,6 +188,7 @@ def draw_views(
     depths = np.empty((*shape, 1), np.float32) if with_depths else None
 
     def draw_view(view: int) -> None:
+        """Draw one view into the arrays of the result."""
         tiled = tile_one(first_view + view)
         images[view], transmittance = blend(tiled, view_colors(tiled), background)
         alphas[view, ..., 0] = 1 - transmittance

@@ -145,6 +145,7 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Seque
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def tile_and_use(view: int) -> None:
+        """Tile one view, and call ``use`` for it."""
         use(view, tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR_PLANE))
 
     view_ids = range(len(scene)) if views is None else views

@@ -49,8 +49,8 @@ def psnr_within(image: Array, reference: Array, masks: Sequence[Array | None]) -
     first, second = image_pair(image, reference)
     checked = [None if mask is None else pixel_mask(mask, first) for mask in masks]
     pairs = ((_select(first, mask), _select(second, mask)) for mask in checked)
-    means = [float((np.subtract(*pair, dtype=np.float64) ** 2).mean()) for pair in pairs]
-    return [-10 * float(log10(error)) if error > 0 else float("inf") for error in means]
+    errors = [float((np.subtract(*pair, dtype=np.float64) ** 2).mean()) for pair in pairs]
+    return [-10 * float(log10(error)) if error > 0 else float("inf") for error in errors]
 
 
 def _select(values: np.ndarray, mask: np.ndarray | None) -> np.ndarray:

@@ -147,6 +147,7 @@ def row_pictures(scene: Scene) -> np.ndarray:
     pictures = make_array((*pixels.fronts.shape, 3), np.float32)
 
     def draw(view: int) -> None:
+        """Write the picture of one view."""
         fronts, picture = pixels.fronts[view], pictures[view]
         np.clip(sh0_to_rgb(sh0.take(fronts, axis=0)), 0, 1, out=picture)
         if (fronts < 0).any():
@@ -194,6 +195,7 @@ def shrink_pictures(pictures: np.ndarray, width: int, height: int) -> np.ndarray
     small = make_array((len(pictures), height, width, *pictures.shape[3:]), pictures.dtype.type)
 
     def shrink(view: int) -> None:
+        """Write the small picture of one view."""
         small[view] = cv2.resize(pictures[view], (width, height), interpolation=cv2.INTER_AREA)
 
     parallel_map(shrink, range(len(pictures)))
@@ -269,9 +271,11 @@ def score_photos(
     masks = {} if covered is None else dict(zip(views, covered, strict=True))
 
     def tiles(view: int) -> np.ndarray | None:
+        """Return the tiles of a view that have to be complete, because they are scored."""
         return scored_tiles(view, photos.width, photos.height, every)
 
     def score_render(view: int, image: np.ndarray, transmittance: np.ndarray) -> RenderScore:
+        """Score the render of one view."""
         return _score_render(image, masks.get(view, transmittance < COVERED_TRANSMITTANCE), photos, view, every)
 
     return _average_scores(photo_errors(gaussians, photos, score_render, views, tiles=tiles, **settings))

@@ -190,6 +190,7 @@ def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, thread
     boxes = np.empty((m, 4), np.int16)
 
     def project(span: tuple[int, int]) -> None:
+        """Write the conics, depths and boxes of a range of the Gaussians."""
         rows = slice(*span)
         projection.project(
             splats.means, splats.quats, splats.scales, opacities, ids[rows], camera,

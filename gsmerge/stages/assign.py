@@ -82,6 +82,7 @@ def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
     pixels_per_view, offsets = groups.labels[0].size, np.cumsum(counts) - counts
 
     def view_middles(view: int) -> np.ndarray:
+        """Return the middle pixels of the superpixels of one view."""
         return middle_pixels(groups.labels[view], groups.counts[view]) + view * pixels_per_view
 
     middles = np.concatenate(parallel_map(view_middles, range(len(counts))))

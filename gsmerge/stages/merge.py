@@ -91,11 +91,11 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
     run = np.repeat(np.arange(len(cuts)), sizes)
     gains, extinctions = rows(features.gains), rows(features.extinctions)
     share = np.maximum(rows(features.weights) * gains, 1e-12)
-    share /= total(share)[run]
+    share /= total(share)[run]  # of each part in its cluster
     means = total(share[:, None] * rows(features.means))
     delta = rows(features.means) - means[run]
     covars = total(share[:, None, None] * (rows(features.covars) + delta[:, :, None] * delta[:, None]))
-    summed = total(extinctions)
+    optical_depths = total(extinctions)
     starts, members = _gather_members(features, order)
 
     return FeatureGaussians(
@@ -103,8 +103,8 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
         covars=to_float32(covars),
         weights=to_float32(total(rows(features.weights))),
         masses=to_float32(total(rows(features.masses))),
-        extinctions=to_float32(summed),
-        gains=to_float32(total(gains * extinctions) / np.maximum(summed, 1e-30)),
+        extinctions=to_float32(optical_depths),
+        gains=to_float32(total(gains * extinctions) / np.maximum(optical_depths, 1e-30)),
         sh0=to_float32(total(share[:, None, None] * rows(features.sh0))),
         shN=to_float32(total(share[:, None, None] * rows(features.shN))),
         footprints=to_float32(total(share * rows(features.footprints))),

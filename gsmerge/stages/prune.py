@@ -53,6 +53,7 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
     splats, low, high, limit = make_splats(gaussians), 0.0, math.inf, start_limit
 
     def clip(_: int, image: np.ndarray, __: np.ndarray) -> np.ndarray:
+        """Clip a render as a picture on a screen is."""
         return np.clip(image, 0, 1, out=image)
 
     whole = photo_errors(splats, photos, clip)
@@ -62,6 +63,7 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
         shown = peaks >= limit
 
         def compare(view: int, image: np.ndarray, transmittance: np.ndarray) -> float:
+            """Return the mean squared change of a render from that of all Gaussians."""
             return float(((clip(view, image, transmittance) - whole[view]) ** 2).mean(dtype=np.float64))
 
         return math.sqrt(max(photo_errors(splats, photos, compare, keep=lambda _: shown)))

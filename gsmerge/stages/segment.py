@@ -133,6 +133,7 @@ def front_depths(scene: Scene) -> np.ndarray:
     cameras, means, fronts = scene.cameras, scene.gaussians.means, scene.get_pixels().fronts
 
     def view_depths(view: int) -> np.ndarray:
+        """Return the depths ``[h,w]`` of one view."""
         depths = camera_depths(means[fronts[view]], cameras.viewmats[view].astype(means.dtype))
         return depths.astype(np.float32)
 
