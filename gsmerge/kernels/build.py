@@ -1,8 +1,8 @@
 """Build the native library of the kernels.
 
 ``pip install`` runs this file, and so does ``python tasks.py native`` after a change. It runs before anything is
-installed, so it needs only the standard library. One compiler, the clang of the PyPI wheel
-``ziglang``, builds every target. ``GSMERGE_CC`` names another compiler, whose rounding may differ.
+installed, so it needs only the standard library. The clang of the PyPI wheel ``ziglang`` builds every target.
+``GSMERGE_CC`` names another compiler, whose rounding may differ.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Target:
 
 
 V3 = Target("v3", ("-mcpu=x86_64_v3",), ("-march=x86-64-v3",))
-# Gathers and scatters are off, because on many processors they take longer than the loads and stores that they replace
+# Vector gathers and scatters are off, because on many processors single loads and stores take less time
 V4 = Target(
     "v4",
     ("-mcpu=x86_64_v4+prefer_no_gather+prefer_no_scatter", "-mprefer-vector-width=512"),
@@ -47,24 +47,24 @@ ARM64 = Target("arm64", (), ())
 
 @dataclass(frozen=True)
 class Platform:
-    """An operating system and a family of processors, for which there is one wheel."""
+    """An operating system and a family of processors. Each platform has one wheel."""
 
     system: str  # linux, macosx or win, as at the start of a wheel's tag
     machine: str  # x86_64 or arm64
 
     @property
     def suffix(self) -> str:
-        """Ending of the names of library files."""
+        """Suffix of library files, with its dot."""
         return {"macosx": ".dylib", "win": ".dll"}.get(self.system, ".so")
 
     @property
     def targets(self) -> tuple[Target, ...]:
-        """The targets of the processors, from the fewest instruction sets to the most."""
+        """Targets of the platform's processors, the one with the fewest instruction sets first."""
         return (V3, V4) if self.machine == "x86_64" else (ARM64,)
 
     @property
     def triple(self) -> str:
-        """The target triple for the compiler. It names a C library, although none is linked."""
+        """The target triple for the compiler. The C library in its name is not linked."""
         kind = "x86_64" if self.machine == "x86_64" else "aarch64"
         system = {"macosx": "macos.11.0", "win": "windows-gnu"}.get(self.system, "linux-gnu.2.17")
         return f"{kind}-{system}"
@@ -80,19 +80,19 @@ class Platform:
 
 
 def find_platform(tag: str | None = None) -> Platform:
-    """Return the platform of a wheel with a tag such as ``manylinux_2_17_aarch64``; by default that of this machine."""
+    """Return the platform of a wheel with a tag such as ``manylinux_2_17_aarch64``, by default of this machine."""
     name = (tag or sysconfig.get_platform()).lower()
     system = next((system for system in ("macosx", "win") if name.startswith(system)), "linux")
     return Platform(system, "arm64" if name.endswith(("arm64", "aarch64")) else "x86_64")
 
 
 def source_files() -> list[Path]:
-    """List the C sources and headers below this folder, by name; a wheel may have none."""
+    """List the C sources and headers below this folder, sorted by name. A wheel may have none."""
     return sorted([*FOLDER.rglob("*.c"), *FOLDER.rglob("*.h")], key=lambda path: path.name)
 
 
 def hash_sources() -> str:
-    """Return a hash of the names and contents of all sources; empty if there are none."""
+    """Return a hash of the names and contents of all sources, or an empty string if there are none."""
     digest, paths = hashlib.sha256(), source_files()
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
@@ -100,7 +100,7 @@ def hash_sources() -> str:
 
 
 def compiler() -> list[str]:
-    """Return the words of the command that runs the compiler; OSError if there is no compiler."""
+    """Return the words of the command that runs the compiler, or raise OSError if there is none."""
     words = shlex.split(os.environ.get("GSMERGE_CC", ""))
     if words:
         program = shutil.which(words[0])
@@ -117,7 +117,10 @@ def compiler() -> list[str]:
 def build_target(
     target: Target, folder: Path, platform: Platform, extra: tuple[str, ...] = (), link: tuple[str, ...] = LINK
 ) -> Path:
-    """Build the library of a target into a folder, and return its path; OSError with the message of the compiler."""
+    """Build the library of a target into a folder, and return its path.
+
+    Raises OSError with the message of the compiler if it fails.
+    """
     command, path = compiler(), folder / platform.library_name(target)
     is_zig = Path(command[0]).stem == "zig"
     options = ["-target", platform.triple, *platform.flags, *target.zig] if is_zig else target.gcc
@@ -146,10 +149,10 @@ def build_libraries(
     Args:
         folder: Folder of the libraries.
         extra: Further options of the compiler.
-        platform: Tag of the wheel that gets the libraries; by default they are for this machine.
+        platform: Tag of the wheel that gets the libraries, by default one for this machine.
         link: Options of the compiler that link a library.
     """
-    from concurrent.futures import ThreadPoolExecutor  # takes some milliseconds, and runs only need `hash_sources`
+    from concurrent.futures import ThreadPoolExecutor  # here because it takes some milliseconds, which runs save
 
     wheel_platform = find_platform(platform)
     with ThreadPoolExecutor() as pool:

@@ -1,15 +1,16 @@
 """Draw simple shapes by casting the rays of a pinhole camera, and light them with shadow maps.
 
-Every shape has its own frame (a centre, and a rotation from the frame to the world) and half sizes along x, y and z:
+Every shape has its own frame (a centre, and a rotation from the frame to the world) and half sizes along x, y and z.
+There are these kinds.
 
-- QUAD: the rectangle z = 0
-- BOX: a box
-- ELLIPSOID: an ellipsoid
-- CONE: a cylinder about y with closed ends, whose radius at +y is ``extra`` times that at -y
-- LEAF: the part of z = 0 where ``|x| <= hx (1 - (y / hy)^2)``, with the half sizes hx and hy
-- BLOB: an ellipsoid whose radius, in units of the half sizes, is 1 plus the sum of its waves
+- QUAD is the rectangle z = 0.
+- BOX is a box.
+- ELLIPSOID is an ellipsoid.
+- CONE is a cylinder about y with closed ends. Its radius at +y is ``extra`` times that at -y.
+- LEAF is the part of z = 0 where ``|x| <= hx (1 - (y / hy)^2)``, with the half sizes hx and hy.
+- BLOB is an ellipsoid whose radius, in units of the half sizes, is 1 plus the sum of its four waves.
 
-``waves [m,4,5]`` are four sines for each shape, each with three wave numbers, a phase and an amplitude.
+A wave in ``waves [m,4,5]`` is a sine with three wave numbers, a phase and an amplitude.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ QUAD, BOX, ELLIPSOID, CONE, LEAF, BLOB = range(6)
     ids=i4("h", "w", out=True), points=f4("h", "w", 3, out=True), normals=f4("h", "w", 3, out=True),
 )  # fmt: skip
 def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, depth, ids, points, normals):
-    """Write the first hit of each pixel's ray: depth along z, shape, point in its frame, and normal in the world.
+    """Write what the ray of each pixel hits first: its depth along z, the shape, the point and the normal.
 
-    A pixel changes only if it hits a shape in front of its present depth.
+    Points are in the frame of the shape, normals in the world. A pixel changes only if its ray hits a shape in front of
+    the present depth.
 
     Args:
         eye: ``[3]`` float64 position of the camera.
@@ -37,8 +39,8 @@ def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, 
         kinds: ``[m]`` int32 kinds of the shapes, 0 to 5.
         sizes: ``[m,4]`` float64 half sizes and ``extra``.
         rects: ``[m,4]`` int32 rectangles of samples, x0, y0, x1 and y1, in which the shape may appear.
-        depth: ``[h,w]`` float64; the caller fills it with the largest depth.
-        ids: ``[h,w]`` int32; the caller fills it with -1.
+        depth: ``[h,w]`` float64, which the caller fills with the largest depth.
+        ids: ``[h,w]`` int32 shapes, which the caller fills with -1.
         normals: ``[h,w,3]`` float32, pointing towards the camera.
     """
 
@@ -48,14 +50,16 @@ def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, 
     bias=f8(), weights=f8("k"), out=f4("n", out=True),
 )  # fmt: skip
 def add_light(points, normals, axes, centre, radius, maps, bias, weights, out):
-    """Add to ``out`` the light that points get: from each lamp whose rays reach the point, its weight times the cosine.
+    """Add to ``out`` the light that points get from all lamps.
+
+    A lamp whose rays reach a point gives it the lamp's weight times the cosine between ray and normal.
 
     Args:
         normals: ``[n,3]`` float32 of length 1.
-        axes: ``[k,3,3]`` float64: rows are right, down and forward along the parallel rays of each lamp.
+        axes: ``[k,3,3]`` float64 axes of the lamps: right, down, and forward along their parallel rays.
         centre: ``[3]`` float64 middle of the shadow maps.
         radius: Half the side of the shadow maps.
-        maps: ``[k,s,s]`` float32 distance of the first surface from the middle, along the rays.
+        maps: ``[k,s,s]`` float32 distances of the first surfaces from the middle, along the rays.
         bias: Largest distance behind that surface at which a point is still lit.
         out: ``[n]`` float32, to which the light is added.
     """

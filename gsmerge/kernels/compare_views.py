@@ -1,4 +1,4 @@
-"""Compare the pixels of one view with what another view shows at the same places."""
+"""Compare the pixels of one view with what another view shows of the same points."""
 
 from __future__ import annotations
 
@@ -23,21 +23,23 @@ def compare_views(
 ):  # fmt: skip
     """Compare pixels of one view with the photo of another, for the pairs of views from ``first`` to before ``last``.
 
-    A pixel is given by its point in the frame of its camera. The points of view i are the rows from ``starts[i]`` to
-    before ``starts[i + 1]``.
+    For each pair, sums over the pixels tell how the second camera has to move so that both pictures agree. A pixel is
+    given by its point in the frame of its camera. The points of view i are the rows from ``starts[i]`` to before
+    ``starts[i + 1]``.
 
     Args:
         greys: For each pair, the grey levels that the second view should show at the pixels of the first.
-        pictures: Grey level, and its derivatives to the right and down. Pixels less than ``border`` from a side of
-            the picture are not used.
-        depths: Depths of the Gaussians at the centres of the pixels; NaN where there are none.
-        given: Poses before any motion, relative to which ``flows`` are measured.
+        pictures: Grey levels of the photos, and their derivatives to the right and down. Pixels less than ``border``
+            pixels from a side of the photo are not used.
+        depths: Depths of the Gaussians at the centres of the pixels, or NaN where there are none.
+        given: View matrices before any motion, relative to which ``flows`` are measured.
         scale: Factor from pixels to the unit of ``flows``.
-        scratch: ``[SCRATCH_COLUMNS, largest number of pixels of a view]``.
-        curvatures: Written: second derivatives, by Gauss-Newton, of half the weighted squared differences by a motion
-            of the second camera; ``slopes`` gets the first derivatives.
-        costs: Written: mean over the pixels of a robust function of their differences.
-        flows: Written: median distance of the pixels' projections with ``viewmats`` from those with ``given``.
+        scratch: ``[SCRATCH_COLUMNS, largest number of pixels of a view]`` float64.
+        curvatures: Written: second derivatives of half the weighted squared differences with respect to a motion of
+            the second camera, by Gauss-Newton.
+        slopes: Written: first derivatives of the same sums.
+        costs: Written: means over the pixels of a robust function of their differences.
+        flows: Written: median distances between the projections of the pixels with ``viewmats`` and with ``given``.
     """
 
 
@@ -49,15 +51,15 @@ _find_surfaces = declare(
 
 
 def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
-    """Find those pixels, among ``rows`` of a view, whose surface another view shows too.
+    """Find the pixels, among the pixels ``rows`` of a view, whose surface another view shows too.
 
     ``means`` and ``others`` are the points of all pixels of the two views. Two pixels show the same surface if the
     other view's point is ``valid``, and the logarithms of both depths differ by less than ``same``. Returns the
-    positions of the pixels within ``rows``, and the matching pixels of the other view.
+    positions of such pixels in ``rows``, and the pixels of the other view.
     """
-    ids, places = np.empty((2, len(rows)), np.int64)
-    count = _find_surfaces(means, rows, others, valid.view(np.uint8), viewmat, K, width, near, same, ids, places)
-    return ids[:count], places[:count]
+    ids, pixels = np.empty((2, len(rows)), np.int64)
+    count = _find_surfaces(means, rows, others, valid.view(np.uint8), viewmat, K, width, near, same, ids, pixels)
+    return ids[:count], pixels[:count]
 
 
 @native(
@@ -65,8 +67,8 @@ def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
     sums=f4("height", "width", 2, out=True),
 )  # fmt: skip
 def add_differences(picture, along, start, depths, colors, pixels, sums):
-    """Add to ``sums``, for those ``pixels`` that a picture shows, the difference of their ``colors`` from it, and 1.
+    """Add the differences of the ``colors`` of some ``pixels`` from another picture, and their number, to ``sums``.
 
-    The homogeneous coordinates of the points, in pixels of the picture, are ``start`` plus ``depths`` times ``along``.
-    Their three numbers are column times depth, row times depth, and depth.
+    Pixels that the picture does not show add nothing. The homogeneous coordinates of a pixel's point in the picture are
+    ``start`` plus its depth times ``along``: column times depth, row times depth, and depth.
     """

@@ -23,16 +23,17 @@ class Unary(Protocol):
 
 
 class Binary(Protocol):
-    """A function of two arrays that are broadcast together."""
+    """A function of two arrays, which are broadcast together."""
 
     def __call__(self, first: ArrayLike, second: ArrayLike, /) -> Any:
-        """Return a new array of the shape of both."""
+        """Return a new array of the common shape."""
 
 
 def _make_function(name: str, doc: str, arguments: tuple[str, ...] = ("values",), narrow: bool = False) -> Any:
-    """Return a function of arrays that calls ``name_each`` of the library, which takes flat float64 arrays.
+    """Return a function of arrays called ``name``, with the docstring ``doc``.
 
-    If ``narrow`` is true, it calls ``name_floats`` for float32 results. ``doc`` is its docstring.
+    It flattens its arguments, and calls a function of the library: NAME_each for float64 results or, if ``narrow`` is
+    true, NAME_floats for float32 results.
     """
     of_doubles = declare(f"{name}_each", **{key: f8("n") for key in arguments}, out=f8("n", out=True))
     of_floats = None
@@ -40,7 +41,8 @@ def _make_function(name: str, doc: str, arguments: tuple[str, ...] = ("values",)
         of_floats = declare(f"{name}_floats", **{key: f4("n") for key in arguments}, out=f4("n", out=True))
 
     def function(*arrays: ArrayLike) -> Any:
-        if all(isinstance(a, float) for a in arrays):  # a shorter path for numbers, which takes half of the time
+        """Broadcast the arrays, convert them to one type, and call the function of the library."""
+        if all(isinstance(a, float) for a in arrays):  # for single numbers this takes half of the time
             single = np.empty(1)
             of_doubles(*(np.array([a]) for a in arrays), single)
             return single[0]
@@ -64,19 +66,19 @@ def _make_function(name: str, doc: str, arguments: tuple[str, ...] = ("values",)
 
 exp: Unary = _make_function("exp", "Compute e to the power of an array.", narrow=True)
 expm1: Unary = _make_function("expm1", "Compute e to the power of an array, less 1, without cancellation near 0.")
-log: Unary = _make_function("log", "Compute the natural logarithm of an array; -inf at 0, NaN below.", narrow=True)
-log10: Unary = _make_function("log10", "Compute the decimal logarithm of an array; -inf at 0, NaN below.")
-log1p: Unary = _make_function("log1p", "Compute the natural logarithm of 1 plus an array; -inf at -1, NaN below.")
+log: Unary = _make_function("log", "Compute the natural logarithm of an array, -inf at 0 and NaN below.", narrow=True)
+log10: Unary = _make_function("log10", "Compute the decimal logarithm of an array, -inf at 0 and NaN below.")
+log1p: Unary = _make_function("log1p", "Compute the natural logarithm of 1 plus an array, -inf at -1 and NaN below.")
 sin: Unary = _make_function("sin", "Compute the sine of an array of radians between about -1e5 and 1e5.")
 cos: Unary = _make_function("cos", "Compute the cosine of an array of radians between about -1e5 and 1e5.")
-arccos: Unary = _make_function("arccos", "Compute the angles, radians from 0 to pi, of cosines; NaN outside -1 to 1.")
+arccos: Unary = _make_function("arccos", "Compute the angles, radians from 0 to pi, of cosines, NaN outside -1 to 1.")
 arctan2: Binary = _make_function(
     "arctan2",
-    "Compute the angles of points ``(x, y)``, from -pi to pi; 0 for the origin, whatever the signs of its zeros.",
+    "Compute the angles of points ``(x, y)``, from -pi to pi, and 0 for the origin with zeros of any sign.",
     ("y", "x"),
 )
 power: Binary = _make_function(
     "power",
-    "Raise an array of numbers of at least 0 to powers, an array or one number; NaN for numbers below 0.",
+    "Raise an array of numbers of at least 0 to powers, an array or one number. The result is NaN for numbers below 0.",
     ("bases", "exponents"),
 )

@@ -18,7 +18,8 @@ def load_library() -> ctypes.CDLL:
     """Return the native library, in the version of the most advanced target that this processor runs.
 
     The environment variable ``GSMERGE_TARGET`` names another target, and ``GSMERGE_NATIVE`` another folder of
-    libraries. Raises UsageError if no library fits the processor, or if it is missing or older than the sources.
+    libraries. Raises UsageError if no library fits the processor, or if the library is missing or older than its
+    sources.
     """
     targets = {target.name: target for target in _runnable_targets()}
     name = os.environ.get("GSMERGE_TARGET") or list(targets)[-1]
@@ -28,7 +29,7 @@ def load_library() -> ctypes.CDLL:
 
 
 def _runnable_targets() -> list[Target]:
-    """Return the targets that this processor runs, the most advanced one last; UsageError if it runs none."""
+    """Return the targets that this processor runs, the most advanced one last, or raise UsageError if there is none."""
     basic, *advanced = find_platform().targets
     if basic.name == "arm64":
         return [basic]
@@ -41,7 +42,7 @@ def _runnable_targets() -> list[Target]:
 
 @lru_cache
 def _open_library(target: Target) -> ctypes.CDLL:
-    """Load the library of a target; UsageError if it is missing, damaged, or older than the sources."""
+    """Load the library of a target, or raise UsageError if it is missing, damaged, or older than the sources."""
     folder = Path(os.environ.get("GSMERGE_NATIVE") or FOLDER)
     path = folder / find_platform().library_name(target)
     try:

@@ -17,7 +17,7 @@ Array = np.ndarray[Any, Any]
 NARROW, WIDE = np.dtype(np.float32), np.dtype(np.float64)
 
 
-# b is one matrix for all if m is 1
+# If m is 1, all matrices a are multiplied with the same matrix b
 _multiply_matrices = declare(
     "multiply_matrices", STATUS, a=f8("n", "i", "j"), b=f8("m", "j", "k"), out=f8("n", "i", "k", out=True)
 )
@@ -27,12 +27,13 @@ _multiply_matrices = declare(
 _solve_equations = declare("solve_equations", i4(), a=f8("n", "d", "d", out=True), b=f8("n", "d", "k", out=True))
 
 
-# Replaces symmetric matrices a by diagonal matrices of their eigenvalues; writes the eigenvectors to the columns of v
+# Replaces symmetric matrices a by diagonal matrices of their eigenvalues, and writes the eigenvectors to the columns of
+# v
 _diagonalise = declare("diagonalise", a=f8("n", "d", "d", out=True), v=f8("n", "d", "d", out=True))
 
 
-def _wide(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:
-    """Return arrays as float64, and the type that the result should have."""
+def _to_float64(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:
+    """Return arrays as float64, and the type of the result: float32 if all arrays are float32, otherwise float64."""
     inputs = [np.asarray(array) for array in arrays]
     dtype = NARROW if all(array.dtype == NARROW for array in inputs) else WIDE
     return [array if array.dtype == WIDE else array.astype(WIDE) for array in inputs], dtype
@@ -40,49 +41,51 @@ def _wide(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:
 
 def matmul(a: ArrayLike, b: ArrayLike) -> Array:
     """Multiply matrices ``[...,i,j]`` and ``[...,j,k]``, or vectors ``[j]``, as ``a @ b`` does."""
-    (left, right), dtype = _wide(a, b)
+    (left, right), dtype = _to_float64(a, b)
     left_is_vector, right_is_vector = left.ndim == 1, right.ndim == 1
     left, right = left[None] if left_is_vector else left, right[:, None] if right_is_vector else right
-    lead = left.shape[:-2]
-    if right.ndim == 2:  # it is multiplied by all matrices on the left, which then form a single tall matrix
-        first, second = left.reshape(1, math.prod(left.shape[:-1]), left.shape[-1]), right[None]
+    stack = left.shape[:-2]  # shape of the axes before the matrices
+    if right.ndim == 2:  # all matrices on the left are multiplied with this one, so they form a single tall matrix
+        a_list, b_list = left.reshape(1, math.prod(left.shape[:-1]), left.shape[-1]), right[None]
     else:
-        if lead != right.shape[:-2]:
-            lead = np.broadcast_shapes(lead, right.shape[:-2])
-            left, right = (np.broadcast_to(array, lead + array.shape[-2:]) for array in (left, right))
-        first, second = (array.reshape(math.prod(lead), *array.shape[-2:]) for array in (left, right))
-    out = np.empty((*first.shape[:2], second.shape[2]))
-    _multiply_matrices(np.ascontiguousarray(first), np.ascontiguousarray(second), out)
-    out = out.reshape(*lead, left.shape[-2], right.shape[-1])
+        if stack != right.shape[:-2]:
+            stack = np.broadcast_shapes(stack, right.shape[:-2])
+            left, right = (np.broadcast_to(array, stack + array.shape[-2:]) for array in (left, right))
+        a_list, b_list = (array.reshape(math.prod(stack), *array.shape[-2:]) for array in (left, right))
+    out = np.empty((*a_list.shape[:2], b_list.shape[2]))
+    _multiply_matrices(np.ascontiguousarray(a_list), np.ascontiguousarray(b_list), out)
+    out = out.reshape(*stack, left.shape[-2], right.shape[-1])
     out = out[..., 0, :] if left_is_vector else out
     return (out[..., 0] if right_is_vector else out).astype(dtype, copy=False)
 
 
 def solve(a: ArrayLike, b: ArrayLike) -> Array:
-    """Solve ``a x = b`` for matrices ``a [...,d,d]`` and right sides ``b [...,d,k]`` or one ``b [d]``; return x.
+    """Return the solutions x of ``a x = b`` for matrices ``a [...,d,d]`` and ``b [...,d,k]`` or one ``b [d]``.
 
     Raises numpy.linalg.LinAlgError if a matrix is singular.
     """
-    (left, right), dtype = _wide(a, b)
+    (left, right), dtype = _to_float64(a, b)
     if right.ndim == 1:
         return solve(a, np.asarray(b)[:, None])[..., 0]
-    lead, size = np.broadcast_shapes(left.shape[:-2], right.shape[:-2]), left.shape[-1]
-    work = np.broadcast_to(left, (*lead, size, size)).reshape(math.prod(lead), size, size).copy()
-    solution = np.broadcast_to(right, (*lead, *right.shape[-2:])).reshape(math.prod(lead), *right.shape[-2:]).copy()
+    stack = np.broadcast_shapes(left.shape[:-2], right.shape[:-2])  # shape of the axes before the matrices
+    work, solution = (
+        np.broadcast_to(array, (*stack, *array.shape[-2:])).reshape(math.prod(stack), *array.shape[-2:]).copy()
+        for array in (left, right)
+    )
     if _solve_equations(work, solution):
         raise np.linalg.LinAlgError("Singular matrix")
-    return solution.reshape(*lead, *right.shape[-2:]).astype(dtype, copy=False)
+    return solution.reshape(*stack, *right.shape[-2:]).astype(dtype, copy=False)
 
 
 def invert(matrices: ArrayLike) -> Array:
-    """Return the inverses of matrices ``[...,d,d]``; numpy.linalg.LinAlgError if one is singular."""
+    """Return the inverses of matrices ``[...,d,d]``, or raise numpy.linalg.LinAlgError if one is singular."""
     matrices = np.asarray(matrices)
     return solve(matrices, np.eye(matrices.shape[-1], dtype=matrices.dtype))
 
 
 def eigh(matrices: ArrayLike) -> tuple[Array, Array]:
-    """Return eigenvalues ``[...,d]`` of symmetric matrices, ascending, and eigenvectors as columns ``[...,d,d]``."""
-    (wide,), dtype = _wide(matrices)
+    """Return the eigenvalues ``[...,d]`` of symmetric matrices, ascending, and the eigenvectors in columns."""
+    (wide,), dtype = _to_float64(matrices)
     size = wide.shape[-1]
     work = wide.reshape(math.prod(wide.shape[:-2]), size, size).copy()
     vectors = np.empty_like(work)
@@ -95,12 +98,12 @@ def eigh(matrices: ArrayLike) -> tuple[Array, Array]:
 
 
 def transform(matrices: ArrayLike, vectors: ArrayLike) -> Array:
-    """Multiply each of ``matrices [n,i,j]`` by the vector of the same number of ``vectors [n,j]``."""
+    """Multiply each of n matrices ``[n,i,j]`` by one of n vectors ``[n,j]``."""
     return matmul(matrices, np.asarray(vectors)[..., None])[..., 0]
 
 
 def solve_symmetric(a: ArrayLike, b: ArrayLike, rcond: float = 1e-12) -> Array:
-    """Solve ``a x = b`` for a symmetric matrix ``[d,d]`` and ``b [d]`` or ``[d,k]``; return the shortest solution.
+    """Return the shortest solution x of ``a x = b`` for a symmetric matrix ``[d,d]`` and ``b [d]`` or ``[d,k]``.
 
     Eigenvalues of at most ``rcond`` times the largest count as zero.
     """
@@ -118,9 +121,9 @@ def determinant(matrices: ArrayLike) -> Array:
 
 
 def closest_rotation(matrix: ArrayLike) -> Array:
-    """Return the rotation R ``[3,3]`` nearest to a matrix by least squares, which maximises the trace of R^T matrix.
+    """Return the rotation R ``[3,3]`` nearest to a matrix by least squares, so with the largest trace of R^T matrix.
 
-    R is made from a quaternion, which is an eigenvector (Horn 1987), so it is never a reflection.
+    The quaternion of R is an eigenvector (Horn 1987), so R is never a reflection.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64)
     quaternion_form = np.array(

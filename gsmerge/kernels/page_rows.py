@@ -16,13 +16,13 @@ LOOKS = 10  # number of columns before those of the harmonics
     out=u4("columns", "m", out=True),
 )  # fmt: skip
 def pack_looks(rows, opacities, sh0, scales, quats, shN, sh_scale, color_scale, steps, levels, out):
-    """Pack the appearance of the Gaussians ``rows`` into the numbers that a ``.spz`` has, but in coarser steps.
+    """Pack opacities, colours, scales and rotations of the Gaussians ``rows`` as in a ``.spz``, but more coarsely.
 
     Args:
         sh_scale: Factor from ``sh0`` to colours.
         color_scale: Scale of the colours in a ``.spz``.
-        steps: ``[3]`` int32 sizes of the steps of opacities, colours and log scales.
-        levels: Number of steps of rotations from 0 to 1. A rotation is stored as its axis times the tangent of a
+        steps: ``[3]`` int32 steps of opacities, colours and log scales, in steps of a ``.spz``.
+        levels: Number of steps from 0 to 1 for rotations. A rotation is stored as its axis times the tangent of a
             quarter of its angle, from -1 to 1.
         out: Written: columns of opacity, red minus green, green, blue minus green, three log scales and three numbers
             of the rotation. The remaining columns are harmonics.
@@ -40,7 +40,7 @@ def pack_pixels(rows, ids, means, viewmats, Ks, width, height, pixel_parts, dept
     The first row that is not in front of its camera ends the packing.
 
     Args:
-        ids: ``[n]`` int64 pixels of all Gaussians, counted through all views.
+        ids: ``[n]`` int64 pixels of all Gaussians, numbered through all views.
         pixel_parts: Number of steps per pixel.
         depth_parts: Number of steps per unit of the logarithm of a depth.
         out: Written: columns of the pixel, of the shifts right and down from its centre, and of the log depth.

@@ -37,7 +37,7 @@ _sample_picture = declare(
 
 
 def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
-    """Convolve a picture ``[h,w]`` or ``[h,w,c]`` with two filters of odd lengths; return it as float32.
+    """Return a picture ``[h,w]`` or ``[h,w,c]`` as float32, convolved with two filters of odd lengths.
 
     ``across`` filters along the rows, and ``down`` filters along the columns. Outside of its borders the picture is
     mirrored, without repeating the border pixels.
@@ -53,7 +53,7 @@ def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
 
 
 def blur(picture: Picture, sigma: float, size: int | None = None) -> Picture:
-    """Blur a picture ``[h,w]`` or ``[h,w,c]`` by a Gaussian of ``sigma`` pixels; return it as float32.
+    """Return a picture ``[h,w]`` or ``[h,w,c]`` as float32, blurred by a Gaussian of ``sigma`` pixels.
 
     The filter has an odd number ``size`` of pixels, by default all those within four ``sigma``.
     """
@@ -62,7 +62,7 @@ def blur(picture: Picture, sigma: float, size: int | None = None) -> Picture:
 
 
 def _gaussian_taps(sigma: float, size: int) -> np.ndarray:
-    """Return the weights ``[size]`` of a Gaussian of ``sigma`` pixels, whose sum is 1; ``size`` is odd."""
+    """Return the weights ``[size]`` of a Gaussian of ``sigma`` pixels, whose sum is 1, for an odd ``size``."""
     offsets = np.arange(size) - size // 2
     weights = exp(offsets**2 * (-0.5 / sigma**2))
     return weights / weights.sum()
@@ -86,7 +86,7 @@ def compare_windows(first: Picture, second: Picture, sigma: float, size: int, c1
 
 
 def sobel(picture: Picture) -> tuple[Picture, Picture]:
-    """Return Sobel's derivatives of a picture to the right and down as float32: eight times the change per pixel."""
+    """Return Sobel's derivatives of a picture to the right and down as float32, eight times the change per pixel."""
     return convolve(picture, SLOPE, SMOOTH), convolve(picture, SMOOTH, SLOPE)
 
 
@@ -107,7 +107,7 @@ def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
 def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False) -> Picture:
     """Return a picture ``[h,w]`` or ``[h,w,c]`` in a larger size, as float32, by cubic convolution.
 
-    Outside of the picture, its border pixels are repeated, or the whole picture if ``periodic`` is true.
+    Outside of the picture, its border pixels are repeated. If ``periodic`` is true, the whole picture is repeated.
     """
     out: Picture = np.asarray(picture, np.float32)
     for axis, size in ((0, height), (1, width)):
@@ -136,7 +136,7 @@ def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
 def turn_picture(picture: Picture, orientation: int) -> Picture:
     """Turn a stored picture ``[h,w,...]`` as its ``orientation`` from 0 to 7 says.
 
-    For 4 to 7 the picture is first mirrored left to right. Then it is rotated counterclockwise by ``orientation % 4``
+    From 4 on, the picture is first mirrored left to right. Then it is rotated counterclockwise by ``orientation % 4``
     quarter turns.
     """
     return np.rot90(picture[:, ::-1] if is_mirrored(orientation) else picture, orientation % (ORIENTATIONS // 2))
@@ -154,10 +154,10 @@ def turn_back(picture: Picture, orientation: int) -> Picture:
 
 
 def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:
-    """Return the widths, in pixels, of the bars at the borders of a picture ``[h,w,c]``: above, below, left and right.
+    """Return the widths, in pixels, of the bars above, below, left and right in a picture ``[h,w,c]``.
 
-    A bar is of one colour, so its values differ by at most ``spread``. If it reaches the middle of the picture, it is
-    no bar, and its width is 0.
+    The values of a bar differ by at most ``spread``. An area that reaches the middle of the picture is no bar, so its
+    width is 0.
     """
     counts = []
     for lines in (image, image[::-1], image.swapaxes(0, 1), image.swapaxes(0, 1)[::-1]):

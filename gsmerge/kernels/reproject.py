@@ -12,15 +12,15 @@ from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8, na
     errors=f8("n", out=True),
 )  # fmt: skip
 def pixel_errors(points, views, viewmats, Ks, pixels, errors):
-    """Write to ``errors`` the distance, in pixels, of each point's projection into its view from its pixel.
+    """Write the distance, in pixels, between each point's projection into its view and its pixel to ``errors``.
 
-    It is inf if the point is behind the camera.
+    The distance is infinite if the point is behind the camera.
     """
 
 
 @native(points=f8("n", 3), viewmat=f8(4, 4), K=f8(3, 3), near=f8(), hit=u1("height", "width", out=True))
 def mark_pixels(points, viewmat, K, near, hit):
-    """Write 1 to the pixels of ``hit`` in which points beyond the depth ``near`` lie; leave the others unchanged."""
+    """Write 1 to the pixels of ``hit`` that contain points beyond the depth ``near``, and change no other pixel."""
 
 
 _see_points = declare(
@@ -31,10 +31,10 @@ _see_points = declare(
 
 
 def see_points(points, viewmats, Ks, depths, width, height, near, behind):
-    """Return two masks ``[v,n]`` of ``points [n,3]``: those inside the picture of each camera, and those that it sees.
+    """Return a mask ``[v,n]`` of ``points [n,3]`` inside the picture of each camera, and one of those that it sees.
 
     A point is inside only if its depth is more than ``near``. It is seen if its depth is at most ``behind`` times the
-    depth of the surface in its cell. ``depths [v,lines,columns]`` are the depths in a grid of cells over each picture.
+    depth of the surface there. ``depths [v,lines,columns]`` are these depths in a grid of cells over each picture.
     """
     inside, seen = np.empty((2, len(viewmats), len(points)), bool)
     masks = inside.view(np.uint8), seen.view(np.uint8)
@@ -48,11 +48,12 @@ def see_points(points, viewmats, Ks, depths, width, height, near, behind):
     views=i4("v", out=True), width=i8(least=1), height=i8(least=1), mixed=i4(least=0, most=1),
 )  # fmt: skip
 def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, width, height, mixed):
-    """Write to ``ids`` the pixel of each point, so that as many points as possible are in the order of the pixels.
+    """Choose a pixel for each point so that as many points as possible are in the order of their pixels.
 
-    Pixels are ordered by view and then by line. If ``mixed`` is 1, they are ordered by line and column, and the same
-    pixels of all views follow each other. A point without a pixel gets -1. Returns the number of points with a pixel.
-    The arrays from ``tails`` to ``views`` are scratch, of which ``before`` has n·v values.
+    A point may project into several views. The chosen pixels are written to ``ids``, and -1 for points without a pixel.
+    Returns the number of points with a pixel. Pixels are ordered by view and then by line. If ``mixed`` is 1, they are
+    ordered by line and column, and then by view. The arrays from ``tails`` to ``views`` are scratch, of which
+    ``before`` has n·v values.
     """
 
 
@@ -61,10 +62,9 @@ def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, w
     residuals=f8("rows", out=True),
 )  # fmt: skip
 def linearise(points, pixels, K, pose, jacobian, residuals):
-    """Write how far a view's points are projected from their pixels, and the derivatives of that by camera parameters.
+    """Write the reprojection errors of a view's points, and their derivatives with respect to camera parameters.
 
-    ``residuals [2n]`` are the errors of all points to the right, then those downwards. The columns of ``jacobian
-    [2n,6+f]`` are derivatives by the rotation and the shift of the camera, and by f intrinsics. With f = 1 this is the
-    logarithm of the focal length, with f = 2 these are those of both focal lengths, and with f = 4 also the principal
-    point.
+    ``residuals [2n]`` are the errors of all points to the right, then those downwards, in pixels. The columns of
+    ``jacobian [2n,6+f]`` are derivatives with respect to the camera's rotation, its shift, and f intrinsics: the
+    logarithm of the focal length (f = 1), or of both focal lengths (f = 2), and also the principal point (f = 4).
     """

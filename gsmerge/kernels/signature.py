@@ -34,20 +34,20 @@ ArraySize = int | str  # a number, or the name of a size, which may be that of a
 
 @dataclass(frozen=True)
 class Argument:
-    """An argument of a native function: an array in C order, or a scalar if it has no shape.
+    """Declaration of an argument of a native function, which is an array in C order, or a scalar without a shape.
 
-    The limits ``least``, ``below`` and ``most`` are numbers, or names of sizes and integer arguments.
+    The limits ``least``, ``below`` and ``most`` are None, numbers, or names of sizes or of integer arguments.
 
     Args:
         code: NumPy's name of the type.
         shape: Sizes of the array's axes, as numbers or names. A name stands for the same size in all arguments.
-        least: Smallest value; None for no limit.
-        below: All values are smaller than this; None for no limit.
-        most: Largest value; None for no limit.
-        ascending: True if no value is smaller than the value before it.
+        least: Smallest allowed value.
+        below: Least number above all allowed values.
+        most: Largest allowed value.
+        ascending: True if no value may be smaller than the value before it.
         out: True if the function writes the array.
-        optional: True if None is allowed, which becomes a null pointer. Other arguments must have the names in its
-            shape.
+        optional: True if None is allowed, which becomes a null pointer. Each name in its shape is also in the shape of
+            another argument.
     """
 
     code: str
@@ -72,7 +72,7 @@ class Argument:
 
     @cached_property
     def span(self) -> tuple[int, int]:
-        """The smallest and the largest integer that the type and the limits allow, as far as these are numbers."""
+        """The smallest and the largest integer within the type and within those limits that are numbers."""
         limits = np.iinfo(self.dtype)
         most = self.below - 1 if isinstance(self.below, int) else self.most
         return (
@@ -82,7 +82,7 @@ class Argument:
 
     @property
     def has_rules(self) -> bool:
-        """True if limits have to be checked once all sizes are known: those of arrays, and those that name a size."""
+        """True if limits have to be checked after all sizes are known, because they are of an array or name a size."""
         rules = [rule for rule in (self.least, self.below, self.most) if rule is not None]
         return self.ascending or any(self.shape or isinstance(rule, str) for rule in rules)
 
@@ -112,12 +112,13 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
     every call. A ValueError names the argument that has a wrong type, shape or range.
 
     Args:
-        returns: Scalar that the C function returns; None for nothing. If it is STATUS, the Python function returns
-            nothing. If it is COUNT, it returns a count. Both raise ValueError for an index outside its array.
-        arguments: Declarations of the arguments, in their order.
+        returns: Scalar that the C function returns, or None for no result. With STATUS, the Python function returns
+            nothing. With COUNT, it returns a count. Both raise ValueError for an index outside its array.
+        arguments: Declarations of the arguments in their order.
     """
 
     def wrap(function: Callable[..., Any]) -> Any:
+        """Check the names of the parameters, and return the native function with the docstring."""
         code = function.__code__
         if code.co_varnames[: code.co_argcount] != tuple(arguments):
             raise TypeError(f"{function.__name__}: expected parameters {list(arguments)}, as they are declared")
@@ -127,22 +128,24 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
 
 
 def declare(name: str, returns: Argument | None = None, /, **arguments: Argument) -> Callable[..., Any]:
-    """Return a function of the native library, with the checks of :func:`native` but without documentation."""
+    """Return a function of the native library without a docstring, with the checks of :func:`native`."""
     signature = inspect.Signature([inspect.Parameter(key, _POSITIONAL) for key in arguments])
     entries: dict[ctypes.CDLL, Any] = {}  # the C function in each loaded library, because tests load several
     names = size_names(arguments)
-    ruled = [(i, key, argument) for i, (key, argument) in enumerate(arguments.items()) if argument.has_rules]
+    limited = [(i, key, argument) for i, (key, argument) in enumerate(arguments.items()) if argument.has_rules]
 
     def convert(values: Sequence[Any], sizes: dict[str, int]) -> list[Any]:
+        """Check types and shapes, return the arguments for ctypes, and add named sizes to ``sizes``."""
         pairs = zip(arguments.items(), values, strict=True)
         return [_convert(name, key, argument, value, sizes) for (key, argument), value in pairs]
 
     def call(*values: Any, **named: Any) -> Any:
+        """Check the arguments, and call the C function of the loaded library."""
         if named or len(values) != len(arguments):
             values = signature.bind(*values, **named).args
         sizes: dict[str, int] = {}
         passed = convert(values, sizes)
-        for i, key, argument in ruled:
+        for i, key, argument in limited:
             _check_values(name, key, argument, values[i], sizes)
         library = load_library()
         if library not in entries:
@@ -153,7 +156,7 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
         return None if returns is STATUS else result
 
     def prepare(*values: Any) -> Callable[[], None]:
-        """Check arguments once; return a function that makes the call with them. Their memory must stay allocated."""
+        """Check arguments once, and return a function that makes the call. The caller keeps the arrays in memory."""
         sizes: dict[str, int] = {}
         passed = convert(values, sizes)
         passed += [sizes.get(key, 0) for key in names]
@@ -171,21 +174,22 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
 
 
 class Table:
-    """Declares a struct of the native library: addresses of arrays, then named sizes, then numbers, 8 bytes each."""
+    """Declaration of a struct of the native library: addresses of arrays, named sizes, and numbers, 8 bytes each."""
 
     def __init__(self, name: str, numbers: tuple[str, ...], **arrays: Argument) -> None:
         self.name, self.arrays = name, arrays
         self.fields = {key: i for i, key in enumerate((*arrays, *size_names(arrays), *numbers))}
 
     def fill(self, arrays: dict[str, np.ndarray[Any, Any]]) -> FilledTable:
-        """Return a struct with the addresses and sizes of ``arrays``, which are checked, and with numbers of zero."""
+        """Check ``arrays``, and return a struct with their addresses and sizes, and with zeros as numbers."""
         return FilledTable(self, arrays)
 
 
 class FilledTable:
-    """A struct as a :class:`Table` declares it. It keeps the arrays alive to which it points."""
+    """A struct that a :class:`Table` declares. It keeps its arrays in memory."""
 
     def __init__(self, table: Table, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
+        """Check the arrays, and write their addresses and sizes to ``values``."""
         self.table, self.arrays, self._sizes = table, dict[str, np.ndarray[Any, Any]](), dict[str, int]()
         self.values = np.zeros(len(table.fields), np.int64)
         for key in table.arrays:
@@ -194,7 +198,7 @@ class FilledTable:
             self[key] = size
 
     def point(self, key: str, array: np.ndarray[Any, Any]) -> None:
-        """Let the struct point to another array of the same sizes as before; ValueError if the array does not fit."""
+        """Let the struct point to another array, or raise ValueError if its sizes differ from those before."""
         self[key] = _convert(self.table.name, key, self.table.arrays[key], array, self._sizes)
         self.arrays[key] = array
 
@@ -212,14 +216,14 @@ def size_names(arguments: dict[str, Argument]) -> list[str]:
 
 
 def _prototype(name: str, returns: Argument | None, arguments: dict[str, Argument]) -> str:
-    """Return the declaration that a function must have in C."""
+    """Return the declaration of a function in C, which a test compares with the source."""
     parameters = [f"{argument.c}{'' if argument.shape else ' '}{key}" for key, argument in arguments.items()]
     parameters += [f"int64_t {size}" for size in size_names(arguments)]
     return f"{returns.c if returns else 'void'} {name}({', '.join(parameters)})"
 
 
 def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments: dict[str, Argument]) -> Any:
-    """Return a function of a loaded library, with the types of its arguments and of its result set."""
+    """Return a function of a loaded library for ctypes, and set the types of its arguments and of its result."""
     function = getattr(library, name)
     types = [ctypes.c_void_p if argument.shape else _CODES[argument.code][1] for argument in arguments.values()]
     function.argtypes = [*types, *[ctypes.c_int64] * len(size_names(arguments))]
@@ -228,7 +232,10 @@ def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments:
 
 
 def _convert(name: str, key: str, argument: Argument, value: Any, sizes: dict[str, int]) -> Any:
-    """Check the type and the shape of one argument, and return it as ctypes takes it; add named sizes to ``sizes``."""
+    """Check the type and the shape of one argument, and return the value or the address to pass.
+
+    Named sizes that are not known yet are added to ``sizes``.
+    """
     if not argument.shape:
         if argument.code[0] != "f":
             value = int(value)
@@ -255,8 +262,8 @@ def _convert(name: str, key: str, argument: Argument, value: Any, sizes: dict[st
 
 
 def _address(array: np.ndarray[Any, Any], writeable: bool) -> int:
-    """Return the address of an array's values. Through a writable buffer this takes a fifth of the time."""
-    if writeable and array.size:
+    """Return the address of an array's values."""
+    if writeable and array.size:  # a buffer takes a fifth of the time
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
     return int(array.__array_interface__["data"][0])
 

@@ -1,4 +1,4 @@
-"""Convert Gaussians as files store them: scales from their logarithms, and quaternions to unit length."""
+"""Convert the Gaussians of a file: scales from their logarithms, and quaternions to unit length."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from gsmerge.kernels.signature import f4, i4, i8, native
     scales=f4("n", 3, out=True), opacities=f4("n", out=True), sh0=f4("n", 3, out=True), shN=f4("n", "rest", out=True),
 )  # fmt: skip
 def convert_rows(rows, places, most_position, most_harmonic, most_log_scale, means, quats, scales, opacities, sh0, shN):
-    """Convert plain rows, block by block, and return the number of converted rows.
+    """Convert rows with usual values, in blocks of 64 rows, and return the number of converted rows.
 
-    The first block with a row that is not plain ends the conversion; later rows of the outputs are undefined. A block
-    has 64 rows. A row is plain if its values are finite, its positions, harmonics and log scales are within the limits,
-    and its quaternion has a length between 1e-15 and 1e15. ``places`` are the columns of x, y, z, of the harmonics in
-    the order of ``sh0`` and ``shN``, of the log scales, of the quaternions wxyz, and of the opacity, which is copied.
+    The first block with an unusual row ends the conversion, so that the caller can handle it. Later rows of the outputs
+    are undefined. A row is usual if its values are finite, its positions, harmonics and log scales are within the
+    limits, and its quaternion has a length between 1e-15 and 1e15. ``places`` are the columns of x, y, z, of the
+    harmonics in the order of ``sh0`` and ``shN``, of the log scales, of the quaternions wxyz, and of the opacity.
+    Opacities are copied.
     """

@@ -1,7 +1,7 @@
 """Run the networks on tables of tokens, several tables at once, and apply their corrections.
 
-A token describes one Gaussian relative to its group. A table has a row of tokens for each of several groups, padded to
-the same width. Everything here works on arrays. In training,
+A token describes one Gaussian relative to its group. A table has a row of tokens for each of several groups. Rows are
+padded to the same number of tokens. Everything here works on arrays. In training,
 :class:`gsmerge.research.training.predict.TrainingContext` replaces methods of :class:`NetworkContext` by the same
 formulas on tensors, so that gradients pass from stage to stage.
 """
@@ -45,16 +45,16 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, as_array, concat_columns, concat_rows, like
 
-# Fields of a Feature Gaussian that describe it alone; its members, their weights and its view belong to its cluster
+# Fields that a merged Feature Gaussian can take from one of its parts. The other fields describe the whole cluster
 OWN_COLUMNS = (*CORRECTED, "gains", "shN", "footprints")
-RunTable = Callable[[np.ndarray, int], Array]  # takes the groups and the width of a table, returns [groups,columns]
+RunTable = Callable[[np.ndarray, int], Array]  # takes the groups and the width of a table, and returns [groups,columns]
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkContext(Corrector):
-    """Networks together with the scene from which their inputs come."""
+    """Networks, together with the scene from which they get their inputs."""
 
-    networks: RunnableNetworks  # encoder, merger, refiner and decoder heads; in training torch modules
+    networks: RunnableNetworks  # encoder, merger, refiner and decoder heads, in training as torch modules
     members: Members  # the scene's Gaussians
     cameras: Cameras  # the scene's views
     seed: int = 0  # seed by which members of large groups are sampled
@@ -70,15 +70,18 @@ class NetworkContext(Corrector):
         return self.options.max_children
 
     def encode(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Correct Feature Gaussians with the encoder; with the ``geometry`` "carried" also with the head for K = 1."""
+        """Correct Feature Gaussians with the encoder.
+
+        If the option ``geometry`` is "carried", their covariances are decoded by the head for K = 1, as in the paper.
+        """
         encoded = encode_features(features, self)
         if self.options.geometry != "carried":
             return encoded
-        # the head gives only scales and rotations; the mean is that of the encoder (paper section 4.2)
+        # The head gives only scales and rotations. The mean is that of the encoder (paper section 4.2)
         return replace(encoded, covars=self.decode_covars(encoded))
 
     def decode_covars(self, features: FeatureGaussians) -> Array:
-        """Decode each Feature Gaussian by the head for K = 1; return the covariances ``[g,3,3]`` of the Gaussians."""
+        """Decode each Feature Gaussian by the head for K = 1, and return the covariances ``[g,3,3]`` of the results."""
         described = self.describe(features)
         decoded = decode_gaussians(described.base, np.arange(len(features)), described, self)
         return covariances(decoded.quats, decoded.scales)
@@ -86,7 +89,7 @@ class NetworkContext(Corrector):
     def merge(
         self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     ) -> FeatureGaussians:
-        """Correct c merged Feature Gaussians with the merger (paper section 4.4).
+        """Correct merged Feature Gaussians with the merger (paper section 4.4).
 
         Row i of ``pooled`` is a cluster of the rows ``order[cuts[i] : cuts[i + 1]]`` of the Feature Gaussians
         ``parts``. In the paper the merger corrects the first of these rows instead of the pooled Feature Gaussian.
@@ -99,18 +102,19 @@ class NetworkContext(Corrector):
             pooled = replace(pooled, **first_columns)
         group_features, base = self.describe(pooled), self.make_base(parts)
         sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), self.seed)
-        from_means, means = as_array(parts.means), as_array(pooled.means)
+        part_means, means = as_array(parts.means), as_array(pooled.means)
 
-        def run_rows(rows: np.ndarray, width: int) -> Any:
+        def run_table(rows: np.ndarray, width: int) -> Any:
+            """Run the merger on the clusters ``rows``, from each of which at most ``width`` parts are sampled."""
             positions, owners = group_rows(cuts[rows], sizes[rows])
-            keys = ((from_means[order[positions]] - means[rows[owners]]) ** 2).sum(1)
+            keys = ((part_means[order[positions]] - means[rows[owners]]) ** 2).sum(1)
             sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
             ids = order[positions][sample.reshape(-1)]
             relative = self.make_tokens(base, ids, np.repeat(rows, width), group_features)
             tokens = concat_columns([relative, parts.latents[ids]]).reshape(*mask.shape, -1)
             return self.networks.run("merger", tokens, mask, group_features.group[rows])
 
-        outputs = self.run_tables(sizes, options.members, FEATURE + options.latent, run_rows)
+        outputs = self.run_tables(sizes, options.members, FEATURE + options.latent, run_table)
         return _apply_outputs(group_features, outputs, self)
 
     @stage("refine")
@@ -124,7 +128,8 @@ class NetworkContext(Corrector):
         count, width = len(features), neighbors.shape[1] + 1
         table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
 
-        def run_rows(rows: np.ndarray, _: int) -> Any:
+        def run_table(rows: np.ndarray, _: int) -> Any:
+            """Run the refiner on the groups ``rows``, each with its neighbours."""
             ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
             mask = ids >= 0
             ids = np.where(mask, ids, owners)
@@ -133,8 +138,8 @@ class NetworkContext(Corrector):
             tokens = concat_columns([relative, is_same_view, features.latents[ids]]).reshape(len(rows), width, -1)
             return self.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
 
-        max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
-        outputs = self.run_tables(np.full(count, width), max_width, columns, run_rows)
+        max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent  # width up to a power of two
+        outputs = self.run_tables(np.full(count, width), max_width, columns, run_table)
         return _apply_outputs(group_features, outputs, self)
 
     @property
@@ -147,7 +152,7 @@ class NetworkContext(Corrector):
         return decode_gaussians(children, parents, self.describe(features), self)
 
     def make_base(self, features: FeatureGaussians) -> Gaussians:
-        """Return the Gaussian with the moments of each Feature Gaussian, as the kernels take it."""
+        """Return Gaussians with the moments of Feature Gaussians, as contiguous arrays for the kernels."""
         return contiguous(feature_to_gaussians(features))
 
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
@@ -157,9 +162,9 @@ class NetworkContext(Corrector):
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Return the networks' input ``[m,c]`` for the Gaussians ``ids [m]`` of ``parts``.
+        """Return tokens ``[m,c]`` that describe the Gaussians ``ids [m]`` of ``parts`` relative to their groups.
 
-        Each is described relative to its group, ``owners [m]``. Members have more columns than decoded Gaussians.
+        ``owners [m]`` are the groups. Members have more columns than other Gaussians.
         """
         return part_tokens(
             parts, ids, owners, group_features, MEMBER_COLUMNS if isinstance(parts, Members) else PART_COLUMNS
@@ -171,7 +176,7 @@ class NetworkContext(Corrector):
         return move_features(g.features, g.base, as_array(residuals), g.frames)
 
     def run_tables(self, sizes: np.ndarray, max_width: int, columns: int, run: RunTable) -> Array:
-        """Split groups of ``sizes [g]`` into tables, and call ``run`` on each; return all outputs ``[g,columns]``."""
+        """Split groups of ``sizes [g]`` into tables, call ``run`` on each, and join the outputs to ``[g,columns]``."""
         tables = list(split_tables(sizes, max_width))
         if not tables:
             return np.zeros((0, columns), np.float32)
@@ -192,10 +197,11 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
     group_features, starts, ids = context.describe(features), features.starts, features.members
     sizes, seeds = np.diff(starts), point_seeds(as_array(features.means), context.seed)
     base = group_features.base
-    # [g,3] the longest axis of each Gaussian, which is the last column of its rotation, because scales are ascending
+    # [g,3] the longest axis of each Gaussian: column 2 of its 3 x 3 rotation, because scales are ascending
     axes, means = np.stack(rotation_entries(*as_array(base.quats).T)[2::3], 1), as_array(base.means)
 
-    def run_rows(rows: np.ndarray, width: int) -> Any:
+    def run_table(rows: np.ndarray, width: int) -> Any:
+        """Run the encoder on the groups ``rows``, from each of which at most ``width`` members are sampled."""
         positions, owners = group_rows(starts[rows], sizes[rows])
         offsets = context.members.means[ids[positions]] - means[rows[owners]]
         keys = (offsets * axes[rows[owners]]).sum(1)
@@ -205,24 +211,24 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
         table = tokens.reshape(*mask.shape, MEMBER_COLUMNS)
         return context.networks.run("encoder", table, mask, group_features.group[rows])
 
-    encoded = context.run_tables(sizes, options.members, options.latent + 3, run_rows)
+    encoded = context.run_tables(sizes, options.members, options.latent + 3, run_table)
     zeros = np.zeros((len(features), FEATURE - 3), np.float32)
     residuals = scale_outputs(concat_columns([encoded[:, -3:], zeros]), options.bounds, HALF)
     return replace(context.correct_features(group_features, residuals), latents=encoded[:, :-3])
 
 
 def find_neighbors(means: np.ndarray, count: int) -> np.ndarray:
-    """Return the nearest neighbours ``[g,count]`` int64 of points ``means [g,3]``; -1 where there are fewer."""
+    """Return the nearest neighbours ``[g,count]`` int64 of points ``means [g,3]``, and -1 where there are fewer."""
     means, neighbors = means.astype(np.float64), np.full((len(means), count), -1, np.int64)
     rows = np.flatnonzero(np.isfinite(means).all(1))
-    no_views = np.full(len(rows), -1, np.int64)  # so that every other point is one of another view
+    no_views = np.full(len(rows), -1, np.int64)  # these points count as points of different views
     nearest = nearest_of_other_views(means[rows], no_views, count)
     neighbors[rows] = np.where(nearest < 0, -1, rows[nearest])
     return neighbors
 
 
 def _apply_outputs(group_features: GroupFeatures, outputs: Array, context: NetworkContext) -> FeatureGaussians:
-    """Apply the outputs ``[g,14+latent]`` of merger or refiner: corrections of Gaussians, and changes of latents."""
+    """Apply outputs ``[g,14+latent]`` of the merger or the refiner, which are corrections and changes of latents."""
     features = group_features.features
     moved = context.correct_features(group_features, scale_outputs(outputs[:, :FEATURE], context.options.bounds, HALF))
     return replace(moved, latents=like(features.latents, outputs) + outputs[:, FEATURE:])
@@ -231,11 +237,11 @@ def _apply_outputs(group_features: GroupFeatures, outputs: Array, context: Netwo
 def decode_gaussians(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Gaussians:
-    """Correct the children of Feature Gaussians with the decoder head for their number (paper section 4.3).
+    """Correct the children of each Feature Gaussian with the decoder head for their number (paper section 4.3).
 
-    The children of a Feature Gaussian are adjacent. ``parents [n]`` are their rows in ``group_features``, ascending.
-    Three children use three slots of the head for four. Five to eight children are corrected in two halves, as if each
-    half were a group of its own. Heads with absolute outputs cannot do this.
+    The children of a Feature Gaussian are adjacent. ``parents [n]`` are the rows of the Feature Gaussians in
+    ``group_features``, ascending. Three children use the head for four. Five to eight children are corrected in two
+    halves, as if each half were a group of its own. Heads with absolute outputs cannot do this.
     """
     children = prepare_children(children, parents, group_features, context.options)
     residuals = as_array(run_heads(contiguous(children), parents, group_features, context))
@@ -245,10 +251,10 @@ def decode_gaussians(
 def prepare_children(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, options: NetworkOptions
 ) -> Gaussians:
-    """Return what the heads correct: the children, or a round Gaussian in place of each for absolute outputs.
+    """Return the Gaussians that the heads correct: the children or, for absolute outputs, as many round Gaussians.
 
-    A round Gaussian has the mean and the base colour of its group, and the axes of the group's frame. The outputs of
-    the head are offsets from these (paper section 4.3). Its size is that of the group, and its opacity is 0.5.
+    A round Gaussian has the mean, the base colour and the size of its group, the axes of the group's frame, and an
+    opacity of 0.5. The outputs of the head are offsets from these numbers (paper section 4.3).
     """
     if not options.makes_children:
         return children
@@ -266,13 +272,13 @@ def prepare_children(
 def run_heads(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Array:
-    """Return bounded corrections ``[n,13]`` of children by the heads; zeros if there is no head for their number."""
+    """Return bounded corrections ``[n,13]`` of children by the heads, or zeros if no head corrects their number."""
     options = context.options
     count, halves = len(group_features.features), options.max_children > SLOTS[-1]
     starts, sizes, owners = _split_siblings(parents, count, halves=halves)
-    # children without a head keep row 0 of the outputs, which is zero
-    outputs, output_rows, total = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
-    for slots, min_size in zip(SLOTS, (1, 2, 3), strict=True):
+    # The outputs begin with a row of zeros, for children without a head
+    outputs, output_rows, num_outputs = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
+    for slots, min_size in zip(SLOTS, (1, 2, 3), strict=True):  # the heads and their least numbers of children
         rows = np.flatnonzero((sizes >= min_size) & (sizes <= slots))
         if len(rows) == 0:
             continue
@@ -280,8 +286,8 @@ def run_heads(
         mask = offsets < sizes[rows, None]
         ids = starts[rows, None] + np.where(mask, offsets, 0)
         outputs.append(_run_head(children, owners[rows], ids, mask, group_features, context))
-        output_rows[ids[mask]] = total + np.flatnonzero(mask)
-        total += mask.size
+        output_rows[ids[mask]] = num_outputs + np.flatnonzero(mask)
+        num_outputs += mask.size
     return scale_outputs(
         concat_rows(outputs)[output_rows], ABSOLUTE_BOUNDS if options.makes_children else options.bounds
     )
@@ -290,8 +296,8 @@ def run_heads(
 def _split_siblings(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the first row, the number and the parent of each run of children that a head corrects together.
 
-    ``parents`` are those of all children, of ``count`` parents. If ``halves`` is true, more than four children of a
-    parent are split into two runs.
+    ``parents`` has the parent of each child, from 0 to ``count - 1``. If ``halves`` is true, more than four children of
+    a parent are split into two runs.
     """
     sizes = np.bincount(parents, minlength=count)
     starts = np.cumsum(sizes) - sizes
@@ -310,18 +316,19 @@ def _run_head(
     group_features: GroupFeatures,
     context: NetworkContext,
 ) -> Array:
-    """Return the outputs ``[r·slots,13]`` of a head for r runs of children.
+    """Return the outputs ``[r·slots,13]`` of the head for ``slots`` children, run on r runs of children.
 
-    ``parents [r]`` are the rows of their groups, ``ids [r,slots]`` the rows of the children, and ``mask [r,slots]`` is
+    ``parents [r]`` are the groups of the runs, and ``ids [r,slots]`` the rows of the children. ``mask [r,slots]`` is
     false for slots without a child.
     """
     slots, latents = mask.shape[1], group_features.features.latents
 
-    def run_rows(rows: np.ndarray, _: int) -> Any:
+    def run_table(rows: np.ndarray, _: int) -> Any:
+        """Run the head on the runs ``rows``."""
         owners = parents[rows]
         tokens = context.make_tokens(children, ids[rows].reshape(-1), np.repeat(owners, slots), group_features)
         table = tokens.reshape(len(rows), slots, PART_COLUMNS)
         return context.networks.run(f"heads.{slots}", latents[owners], group_features.group[owners], table, mask[rows])
 
-    outputs = context.run_tables(np.full(len(parents), slots), slots, slots * RESIDUAL, run_rows)
+    outputs = context.run_tables(np.full(len(parents), slots), slots, slots * RESIDUAL, run_table)
     return outputs.reshape(-1, RESIDUAL)

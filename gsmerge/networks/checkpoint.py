@@ -41,7 +41,7 @@ class Checkpoint:
     training: Mapping[str, Any]  # facts about the training, as the trainer wrote them
 
     def facts(self) -> dict[str, Any]:
-        """Return what a report says about the checkpoint: name, versions, sizes and training."""
+        """Return the entries of a report about the checkpoint: name, versions, sizes and training."""
         sizes = {"num_parameters": self.networks.num_parameters, "options": asdict(self.networks.options)}
         name = next((name for name, path in IN_PACKAGE.items() if path == self.path), str(self.path))
         head = {"checkpoint": name, "schema": SCHEMA, "gsmerge": self.version}
@@ -49,7 +49,7 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | PathLike[str], networks: NetworkWeights, training: Mapping[str, Any]) -> None:
-    """Write networks and facts about their training to a file, replacing it; SceneError if that fails."""
+    """Write networks and facts about their training to a file, which may exist. Raises SceneError if that fails."""
     header = {"schema": SCHEMA, "gsmerge": __version__, "options": asdict(networks.options), "training": dict(training)}
     with atomic_output(path, overwrite=True) as temporary:
         temporary.write_bytes(
@@ -74,7 +74,7 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
 
 
 def build_networks(path: Path, options: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NetworkWeights:
-    """Make networks of options, as ``NetworkOptions.from_dict`` takes them, and weights by name.
+    """Make networks from their options, see :meth:`NetworkOptions.from_dict`, and their weights by name.
 
     Raises SceneError about the file ``path`` if an option is out of range, or if the weights do not fit the options.
     """
@@ -114,17 +114,17 @@ def _read_header(header: Mapping[str, str], budget: ReadBudget) -> tuple[dict[st
 
 
 def _header_error(path: StrPath, error: Exception) -> SceneError:
-    """Return the error to raise for a file whose header does not describe networks; ``error`` says why."""
+    """Return the error to raise for a file whose header does not describe networks, for the reason in ``error``."""
     reason = str(error).splitlines()[0]
     return SceneError(path, f"expected a header that describes the networks ({reason})", REMEDY)
 
 
 def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, list[str]]:
-    """Load a checkpoint by name; also return notes for the user.
+    """Load a checkpoint by name, and return it with notes for the user.
 
-    ``name`` is a file, or ``"shipped"`` or ``"paper"`` for one in the package. For ``"none"`` the checkpoint is None,
-    and the stages run without networks. If a checkpoint of the package cannot be used and is not ``required``, it is
-    None too, and a note says so. In all other cases a checkpoint that cannot be used raises SceneError.
+    ``name`` is a file, or ``"shipped"`` or ``"paper"`` for one in the package. For ``"none"``, None is returned, and
+    the stages run without networks. If a checkpoint of the package cannot be used and is not ``required``, None is
+    returned with a note. Any other checkpoint that cannot be used raises SceneError.
     """
     if name == "none":
         return None, []

@@ -1,9 +1,9 @@
-"""Apply bounded corrections to Gaussians and Feature Gaussians; a correction of zero changes no bit.
+"""Apply bounded corrections to Gaussians and Feature Gaussians.
 
 A correction has 13 columns: a shift of the mean (3), changes of the log scales along the principal axes (3), a rotation
 vector (3), a change of the opacity's logit (1), and changes of the base colour (3). Shift and rotation vector are in
-the group's frame. A correction of a Feature Gaussian has one more column. It changes the logarithm of the mass, in
-addition to what size and opacity change of it.
+the group's frame. Corrections of Feature Gaussians have one more column, which is added to the logarithm of the mass.
+The mass also follows the changes of size and opacity. A correction of zero changes no bit.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CORRECTION_ROWS = 8192  # rows per task
 
 
 def residual_limits(bounds: Bounds) -> np.ndarray:
-    """Return the bounds ``[14]`` float32 of the columns of a Feature Gaussian's correction."""
+    """Return the bounds ``[14]`` float32 of the columns of a correction of Feature Gaussians."""
     b = bounds
     return np.array([b.mean] * 3 + [b.size] * 3 + [b.turn] * 3 + [b.logit] + [b.color] * 3 + [b.logit], np.float32)
 
@@ -43,6 +43,7 @@ def move_gaussians(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarr
     columns = {name: np.array(getattr(gaussians, name), np.float32, order="C") for name in names}
 
     def move(first: int) -> None:
+        """Correct the rows from ``first`` on in place."""
         rows = slice(first, first + CORRECTION_ROWS)
         correct_gaussians(*(column[rows] for column in columns.values()), residuals[rows], frames, owners[rows])
 
@@ -55,15 +56,16 @@ def move_features(
 ) -> FeatureGaussians:
     """Apply corrections ``residuals [g,14]`` to Feature Gaussians.
 
-    ``base`` has one Gaussian for each group. ``frames [g,3,3]`` have the axes of each group as columns, in the world.
-    The tenth column is added to the logarithms of both the integrated optical depth and the mass, the last column only
-    to that of the mass. A change of scales does not change the opacity.
+    ``base`` are the Gaussians with their moments. ``frames [g,3,3]`` have the axes of each group as columns, in the
+    world. ``LOGIT_COLUMN`` is added to the logarithms of both the integrated optical depth and the mass,
+    ``MASS_COLUMN`` only to that of the mass. A change of scales does not change the opacity.
     """
     names = ("means", "covars", "masses", "extinctions", "sh0")
     columns = {name: np.array(getattr(features, name), np.float32, order="C") for name in names}
     fixed = (base.quats, base.scales, frames, np.ascontiguousarray(residuals[:, :RESIDUAL]))
 
     def move(first: int) -> None:
+        """Correct the rows from ``first`` on in place."""
         rows = slice(first, first + CORRECTION_ROWS)
         correct_features(*(column[rows] for column in (*columns.values(), *fixed)))
 

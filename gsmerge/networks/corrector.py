@@ -9,9 +9,9 @@ from gsmerge.types import FeatureGaussians, Gaussians
 
 
 class Corrector:
-    """Interface of the corrections, which changes nothing itself.
+    """Interface of corrections. This base class returns everything unchanged, for runs without networks.
 
-    The class with networks is :class:`gsmerge.networks.apply.NetworkContext`.
+    The subclass with networks is :class:`gsmerge.networks.apply.NetworkContext`.
     """
 
     @property
@@ -39,7 +39,7 @@ class Corrector:
 
     @property
     def makes_children(self) -> bool:
-        """True if :meth:`decode` makes all children itself, so that a group may have more than its members allow."""
+        """True if :meth:`decode` makes all children itself, so that a group may have more children than members."""
         return False
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:

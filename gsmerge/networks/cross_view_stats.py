@@ -19,7 +19,7 @@ NEAR_LOG = 0.03  # largest difference of the logarithms of two depths on the sam
 FAR_LOG = 0.3  # differences of the logarithms of depths are clipped to at most this
 MIN_SURFACE_OPACITY = 1 / 255  # a fainter Gaussian is no surface
 STATS_ROWS = 8192  # points per task
-# The search for neighbours compares MAX_COMPARED points for each neighbour, or for MIN_NEIGHBORS if there are fewer
+# The search compares MAX_COMPARED points for each wanted neighbour, or for MIN_NEIGHBORS neighbours if fewer are wanted
 MAX_COMPARED, MIN_NEIGHBORS = 64, 16
 
 
@@ -28,12 +28,13 @@ def cross_view_stats(
 ) -> np.ndarray:
     """Measure how well points agree with the Gaussians that they project onto in every other view.
 
-    A point with its mean in ``means [g,3]`` and its base colour in ``sh0 [g,1,3]`` belongs to a view in ``views [g]``
-    int64. It is compared with the ``most`` views nearest to this view, or with all others if None.
+    The points ``means [g,3]`` have base colours ``sh0 [g,1,3]`` and belong to ``views [g]`` int64. A point is compared
+    with the ``most`` views nearest to its own view, by default with all others.
 
-    Returns statistics ``[g,7]`` float32. The first is the logarithm of the number of views that see the point. The next
-    three are the shares of these views that have a surface at the point, behind it, and in front of it. Then follow
-    the mean differences of colours and of relative depths, and the logarithm of the number of all views.
+    Returns statistics ``[g,7]`` float32, scaled to about 1. Column 0 is the logarithm of the number of views that see
+    the point. Columns 1 to 3 are the shares of these views that have a surface at the point, behind it, and in front of
+    it. Columns 4 and 5 are the mean differences of colours and of relative depths, and column 6 is the logarithm of the
+    number of all views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, -1] = math.log(len(cameras)) / 4
@@ -46,6 +47,7 @@ def cross_view_stats(
     neighbors = np.sort(order_others(camera_distances(cameras))[:, :most], 1).astype(np.int32)
 
     def add_sums(begin: int) -> None:
+        """Compare the points from ``begin`` on with the views, and add the results to ``sums``."""
         end = min(begin + STATS_ROWS, len(points))
         sum_cross_view(
             points, colors, views, neighbors, viewmats, Ks, *size, m.fronts, m.means, m.opacities, m.sh0, *limits,
@@ -61,11 +63,12 @@ def cross_view_stats(
 
 
 def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
-    """Return the nearest points of other views, ``[g,count]`` int64, nearest first (paper section 4.4).
+    """Return, for each point, the nearest points of other views ``[g,count]`` int64, the nearest first.
 
-    Points are ``means [g,3]`` float64, finite, and belong to ``views [g]``. A view below 0 differs from all others. If
-    there are fewer than ``count`` points, the rest is -1. The search for a point ends after ``MAX_COMPARED`` times
-    ``count`` others, at least 1,024. Most of these belong to its own view, and Gaussians farther away do not overlap.
+    The finite points ``means [g,3]`` float64 belong to ``views [g]``. A view below 0 differs from all others. Rows with
+    fewer than ``count`` points end with -1. The search for a point ends after ``MAX_COMPARED`` times ``count``
+    comparisons, at least 1,024. Most of the compared points are of its own view, and Gaussians farther away do not
+    overlap. The paper matches such neighbours in section 4.4.
     """
     num = len(means)
     neighbors, means = np.empty((num, count), np.int64), np.ascontiguousarray(means)

@@ -14,18 +14,18 @@ SLOTS = (1, 2, 4)  # there is a decoder head for each of these numbers of childr
 OUTPUTS = ("residual", "absolute")
 STARTS = ("pooled", "first")
 GEOMETRIES = ("analytic", "carried")
-PART_COLUMNS = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
-MEMBER_COLUMNS = PART_COLUMNS + 6  # columns of a member, with its position in footprints and its colour at the end
+PART_COLUMNS = 13  # columns that describe a Gaussian in its group: position, log scales, opacity, colour, normal
+MEMBER_COLUMNS = PART_COLUMNS + 6  # those of a member also have its position in footprints, and its colour
 GROUP_COLUMNS = 19 + NUM_STATS  # numbers that describe a whole group
 RESIDUAL = 13  # columns of a correction, see gsmerge.networks.corrections
 FEATURE = RESIDUAL + 1  # columns of a correction of a Feature Gaussian; the last one changes its mass
 CORRECTED = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # fields that corrections change
-PAPER_NUMBERS = (4, 8, 9, 10)  # the numbers of a group that the paper's decoder reads: mass and base colour
+PAPER_NUMBERS = (4, 8, 9, 10)  # mass and base colour, which are the numbers of a group that the paper's decoder reads
 
 
 @dataclass(frozen=True)
 class Bounds(Settings):
-    """Largest corrections by the decoder; encoder, merger and refiner may each correct by half as much."""
+    """Largest corrections by the decoder. Encoder, merger and refiner may each correct by half as much."""
 
     mean: float = setting(1.0, "Shift along each axis of the group's frame, in units of the Gaussian's size.", least=0,
         most=8)  # fmt: skip
@@ -73,7 +73,10 @@ class NetworkOptions(Settings):
 
     @property
     def reads_children(self) -> bool:
-        """True if heads read the Gaussians that they correct; absolute heads learn only the group's size from them."""
+        """True if heads read the Gaussians that they correct.
+
+        With absolute outputs, these Gaussians tell only the group's size.
+        """
         return self.group_numbers or not self.makes_children
 
     @property
@@ -96,7 +99,7 @@ class NetworkOptions(Settings):
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> NetworkOptions:
-        """Make options from what ``dataclasses.asdict`` gives; ValueError for an unknown name or a wrong value."""
+        """Make options from the result of ``dataclasses.asdict``, or raise ValueError for a wrong name or value."""
         unknown = sorted(values.keys() - {f.name for f in fields(NetworkOptions)})
         bounds = values.get("bounds", {})
         if not isinstance(bounds, Mapping):
@@ -157,14 +160,16 @@ def _block(name: str, width: int) -> dict[str, tuple[int, ...]]:
 
 
 def _mlp(name: str, *widths: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the weights of linear layers, which have even numbers; activations have the odd ones."""
+    """Return the shapes of the weights of linear layers, which have even numbers, since activations have odd ones."""
     layers = (_linear(f"{name}.{2 * i}", *pair) for i, pair in enumerate(pairwise(widths)))
     return {key: shape for layer in layers for key, shape in layer.items()}
 
 
 def _linear(name: str, inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the weights of a linear layer."""
     return {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
 
 
 def _norm(name: str, width: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the weights of a layer norm."""
     return {f"{name}.weight": (width,), f"{name}.bias": (width,)}

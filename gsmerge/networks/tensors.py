@@ -1,4 +1,4 @@
-"""Apply corrections as :mod:`gsmerge.networks.corrections` does, but to tensors and with gradients."""
+"""Apply corrections to tensors with gradients, as :mod:`gsmerge.networks.corrections` does to arrays."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def skew_vectors(matrices: Tensor) -> Tensor:
 
 
 def move_tensors(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> Gaussians:
-    """Apply corrections ``residuals [n,13]`` to Gaussians of tensors, in ``frames [n,3,3]`` whose columns are axes."""
+    """Apply corrections ``residuals [n,13]`` to Gaussians, in ``frames [n,3,3]`` whose columns are axes."""
     g = gaussians
     opacities, factor = g.opacities, torch.exp(residuals[:, LOGIT_COLUMN])
     return replace(

@@ -1,6 +1,6 @@
 """Compute the inputs of the networks, which are numbers without a unit in the frame of each group.
 
-The axes of the frame are the right and down of the picture in the group's view, and the ray from the camera to the
+The axes of a frame point right and down in the picture of the group's view, and along the ray from the camera to the
 group. Lengths are in units of the Feature Gaussian's size or of the footprint of one pixel. So the inputs do not depend
 on depth, focal length, resolution or the scale of the world.
 """
@@ -25,7 +25,7 @@ class GroupFeatures:
     """Inputs of the networks for g Feature Gaussians, float32. In training, arrays with a gradient are tensors."""
 
     features: FeatureGaussians
-    base: Gaussians  # for each Feature Gaussian, the Gaussian with the same moments
+    base: Gaussians  # Gaussians with the moments of the Feature Gaussians
     frames: Array  # [g,3,3] columns are the axes of each group (right, down, away), in the world
     sizes: Array  # [g] geometric mean of the two largest scales, world units
     footprints: np.ndarray  # [g] size of one pixel, world units
@@ -34,7 +34,7 @@ class GroupFeatures:
 
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
-    """Return the inputs of the networks for Feature Gaussians, whose ``members`` are those of the whole scene."""
+    """Return the inputs of the networks for Feature Gaussians. ``members`` are the Gaussians of the whole scene."""
     views = choose_token_views(features, members, cameras)
     stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
     return describe_features(features, views, np.diff(features.starts), stats, cameras)
@@ -43,15 +43,16 @@ def compute_group_features(features: FeatureGaussians, members: Members, cameras
 def describe_features(
     features: FeatureGaussians, views: np.ndarray, num_members: np.ndarray, stats: np.ndarray, cameras: Cameras
 ) -> GroupFeatures:
-    """Return the inputs of the networks, if the ``views [g]`` and ``stats [g,7]`` of Feature Gaussians are known.
+    """Return the inputs of the networks for Feature Gaussians whose statistics are known.
 
-    ``stats`` are those of :func:`cross_view_stats`, and ``num_members [g]`` are numbers of members.
+    ``stats [g,7]`` are those of :func:`cross_view_stats`. ``views [g]`` define the frames of the Feature Gaussians, and
+    ``num_members [g]`` are their numbers of members.
     """
     bare = make_group_features(features, views, np.zeros((len(features), GROUP_COLUMNS), np.float32), cameras)
     base, group = bare.base, np.empty((len(features), GROUP_COLUMNS), np.float32)
-    sums = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
+    columns = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
     describe_groups(
-        base.means, base.scales, base.opacities, base.sh0, *sums, num_members, bare.footprints,
+        base.means, base.scales, base.opacities, base.sh0, *columns, num_members, bare.footprints,
         bare.frames, bare.sizes, _viewmats(cameras), views, group,
     )  # fmt: skip
     group[:, GROUP_COLUMNS - NUM_STATS :] = np.nan_to_num(stats)
@@ -61,7 +62,10 @@ def describe_features(
 def make_group_features(
     features: FeatureGaussians, views: np.ndarray, group: np.ndarray, cameras: Cameras
 ) -> GroupFeatures:
-    """Return the inputs of the networks, if ``views [g]`` and the numbers ``group [g,GROUP_COLUMNS]`` are known."""
+    """Return the inputs of the networks for Feature Gaussians with the numbers ``group [g,GROUP_COLUMNS]``.
+
+    ``views [g]`` define the frames of the Feature Gaussians.
+    """
     base = contiguous(feature_to_gaussians(features))
     frames, sizes = np.empty((len(features), 3, 3), np.float32), np.empty(len(features), np.float32)
     place_frames(base.means, base.scales, _viewmats(cameras), views, frames, sizes)
@@ -83,9 +87,10 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
 
 
 def choose_token_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
-    """Return a view ``[g]`` int64 for each Feature Gaussian.
+    """Return the view ``[g]`` int64 in which the frame of each Feature Gaussian is defined.
 
-    It is its own view, or after merging across views the one whose members have the largest sum of opacities.
+    A Feature Gaussian has the view that it was made from. If it was merged across views, it gets the view of most of
+    its members, which are weighted by their opacities.
     """
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)
@@ -94,8 +99,8 @@ def choose_token_views(features: FeatureGaussians, members: Members, cameras: Ca
     positions, owners = group_rows(features.starts[merged], np.diff(features.starts)[merged])
     ids = features.members[positions]
     pixels = members.pixels[ids]
-    seen = pixels // (cameras.width * cameras.height)
-    sums = np.bincount(owners * len(cameras) + seen, members.opacities[ids], len(merged) * len(cameras))
+    member_views = pixels // (cameras.width * cameras.height)
+    sums = np.bincount(owners * len(cameras) + member_views, members.opacities[ids], len(merged) * len(cameras))
     views[merged] = sums.reshape(len(merged), -1).argmax(1)
     return views
 
@@ -120,10 +125,10 @@ def part_tokens(
 
 
 def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Split groups of ``sizes [g]`` into tables; yield the groups and the width of each table.
+    """Split groups of ``sizes [g]`` into tables, and yield the groups and the width of each table.
 
-    A width is a power of two, at most ``max_width``. A table has groups of similar size, and larger groups than its
-    width have to be sampled. The split depends only on the sizes.
+    A table has groups of similar size. Its width is a power of two, at most ``max_width``. Groups with more members
+    have to be sampled. The split depends only on the sizes.
     """
     bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # exponents of the next powers of two
     widths = np.minimum(1 << bits, max_width)
@@ -135,33 +140,33 @@ def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray
             yield rows[start : start + step], int(width)
 
 
-def group_rows(begins: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions ``[m]`` of all members of groups, and the group ``[m]`` of each.
+def group_rows(starts: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions ``[m]`` of the members of all groups, group after group, and the group ``[m]`` of each.
 
-    The members of a group have ``sizes [g]`` adjacent positions from ``begins [g]`` on.
+    The members of a group have ``sizes [g]`` adjacent positions from ``starts [g]`` on.
     """
     owners = np.repeat(np.arange(len(sizes)), sizes)
     offsets = np.cumsum(sizes) - sizes
-    return np.arange(len(owners)) - offsets[owners] + begins[owners], owners
+    return np.arange(len(owners)) - offsets[owners] + starts[owners], owners
 
 
 def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sample at most ``width`` members of each group, evenly along their ``keys [m]``, whatever their order.
+    """Sample at most ``width`` members of each group, evenly along the keys of the members.
 
-    The keys are group after group, and ``sizes [g]`` are their numbers. A group with more than ``width`` members is
-    sorted by its keys and cut into ``width`` runs of similar length. ``seeds [g]`` uint64 choose one random member of
-    each run, so that the sample covers the group (paper supplement, encoder compute).
+    ``keys [m]`` has the keys of one group after another, and ``sizes [g]`` are the numbers of members. A group with
+    more than ``width`` members is sorted by its keys and cut into ``width`` runs of similar length. ``seeds [g]``
+    uint64 choose a random member of each run, so that the sample covers the group (paper supplement, encoder compute).
 
-    Returns positions ``[g,width]`` in ``keys``, and a mask ``[g,width]`` that is true for as many as there are. The
-    other positions repeat the first one of the group.
+    Returns positions ``[g,width]`` in ``keys``, and a mask ``[g,width]`` that is false where a group has too few
+    members. The positions there repeat the first one of the group.
     """
     offsets = np.cumsum(sizes) - sizes
     order = np.lexsort((keys, np.repeat(np.arange(len(sizes)), sizes)))
     slots = np.arange(width)[None]
     large = (sizes > width)[:, None]
-    low = slots * sizes[:, None] // width
-    high = (slots + 1) * sizes[:, None] // width
-    draws = low + np.floor(hash_uniform(seeds[:, None], slots.astype(np.uint64)) * (high - low)).astype(np.int64)
+    run_starts = slots * sizes[:, None] // width
+    run_sizes = (slots + 1) * sizes[:, None] // width - run_starts
+    draws = run_starts + np.floor(hash_uniform(seeds[:, None], slots.astype(np.uint64)) * run_sizes).astype(np.int64)
     within = np.where(large, draws, np.minimum(slots, sizes[:, None] - 1))
     mask = large | (slots < sizes[:, None])
     return order[offsets[:, None] + np.where(mask, within, 0)], mask

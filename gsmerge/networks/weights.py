@@ -1,7 +1,7 @@
 """Run the forward pass of the networks on arrays with the native library.
 
 The arithmetic is that of the torch modules for training, :mod:`gsmerge.research.training.modules`, up to rounding.
-Every group is computed by itself, so its results depend neither on the other groups of a table nor on the number of
+Every group is computed by itself. So its results depend neither on the other groups of a table nor on the number of
 threads.
 """
 
@@ -70,15 +70,15 @@ class NetworkWeights:
     def run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
         """Run ``"encoder"``, ``"merger"``, ``"refiner"`` or ``"heads.K"`` on a table of b groups.
 
-        The inputs are those of the torch module of the same name. Returns all its outputs, concatenated, as
-        ``[b,columns]`` after tanh, with 0 in place of NaN. The outputs of a head are ``[b,K * 13]``.
+        The inputs are those of the torch module of the same name. Returns the outputs of this network after tanh in one
+        array ``[b,columns]``, with 0 in place of NaN. A head has ``K * 13`` columns.
         """
         if name.startswith("heads."):
             return self._run_head(name, *inputs)
         return self._run_refiner(*inputs) if name == "refiner" else self._run_set_network(name, *inputs)
 
     def _run_set_network(self, name: str, tokens: np.ndarray, mask: np.ndarray, group: np.ndarray) -> np.ndarray:
-        """Run the encoder or the merger: embed tokens, run attention, pool the tokens, and join the group's numbers."""
+        """Run the encoder or the merger: embed tokens, run attention, pool tokens, and add the numbers of the group."""
         set_name = f"{name}.set"
         x = self._mlp(f"{set_name}.embed", tokens)
         for i in range(self.options.blocks):
@@ -89,7 +89,7 @@ class NetworkWeights:
         return np.concatenate([self._dense(f"{name}.{out}", hidden, TANH) for out in outs], 1)
 
     def _run_refiner(self, tokens: np.ndarray, mask: np.ndarray, group: np.ndarray) -> np.ndarray:
-        """Run the refiner, in which the first token of a group is the group itself, and the others its neighbours."""
+        """Run the refiner. The first token of each group describes the group itself, the others its neighbours."""
         x = self._mlp("refiner.embed", tokens)
         last = self.options.refine_blocks - 1
         for i in range(last + 1):
@@ -101,7 +101,7 @@ class NetworkWeights:
     def _run_head(
         self, name: str, latents: np.ndarray, group: np.ndarray, children: np.ndarray, mask: np.ndarray
     ) -> np.ndarray:
-        """Run a decoder head: make a token for each child, run attention, and return a correction for each."""
+        """Run a decoder head: make a token for each child, run attention, and return a correction of each child."""
         numbers = group[:, list(self.options.head_numbers)]
         x = self._mlp(f"{name}.seeds", np.concatenate([latents, numbers], 1))
         x = x.reshape(*children.shape[:2], self.options.width)
@@ -111,7 +111,7 @@ class NetworkWeights:
         return self._dense(f"{name}.out", x, TANH).reshape(len(children), -1)
 
     def _block(self, name: str, x: np.ndarray, mask: np.ndarray, *, first_token_only: bool = False) -> np.ndarray:
-        """Run an attention block on tokens ``x``; return the outputs of all tokens or only of the first token."""
+        """Run an attention block on tokens ``x``, for the outputs of all tokens or only of the first token."""
         context = self._norm(f"{name}.before", x)
         x, query = (x[:, :1], context[:, :1]) if first_token_only else (x, context)
         x = self._attention(f"{name}.attention", query, context, mask, x)
@@ -126,7 +126,7 @@ class NetworkWeights:
     def _attention(
         self, name: str, query: np.ndarray, context: np.ndarray, mask: np.ndarray, residual: np.ndarray
     ) -> np.ndarray:
-        """Let tokens ``query [b,q,w]`` attend to ``context [b,n,w]``; return the outputs plus ``residual [b,q,w]``."""
+        """Let tokens ``query [b,q,w]`` attend to ``context [b,n,w]``, and add ``residual [b,q,w]`` to the outputs."""
         (sets, queries, width), heads = query.shape, self.options.heads
         query, pairs = self._dense(f"{name}.query", query), self._dense(f"{name}.pair", context)
         mixed = np.empty((sets, queries, heads * padded(width // heads)), np.float32)
@@ -163,19 +163,22 @@ class NetworkWeights:
         return {name: self._layer(name) for name in names}
 
     def _layer(self, name: str) -> Layer:
-        """Return a packed linear layer; those before and after attention are padded, so that heads fill vectors."""
+        """Return a packed linear layer.
+
+        Layers before and after attention are padded with zeros, so that the values of each head fill whole vectors.
+        """
         weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
         width, heads = self.options.width, self.options.heads
         size = width // heads
         padded_columns = np.arange(width) // size * padded(size) + np.arange(width) % size
-        if name.endswith("attention.pair"):
+        if name.endswith("attention.pair"):  # outputs are keys, which are not padded, and values
             padded_columns = np.concatenate([np.arange(width), width + padded_columns])
             columns = width + heads * padded(size)
-            wide, shift = np.zeros((columns, width), np.float32), np.zeros(columns, np.float32)
-            wide[padded_columns], shift[padded_columns] = weight, bias
-            weight, bias = wide, shift
-        elif name.endswith("attention.out"):
-            wide = np.zeros((width, heads * padded(size)), np.float32)
-            wide[:, padded_columns] = weight
-            weight = wide
+            padded_weight, padded_bias = np.zeros((columns, width), np.float32), np.zeros(columns, np.float32)
+            padded_weight[padded_columns], padded_bias[padded_columns] = weight, bias
+            weight, bias = padded_weight, padded_bias
+        elif name.endswith("attention.out"):  # inputs are means of the values
+            padded_weight = np.zeros((width, heads * padded(size)), np.float32)
+            padded_weight[:, padded_columns] = weight
+            weight = padded_weight
         return *pack_weights(weight, bias), len(bias)

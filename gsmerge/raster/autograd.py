@@ -1,4 +1,4 @@
-"""Differentiable rendering of tensors."""
+"""Render tensors so that images have gradients."""
 
 from __future__ import annotations
 
@@ -27,11 +27,13 @@ class _Render(torch.autograd.Function):
     def forward(
         ctx: Any, cameras: Cameras, background: Array, options: dict[str, Any], with_depths: bool, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
+        """Draw all views. ``tensors`` are the fields of the Gaussians, and the view matrices."""
         cameras = replace(cameras, viewmats=tensors[-1])
         splats, viewmats, Ks = prepare_views(Gaussians(*tensors[:-1]), cameras)
         tiled_views: dict[int, TiledView] = {}
 
         def tile_one(view: int) -> TiledView:
+            """Tile a view, and keep the result for the backward pass."""
             tiled_views[view] = tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
             return tiled_views[view]
 
@@ -49,6 +51,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_images: Tensor, grad_alphas: Tensor, *_: Tensor) -> tuple[Any, ...]:
+        """Return the gradients of the arguments of :meth:`forward`, summed over the views, and None for the others."""
         *tensors, images, alphas = ctx.saved_tensors
         transmittances = 1 - alphas[..., 0]
         totals = [np.zeros(tensor.shape, np.float32) for tensor in tensors[:-1]]
@@ -74,7 +77,7 @@ class _Render(torch.autograd.Function):
 
 
 def _add_view(totals: list[Array], grads: Gradients, color_grads: ColorGradients) -> None:
-    """Add the gradients of one view to ``totals``, which have the gradients of all Gaussians, field by field."""
+    """Add the gradients of one view to ``totals``, an array for each field with the gradients of all Gaussians."""
     columns = [
         grads.means + color_grads.means,
         grads.quats,
@@ -91,7 +94,7 @@ def _add_view(totals: list[Array], grads: Gradients, color_grads: ColorGradients
 def render_tensors(
     gaussians: Gaussians, cameras: Cameras, background: Array, *, with_depths: bool, **options: Any
 ) -> Rendering:
-    """Render tensors on the CPU so that images and alphas are differentiable; see :func:`gsmerge.render`."""
+    """Render tensors on the CPU so that images and alphas are differentiable, see :func:`gsmerge.render`."""
     tensors = (*vars(gaussians).values(), cameras.viewmats)
     cameras = replace(cameras, viewmats=cameras.viewmats.detach())
     drawn = _Render.apply(cameras, background, options, with_depths, *tensors)

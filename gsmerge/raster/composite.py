@@ -19,7 +19,7 @@ from gsmerge.values.arrays import ArrayFields, as_array
 
 
 def background_color(background: ArrayLike) -> Array:
-    """Expand a background of one or three numbers to ``[3]``; ValueError for others."""
+    """Expand a background of one or three numbers to ``[3]``, or raise ValueError for other numbers."""
     try:
         return np.broadcast_to(np.asarray(background, np.float32), (3,)).copy()
     except (TypeError, ValueError):
@@ -27,7 +27,7 @@ def background_color(background: ArrayLike) -> Array:
 
 
 def view_colors(tiled: TiledView) -> Array:
-    """Evaluate the colours ``[m,3]`` of the Gaussians of a view as seen from it, clipped at 0."""
+    """Return the colours ``[m,3]`` that a view's Gaussians show to its camera, clipped at 0."""
     colors, splats = np.empty((len(tiled.ids), 3), np.float32), tiled.splats
     with use_threads() as threads:
         parallel_map(
@@ -38,11 +38,12 @@ def view_colors(tiled: TiledView) -> Array:
 
 
 def blend(tiled: TiledView, colors: Array, background: Array) -> tuple[Array, Array]:
-    """Blend ``colors [m,3]`` of the Gaussians of a view; return image ``[h,w,3]`` and transmittance ``[h,w]``."""
+    """Blend the Gaussians of a view with ``colors [m,3]`` to an image ``[h,w,3]`` and a transmittance ``[h,w]``."""
     image = np.empty((tiled.height, tiled.width, 3), np.float32)
     transmittance = np.empty((tiled.height, tiled.width), np.float32)
 
     def blend_tiles(span: tuple[int, int]) -> None:
+        """Blend a range of tiles."""
         kernels.blend(*tiled.lists, colors, *span, tiled.top, background, image, transmittance)
 
     with use_threads() as threads:
@@ -51,14 +52,14 @@ def blend(tiled: TiledView, colors: Array, background: Array) -> tuple[Array, Ar
 
 
 def depth_colors(tiled: TiledView, farthest: float = np.inf) -> Array:
-    """Return the depths of the Gaussians of a view as colours ``[m,3]``; larger depths become ``farthest``."""
+    """Return the depths of the Gaussians of a view as colours ``[m,3]``, at most ``farthest``."""
     return np.repeat(np.minimum(tiled.depths, np.float32(farthest))[:, None], 3, 1)
 
 
 def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Array]:
     """Return the mean depth ``[h,w]`` of the blended Gaussians of a view, and the transmittance ``[h,w]``.
 
-    Larger depths than ``farthest`` become ``farthest``.
+    Gaussians that are farther away than ``farthest`` count with this depth.
     """
     blended, transmittance = blend(tiled, depth_colors(tiled, farthest), np.zeros(3, np.float32))
     min_opacity = 1e-6  # blended depths are divided by the opacity of their pixel, or by this if it is smaller
@@ -91,6 +92,7 @@ def splat_adjoint(tiled: TiledView, image: Array) -> Array:
     slots = np.empty((len(tiled.flatten_ids), kernels.CHANNELS), np.float32)
 
     def sum_tiles(span: tuple[int, int]) -> None:
+        """Write the sums over each of a range of tiles to ``slots``."""
         kernels.weighted_sums(*tiled.lists, *span, channels, slots)
 
     with use_threads() as threads:
@@ -114,7 +116,7 @@ def survey(tiled: TiledView, colors: Array | None = None) -> tuple[Array, Array,
 
 
 def contributions(tiled: TiledView) -> tuple[Array, Array]:
-    """Return the sum ``[n]`` (pixels) and the maximum ``[n]`` of each Gaussian's blending weights; 0 if unseen."""
+    """Return the sum ``[n]`` (pixels) and the maximum ``[n]`` of each Gaussian's blending weights, 0 if unseen."""
     mass, peak = np.zeros((2, len(tiled.splats)), np.float32)
     mass[tiled.ids], peak[tiled.ids] = list_contributions(tiled)
     return mass, peak
@@ -134,7 +136,7 @@ class Rendering(ArrayFields):
     Args:
         images: ``[c,h,w,3]`` float32 over the background, not clamped at 1.
         alphas: ``[c,h,w,1]`` float32, 1 less the remaining transmittance.
-        depths: ``[c,h,w,1]`` float32 mean camera z of the blended Gaussians, 0 without any; None if not requested.
+        depths: ``[c,h,w,1]`` float32 mean camera z of the blended Gaussians, 0 without any, or None if not requested.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -152,7 +154,7 @@ class Rendering(ArrayFields):
         return f"Rendering({count} of {width} x {height}{'' if self.depths is None else ', depths'})"
 
     def _repr_png_(self) -> bytes | None:
-        """Encode the first views, side by side, as the PNG that a notebook shows; None without views."""
+        """Encode the first views, side by side, as the PNG that a notebook shows, or return None without views."""
         if len(self.images) == 0:
             return None
         notebook_views = 4  # number of a rendering's views that a notebook shows
@@ -178,14 +180,15 @@ def draw_views(
     with_depths: bool,
     first_view: int = 0,
 ) -> Rendering:
-    """Draw the views from ``first_view`` on; ``shape`` is (number of views, height, width).
+    """Draw the views from ``first_view`` on. ``shape`` is (number of views, height, width).
 
-    ``tile_one`` tiles the view of a number.
+    ``tile_one(view)`` projects and tiles the Gaussians for one view.
     """
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.empty((*shape, 1), np.float32) if with_depths else None
 
     def draw_view(view: int) -> None:
+        """Draw one view into the arrays of the result."""
         tiled = tile_one(first_view + view)
         images[view], transmittance = blend(tiled, view_colors(tiled), background)
         alphas[view, ..., 0] = 1 - transmittance

@@ -17,7 +17,8 @@ from gsmerge.kernels.raster.project import BLOCK, POSE, SUMS, project_backward
 from gsmerge.raster.tiled_view import Array, TiledView, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-# Least number of intersections or Gaussians per thread. The forward pass is faster per item, and has a higher one
+# Least number of intersections or Gaussians per thread. The forward pass has a higher number, because it takes less
+# time for each of them
 MIN_PER_THREAD = 1 << 12
 
 
@@ -25,7 +26,7 @@ MIN_PER_THREAD = 1 << 12
 class Gradients:
     """Gradients of a loss with respect to the Gaussians of a view."""
 
-    ids: Array  # [m] int32, ascending: the Gaussians of the rows; all other Gaussians have a gradient of zero
+    ids: Array  # [m] int32 Gaussians of the rows, ascending; all other Gaussians have a gradient of zero
     means: Array  # [m,3] float32, through geometry only; ColorGradients has the part through the viewing direction
     quats: Array  # [m,4] float32, with respect to the quaternions as stored, which may have any length
     scales: Array  # [m,3] float32, with respect to linear scales
@@ -34,7 +35,7 @@ class Gradients:
     viewmat: Array | None  # [4,4] float64, last row 0; None if not requested
 
     def __getitem__(self, rows: Array) -> Gradients:
-        """Select the gradients of the Gaussians ``rows`` (mask or indices); the gradient of the view matrix stays."""
+        """Select the gradients of the Gaussians ``rows`` (mask or indices), and keep that of the view matrix."""
         names = ("ids", "means", "quats", "scales", "opacities", "colors")
         return replace(self, **{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in names})
 
@@ -43,7 +44,7 @@ class Gradients:
 class ColorGradients:
     """Gradients of a loss through the colours of the Gaussians of a view."""
 
-    ids: Array  # [m] int32, ascending: the Gaussians of the rows; all other Gaussians have a gradient of zero
+    ids: Array  # [m] int32 Gaussians of the rows, ascending; all other Gaussians have a gradient of zero
     sh0: Array  # [m,1,3] float32
     shN: Array  # [m,k-1,3] float32
     means: Array  # [m,3] float32, through the viewing direction only
@@ -70,9 +71,9 @@ def gradients_of(
 
     All arrays are float32 and contiguous. ``colors [m,3]`` are the colours of the view's Gaussians. ``image [h,w,3]``,
     with its background, and ``transmittance [h,w]`` are the results of ``composite``. ``grad_image [h,w,3]`` and
-    ``grad_left [h,w]`` are the gradients of the loss with respect to these two; without ``grad_left`` the second is
-    zero. ``with_viewmat`` also asks for the gradient of the view matrix. The gradient of alpha is zero where alpha is
-    clamped at 0.99. Thresholds that decide whether a Gaussian is drawn have no gradient.
+    ``grad_left [h,w]`` are the gradients of the loss with respect to the image and the transmittance. Without
+    ``grad_left``, the latter is zero. ``with_viewmat`` also asks for the gradient of the view matrix. The gradient of
+    alpha is zero where alpha is clamped at 0.99. Thresholds that decide whether a Gaussian is drawn have no gradient.
     """
     m, splats = len(tiled.ids), tiled.splats
     slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
@@ -83,9 +84,11 @@ def gradients_of(
     poses = np.empty((num_blocks, POSE), np.float32) if with_viewmat else None
 
     def blend_tiles(span: tuple[int, int]) -> None:
+        """Write the sums of each Gaussian over each of a range of tiles."""
         blend_backward(*tiled.lists, colors, *span, image, transmittance, grad_image, grad_left, slots)
 
     def project(span: tuple[int, int]) -> None:
+        """Write the gradients of a range of Gaussians from their sums over all tiles."""
         gather_slots(tiled.flatten_ids, slots, *span, sums)
         project_backward(
             splats.means, splats.quats, splats.scales, tiled.opacities, tiled.ids, sums, tiled.camera, *span,
@@ -101,13 +104,13 @@ def gradients_of(
 
 
 def viewmat_gradient(poses: Array, origin: Array) -> Array:
-    """Return the gradient ``[4,4]`` float64 of the view matrix from the sums ``[blocks,POSE]`` of the kernel.
+    """Return the gradient ``[4,4]`` float64 of the view matrix in world coordinates.
 
-    The kernel is :func:`project_backward`. ``origin [3]`` is the origin of the splats.
+    ``poses [blocks,POSE]`` are partial sums of :func:`project_backward`, whose coordinates begin at ``origin [3]``.
     """
     pose, viewmat = poses.sum(0, dtype=np.float64), np.zeros((4, 4))
-    viewmat[:3, 3] = pose[9:]
-    viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], origin)
+    rotation, shift = pose[:9].reshape(3, 3), pose[9:]
+    viewmat[:3, 3], viewmat[:3, :3] = shift, rotation + np.outer(shift, origin)
     return viewmat
 
 
@@ -116,9 +119,9 @@ def color_gradients(
 ) -> ColorGradients:
     """Return the gradients of a loss through the spherical harmonics of the Gaussians of a view.
 
-    ``grad_colors [m,3]`` are :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours; no gradient passes
-    where they are clipped at 0. ``used`` is an earlier result that is no longer needed. Its memory is reused if it has
-    the same number of coefficients and enough rows, since new memory costs a quarter of the time or more.
+    ``grad_colors [m,3]`` are :attr:`Gradients.colors`. No gradient passes where ``colors [m,3]``, which are float32,
+    are clipped at 0. ``used`` is an earlier result that is no longer needed. Its memory is reused if it has the same
+    number of coefficients and enough rows, since new memory costs a quarter of the time or more.
     """
     m, splats = len(tiled.ids), tiled.splats
     shape_N = splats.shN.shape[1:]
@@ -139,12 +142,13 @@ def color_gradients(
 def pose_gradient(tiled: TiledView, gradients: Gradients, color_grads: ColorGradients | None = None) -> Array:
     """Return the gradient ``[4,4]`` float64 of a loss with respect to the view matrix.
 
-    It is that through the geometry and, with ``color_grads``, also through the colours.
+    The gradient passes through the geometry and, if ``color_grads`` are given, also through the colours.
     """
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
     if color_grads is not None:
-        # The eye is -R^T t. Only its position relative to the means counts, so its gradient is minus the sum of theirs
+        # The eye is -R^T t. Only the position of the eye relative to the means counts, so its gradient is minus the sum
+        # of the gradients of all means
         eye = -color_grads.means.sum(0, dtype=np.float64)
         viewmat[:3, :3] -= np.outer(tiled.viewmat[:3, 3], eye)
         viewmat[:3, 3] -= matmul(tiled.viewmat[:3, :3], eye)

@@ -18,7 +18,8 @@ from gsmerge.types import Cameras, Gaussians, Scene
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.arrays import Array, like
 
-# Gaussians. Larger scenes tile one view at a time, since a tiled view takes about as much memory as the Gaussians
+# Scenes of more Gaussians than this are tiled view by view, because a tiled view takes about as much memory as the
+# Gaussians
 ONE_AT_A_TIME = 4_000_000
 BAND_PIXELS = 1 << 22  # largest number of pixels drawn at once; larger images are drawn in bands to save memory
 
@@ -43,7 +44,7 @@ def render(
 ) -> Rendering:
     """Render Gaussians into every camera.
 
-    Arrays give arrays, and tensors give tensors. Rendering runs on the CPU: tensors on a GPU are copied to the CPU, and
+    Arrays give arrays, and tensors give tensors. Rendering runs on the CPU. Tensors on a GPU are copied to the CPU, and
     results and gradients are copied back.
 
     For tensors, images and alphas are differentiable with respect to the Gaussians and the view matrices. Depths and
@@ -51,7 +52,7 @@ def render(
 
     Args:
         gaussians: n Gaussians, SH degrees 0 to 4.
-        cameras: c cameras; the skew of their intrinsics is ignored.
+        cameras: c cameras, whose skew is ignored.
         background: Colour behind the Gaussians, 1 or 3 numbers.
         antialiased: Lower the opacity of small Gaussians to compensate for the dilation.
         near: Nearest depth drawn, world units, above 0.
@@ -62,7 +63,7 @@ def render(
         Images, alphas and, if requested, depths.
 
     Raises:
-        ValueError: If the background has another number of values, or if near and far are no valid range.
+        ValueError: If the background has another number of values, or if ``near`` is not above 0 and below ``far``.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -98,11 +99,11 @@ def render_in_batches(
     convert: Callable[[np.ndarray], np.ndarray] = np.asarray,
     columns: Sequence[tuple[int, int]] | None = None,
 ) -> Iterator[np.ndarray]:
-    """Yield the images ``[h,w,3]`` that :func:`render` makes, equal to the bit, each after ``convert``.
+    """Yield the images ``[h,w,3]`` of :func:`render`, with the same bits, each after ``convert``.
 
     At most ``at_once`` images are in memory. Large images are drawn and converted in bands, so ``convert`` has to work
-    pixel by pixel. ``columns`` has, for each image, the first and last + 1 column of pixels to draw. Tiles outside
-    these columns may show the background only.
+    pixel by pixel. ``columns`` has, for each image, the first column of pixels to draw and the column after the last.
+    Tiles outside these columns may show the background only.
     """
     background_rgb = background_color(background)
     tile_one = _make_tiler(gaussians, cameras, {"near": near}, columns)
@@ -123,16 +124,17 @@ def render_in_batches(
 def _make_tiler(
     gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any], columns: Sequence[tuple[int, int]] | None = None
 ) -> Callable[..., TiledView]:
-    """Prepare the Gaussians for cameras, and return the function ``tile_one(view, band)`` that tiles a view.
+    """Return a function ``tile_one(view, band)`` that tiles the view of a camera, or a band of it.
 
-    ``band`` is that of :func:`tile_view`, and ``columns`` are those of :func:`render_in_batches`.
+    See :func:`tile_view` for ``options`` and bands, and :func:`render_in_batches` for ``columns``, which are in pixels.
     """
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
-    spans = None if columns is None else [(left // TILE, -(-right // TILE)) for left, right in columns]  # of tiles
+    tile_columns = None if columns is None else [(left // TILE, -(-right // TILE)) for left, right in columns]
 
     def tile_one(view: int, band: tuple[int, int] | None = None) -> TiledView:
+        """Tile a view, or only the lines of tiles in ``band``."""
         camera = viewmats[view], Ks[view], cameras.width, cameras.height
-        return tile_view(splats, *camera, band=band, columns=None if spans is None else spans[view], **options)
+        return tile_view(splats, *camera, band=band, columns=tile_columns[view] if tile_columns else None, **options)
 
     return tile_one
 
@@ -143,6 +145,7 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Seque
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def tile_and_use(view: int) -> None:
+        """Tile one view, and call ``use`` for it."""
         use(view, tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR_PLANE))
 
     view_ids = range(len(scene)) if views is None else views
@@ -154,7 +157,7 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Seque
 
 
 def thin_out(gaussians: Gaussians, count: int) -> Gaussians:
-    """Sample every k-th Gaussian, at most ``count``, and enlarge the samples so that they cover about the same area."""
+    """Keep every k-th Gaussian, at most ``count``, but enlarged, so that they cover about the area of all Gaussians."""
     step = max(1, -(-len(gaussians) // count))
     sample = gaussians[::step]
     return replace(sample, scales=sample.scales * math.sqrt(step))

@@ -14,13 +14,13 @@ WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviat
 INNER = (slice(WINDOW // 2, -(WINDOW // 2)), slice(WINDOW // 2, -(WINDOW // 2)))  # pixels that are centres of windows
 C1, C2 = 0.01**2, 0.03**2  # stabilisers of SSIM (K1 = .01, K2 = .03) for a data range of 1
 MAX_LOSS = 0.5  # dB of PSNR that a result may lose against its input without a warning
-SAMPLE_LOSS = 1.0  # dB by which a loss that is measured on a sample may be wrong; at most .9 dB on fifteen captures
+SAMPLE_LOSS = 1.0  # dB by which a loss measured on a sample may be wrong; at most 0.9 dB on fifteen captures
 MAX_PSNR = 120.0  # dB that replace the infinite PSNR of equal pictures
-POOR_PSNR = 30.0  # dB of PSNR between a result and its input; below it their views look different
+POOR_PSNR = 30.0  # dB of PSNR between a result and its input, below which their views look different
 
 
 def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
-    """Convert two images ``[h,w,c]`` to arrays; raise ValueError if their shapes differ."""
+    """Convert two images ``[h,w,c]`` to arrays, or raise ValueError if their shapes differ."""
     first, second = as_array(image), as_array(reference)
     if first.ndim != 3 or first.shape != second.shape:
         raise ValueError(f"expected two images [h,w,c] of one shape, got {list(first.shape)} and {list(second.shape)}")
@@ -28,7 +28,7 @@ def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
 
 
 def pixel_mask(mask: Array, image: Array) -> Array:
-    """Convert a mask to ``[h,w]`` bool; raise ValueError if it is empty or has another size than the image."""
+    """Convert a mask to ``[h,w]`` bool, or raise ValueError if it is empty or has another size than the image."""
     selected = as_array(mask).astype(bool)
     if selected.ndim == 3 and selected.shape[2] == 1:
         selected = selected[..., 0]
@@ -49,13 +49,13 @@ def psnr_within(image: Array, reference: Array, masks: Sequence[Array | None]) -
     first, second = image_pair(image, reference)
     checked = [None if mask is None else pixel_mask(mask, first) for mask in masks]
     pairs = ((_select(first, mask), _select(second, mask)) for mask in checked)
-    means = [float((np.subtract(*pair, dtype=np.float64) ** 2).mean()) for pair in pairs]
-    return [-10 * float(log10(error)) if error > 0 else float("inf") for error in means]
+    errors = [float((np.subtract(*pair, dtype=np.float64) ** 2).mean()) for pair in pairs]
+    return [-10 * float(log10(error)) if error > 0 else float("inf") for error in errors]
 
 
 def _select(values: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """Return the values ``[h,w,c]`` of the pixels in ``mask [h,w]`` as ``[m,c]``; of all pixels without a mask."""
-    # compress takes a third of the time of a mask as an index
+    """Return the values ``[m,c]`` of the pixels in ``mask [h,w]``, or all values ``[h,w,c]`` without a mask."""
+    # compress takes a third of the time that indexing by a mask takes
     return values if mask is None else values.reshape(-1, values.shape[2]).compress(mask.reshape(-1), 0)
 
 
@@ -70,21 +70,21 @@ def psnr_words(psnr: float) -> str:
 
 
 def psnr_figure(psnr: float, choices: Mapping[str, object]) -> str:
-    """Write the PSNR (dB) of a scene's own views: with two digits if all views were scored, otherwise as an estimate.
+    """Write the PSNR (dB) of a scene's own views for a message.
 
-    The ``choices`` of a report say whether they were.
+    If the ``choices`` of a report say that all views were scored, it has two digits. Otherwise it is an estimate.
     """
     return f"{psnr:.2f} dB" if choices.get("scored_all") else f"about {psnr:.1f} dB"
 
 
 def is_worse(before: float | None, after: float | None, spare: float = 0.0) -> bool:
-    """Return whether a PSNR (dB) falls by more than ``MAX_LOSS - spare``; False if one of the two is None."""
-    # False for two infinities, too, whose difference is NaN
+    """Return whether a PSNR (dB) falls by more than ``MAX_LOSS - spare``, or False if one of the two is None."""
+    # Two infinite PSNRs are no loss either, because their difference is NaN
     return before is not None and after is not None and before - after > MAX_LOSS - spare
 
 
 def describe_loss(name: str, before: float | None, after: float | None, pictures: str) -> str | None:
-    """Describe a loss of quality on the scene's own ``pictures``; None if the loss is at most ``MAX_LOSS``.
+    """Describe a loss of quality on the scene's own ``pictures``, or return None if it is at most ``MAX_LOSS``.
 
     ``before`` and ``after`` are the PSNR (dB) of the pictures from the input and from the result, or None.
     """
@@ -94,7 +94,7 @@ def describe_loss(name: str, before: float | None, after: float | None, pictures
 
 
 def describe_distance(psnr: float | None) -> str | None:
-    """Describe that a result looks different from its input; None if ``psnr`` is None or ``POOR_PSNR`` dB or more."""
+    """Describe that a result looks different from its input, or return None if ``psnr`` is at least ``POOR_PSNR``."""
     if psnr is None or psnr >= POOR_PSNR:
         return None
     return f"the result looks different from its input: {psnr:.1f} dB, below {POOR_PSNR:g} dB"
@@ -103,12 +103,12 @@ def describe_distance(psnr: float | None) -> str | None:
 def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
     """Return the structural similarity, at most 1, over Gaussian windows of 11 x 11 pixels (Wang et al. 2004).
 
-    It is the mean over channels and over the windows that lie wholly inside the image, as computed by scikit-image's
-    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1,
-    data_range=1)``. This function is for measuring only. The loss of the full fit and of training has its own
-    definition, :func:`gsmerge.fit.loss.loss_ssim`.
+    The result is the mean over channels and over the windows that lie wholly inside the image, as computed by
+    scikit-image's ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+    channel_axis=-1, data_range=1)``. This function is for measuring only. The loss of the full fit and of training has
+    its own definition, :func:`gsmerge.fit.loss.loss_ssim`.
 
-    Images are ``[h,w,c]`` with at most 4 channels. ``mask [h,w]`` selects windows by their centres; a window also
+    Images are ``[h,w,c]`` with at most 4 channels. ``mask [h,w]`` selects windows by their centres, but a window also
     contains the pixels around its centre. Raises ValueError if shapes differ, the image is too small or no window is
     selected.
     """
@@ -124,8 +124,8 @@ def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
 def ssim_within(image: Array, reference: Array, masks: Sequence[Array | None]) -> list[float | None]:
     """Return the :func:`ssim` within each of the ``masks [h,w]``, where None stands for all pixels.
 
-    A result is None if there is no window: for a small image, or a mask without the centre of a window. All masks take
-    one comparison of the images.
+    A result is None if the image is smaller than a window, or a mask contains no centre of a window. The images are
+    compared once for all masks.
     """
     first, second = image_pair(image, reference)
     if min(first.shape[:2]) < WINDOW:

@@ -23,14 +23,14 @@ Score = TypeVar("Score")
 
 LEAST_OPACITY = 1 / 255  # rasterizers draw no smaller opacity
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
-# Gaussians. Larger scenes are rendered one view at a time, since a tiled view takes about as much memory as the
-# Gaussians. Threads then share the view
+# Scenes of more Gaussians than this are rendered view by view, because a tiled view takes about as much memory as the
+# Gaussians. Then all threads share one view
 ERRORS_ONE_AT_A_TIME = 400_000
-# From a line of tiles to the next, the scored tiles of a sample are shifted by TILE_STEP columns, a prime. At least
-# LEAST_TILES of a view are scored, so small views are scored whole. With 48, a gain on six views of 256 x 480 was
-# measured 1.0 dB too large
+# Scored tiles are shifted by TILE_STEP columns, a prime, from one line of tiles to the next. At least LEAST_TILES of a
+# view are scored, so small views are scored whole. With 48 tiles, a PSNR gain on six views of 256 x 480 pixels seemed
+# 1.0 dB larger than it was
 TILE_STEP, LEAST_TILES = 13, 100
-MASKED_WEIGHT = np.float32(0.1)  # weight of pixels outside masks; with a weight of 0 the Gaussians there would drift
+MASKED_WEIGHT = np.float32(0.1)  # weight of pixels outside masks; with 0, Gaussians there would drift
 COVERED_TRANSMITTANCE = np.float32(0.5)  # transmittance below which a pixel counts as covered by Gaussians
 WHOLE_SHARE = 0.98  # share of covered pixels from which on the whole view counts as covered
 
@@ -46,7 +46,7 @@ class RenderScore(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PhotoScore:
-    """Mean of the scores of several renders; see :class:`RenderScore`."""
+    """Mean of the scores of several renders, see :class:`RenderScore`."""
 
     psnr: float  # dB
     covered_psnr: float  # dB; NaN if no view has covered pixels
@@ -56,9 +56,9 @@ class PhotoScore:
 
 @dataclass(frozen=True)
 class Sample:
-    """Pixels of a photo at equal distances: each ``stride``-th column and row from ``column`` and ``row`` on.
+    """Every ``stride``-th column and row of a photo, from ``column`` and ``row`` on.
 
-    They form a smaller photo. Its camera projects to the centres of these pixels, with the low-pass of the whole photo.
+    These pixels form a smaller photo. Its camera projects to their centres, with the low-pass of the whole photo.
     """
 
     stride: int = 1
@@ -81,12 +81,12 @@ class Photos:
     images: np.ndarray  # [v,h,w,3] float32 sRGB in [0, 1], or uint8 if photos are larger than the grid; see image()
     viewmats: np.ndarray  # [v,4,4] world to camera
     Ks: np.ndarray  # [v,3,3] intrinsics at this size
-    # Variance of the low-pass, in square pixels of these photos. It is that of the full-size image, scaled, so that a
+    # Variance of the low-pass, in square pixels of these photos. It is scaled from that of full-size photos, so that a
     # fit filters Gaussians as the final render does
     eps2d: float
-    weights: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in [0, 1]; None: all 1
-    empty: np.ndarray | None = None  # [v,h,w] float32 share of each pixel that shows the background; None: 0
-    importance: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in a fit; None: all 1
+    weights: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in [0, 1], by default 1
+    empty: np.ndarray | None = None  # [v,h,w] float32 share of each pixel that shows the background, by default 0
+    importance: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in a fit, by default 1
 
     def __len__(self) -> int:
         return len(self.images)
@@ -111,7 +111,10 @@ class Photos:
         return self.images.shape[2]
 
     def image(self, view: int, background: np.ndarray | None = None, sample: Sample = WHOLE_PHOTO) -> np.ndarray:
-        """Return the photo ``[h,w,3]`` of a view, sRGB in [0, 1], over a ``background [3]``; None: black."""
+        """Return the photo ``[h,w,3]`` of a view, sRGB in [0, 1], or a sample of its pixels.
+
+        Where ``empty`` is above 0, a ``background [3]`` shows through.
+        """
         image = self.images[view][sample.pixels]
         image = np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
         if self.empty is None or background is None:
@@ -134,16 +137,17 @@ class Photos:
 
 
 def scene_pictures(scene: Scene) -> np.ndarray:
-    """Return a scene's photos ``[v,h,w,3]``; without photos, the base colours of the Gaussians in front."""
+    """Return a scene's photos ``[v,h,w,3]``, or without photos the base colours of the Gaussians in front."""
     return row_pictures(scene) if scene.images is None else scene.images
 
 
 def row_pictures(scene: Scene) -> np.ndarray:
-    """Return the base colours ``[v,h,w,3]`` of the Gaussians in front of a scene's pixels; 0 for pixels without any."""
+    """Return the base colours ``[v,h,w,3]`` of the Gaussians in front of a scene's pixels, 0 where there is none."""
     sh0, pixels = scene.gaussians.sh0[:, 0], scene.get_pixels()
     pictures = make_array((*pixels.fronts.shape, 3), np.float32)
 
     def draw(view: int) -> None:
+        """Write the picture of one view."""
         fronts, picture = pixels.fronts[view], pictures[view]
         np.clip(sh0_to_rgb(sh0.take(fronts, axis=0)), 0, 1, out=picture)
         if (fronts < 0).any():
@@ -154,7 +158,7 @@ def row_pictures(scene: Scene) -> np.ndarray:
 
 
 def scene_photos(scene: Scene, level: float = 1) -> Photos:
-    """Return the scene's photos with their cameras, shrunk by area averages to sides divided by ``level``."""
+    """Return the scene's photos with their cameras, shrunk by area averages to sides / ``level``."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
     photos = photos_of(scene.images, scene.cameras, level)
@@ -171,7 +175,7 @@ def with_pixel_values(photos: Photos, scene: Scene) -> Photos:
 def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
     """Convert masks ``[v,h,w]`` to pixel weights ``[v,height,width]``: 1 inside, ``MASKED_WEIGHT`` outside.
 
-    A pixel is inside if all of it is.
+    A pixel of the smaller photo is inside if all pixels of the mask that it covers are inside.
     """
     if masks is None:
         return None
@@ -181,7 +185,7 @@ def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarr
 
 
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
-    """Combine photos ``[v,h,w,3]`` with their cameras; shrink them by area averages to sides divided by ``level``."""
+    """Combine photos ``[v,h,w,3]`` with their cameras, and shrink them by area averages to sides / ``level``."""
     blank = blank_photos(cameras, level)
     return replace(blank, images=images if level == 1 else shrink_pictures(images, blank.width, blank.height))
 
@@ -191,6 +195,7 @@ def shrink_pictures(pictures: np.ndarray, width: int, height: int) -> np.ndarray
     small = make_array((len(pictures), height, width, *pictures.shape[3:]), pictures.dtype.type)
 
     def shrink(view: int) -> None:
+        """Write the small picture of one view."""
         small[view] = cv2.resize(pictures[view], (width, height), interpolation=cv2.INTER_AREA)
 
     parallel_map(shrink, range(len(pictures)))
@@ -198,7 +203,10 @@ def shrink_pictures(pictures: np.ndarray, width: int, height: int) -> np.ndarray
 
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
-    """Return black photos of the cameras, which take no memory; sides are divided by ``level``."""
+    """Return black photos for the cameras, with sides / ``level``, to draw views that have no photo.
+
+    The black images take no memory.
+    """
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     w, h = cameras.width, cameras.height
     width, height = max(1, round(w / level)), max(1, round(h / level))
@@ -223,17 +231,18 @@ def photo_errors(
     Args:
         gaussians: n Gaussians.
         photos: The photos, whose cameras are used.
-        score: Called with the view, its render ``[h,w,3]`` float32, not clipped, and the transmittance ``[h,w]``.
-        views: The views, in the order of the result; None: all.
-        near: Near plane in the unit of the Gaussians.
-        colors: ``[n,3]`` that replace the harmonics.
-        keep: ``keep(view)`` returns the mask ``[n]`` of the Gaussians to draw; None: all.
-        tiles: ``tiles(view)`` returns the mask ``[tile_height,tile_width]`` of the tiles that must be complete; None:
+        score: ``score(view, render, transmittance)`` returns the score of a render ``[h,w,3]``, which is not clipped.
+        views: The views in the order of the result, by default all.
+        near: Depth of the near plane, in the unit of the Gaussians.
+        colors: Colours ``[n,3]`` that replace the harmonics.
+        keep: ``keep(view)`` returns a mask ``[n]`` of the Gaussians to draw, by default all.
+        tiles: ``tiles(view)`` returns a mask ``[tile_height,tile_width]`` of tiles that have to be complete, by default
             all.
     """
     splats = gaussians if isinstance(gaussians, Splats) else make_splats(gaussians)
 
     def score_view(view: int) -> Score:
+        """Render one view, and return its score."""
         shown, complete = (None if choose is None else choose(view) for choose in (keep, tiles))
         tiled = tile_view(splats, **photos.camera(view), near=near, keep=shown, tiles=complete)
         return score(view, *composite(tiled, colors))
@@ -255,23 +264,25 @@ def score_photos(
 ) -> PhotoScore:
     """Score renders of Gaussians against the photos of ``views``.
 
-    Of each ``every`` tiles one is scored, see :func:`scored_tiles`. ``covered`` has a mask ``[h,w]`` of the
-    covered pixels for each of the views. By default a pixel is covered if its opacity is above a half. ``settings`` are
-    options of :func:`photo_errors`.
+    One of ``every`` tiles is scored, see :func:`scored_tiles`. ``covered`` has a mask ``[h,w]`` of the covered pixels
+    for each of the views. By default a pixel is covered if its opacity is above a half. ``settings`` are options of
+    :func:`photo_errors`.
     """
     masks = {} if covered is None else dict(zip(views, covered, strict=True))
 
     def tiles(view: int) -> np.ndarray | None:
+        """Return the tiles of a view that have to be complete, because they are scored."""
         return scored_tiles(view, photos.width, photos.height, every)
 
     def score_render(view: int, image: np.ndarray, transmittance: np.ndarray) -> RenderScore:
+        """Score the render of one view."""
         return _score_render(image, masks.get(view, transmittance < COVERED_TRANSMITTANCE), photos, view, every)
 
     return _average_scores(photo_errors(gaussians, photos, score_render, views, tiles=tiles, **settings))
 
 
 def _average_scores(scores: Sequence[RenderScore]) -> PhotoScore:
-    """Average the scores of views; each PSNR is at most MAX_PSNR, so that views with equal pictures do not dominate."""
+    """Average the scores of views. Each PSNR counts as at most ``MAX_PSNR``, because it may be infinite."""
     covered_psnrs = [min(score.covered_psnr, MAX_PSNR) for score in scores if score.share > 0]
     share = float(np.mean([score.share for score in scores]))
     mean = float(np.mean([min(score.psnr, MAX_PSNR) for score in scores]))
@@ -293,9 +304,10 @@ def _score_render(image: np.ndarray, covered: np.ndarray, photos: Photos, view: 
 
 
 def _scored_pixels(photos: Photos, view: int, every: int) -> np.ndarray | None:
-    """Return the mask ``[h,w]`` of the pixels inside the photo's mask and inside the scored tiles; None: all pixels.
+    """Return the mask ``[h,w]`` of the pixels that are scored, or None for all pixels.
 
-    If no pixel is inside both, all pixels of the photo's mask are returned. If that is empty, those of the tiles are.
+    Pixels are scored inside the photo's mask and inside the scored tiles. If there are none, all pixels of the photo's
+    mask are scored. If the photo's mask is empty, all pixels of the scored tiles are scored.
     """
     tiles = scored_tiles(view, photos.width, photos.height, every)
     in_tiles = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
@@ -307,10 +319,10 @@ def _scored_pixels(photos: Photos, view: int, every: int) -> np.ndarray | None:
 
 
 def scored_tiles(view: int, width: int, height: int, every: int) -> np.ndarray | None:
-    """Return the mask ``[tile_height,tile_width]`` of the tiles of a view that are scored; None: all tiles.
+    """Return a mask ``[tile_height,tile_width]`` of the tiles of a view that are scored, or None for all tiles.
 
-    Of each ``every`` tiles one is scored. Of a small view more are, at least ``LEAST_TILES``. The tiles are spread
-    evenly, and differ from view to view.
+    One of ``every`` tiles is scored, but at least ``LEAST_TILES`` of a view. The scored tiles are spread evenly, and
+    differ from view to view.
     """
     tile_height, tile_width = -(-height // TILE), -(-width // TILE)
     every = min(every, tile_height * tile_width // LEAST_TILES)
@@ -321,5 +333,5 @@ def scored_tiles(view: int, width: int, height: int, every: int) -> np.ndarray |
 
 
 def render_photos(gaussians: Gaussians | Splats, photos: Photos, **settings: Any) -> list[np.ndarray]:
-    """Return the render ``[h,w,3]`` of every view, not clipped; ``settings`` are options of :func:`photo_errors`."""
+    """Return the render ``[h,w,3]`` of every view, not clipped, with the ``settings`` of :func:`photo_errors`."""
     return photo_errors(gaussians, photos, lambda _, image, __: image, **settings)

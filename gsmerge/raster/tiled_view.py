@@ -21,13 +21,13 @@ from gsmerge.values.arrays import distinct
 Array = NDArray[Any]
 
 THREAD_PIECE = 1 << 13  # least number of Gaussians or intersections per thread
-# Intersections of a view, and mean intersections per Gaussian. Above both, most Gaussians are hidden. Then the list of
-# each tile ends at its last visible Gaussian
+# Least intersections of a crowded view, and least mean intersections per Gaussian. In a crowded view most Gaussians are
+# hidden, so the list of each tile ends at its last visible Gaussian
 CROWDED, CROWDED_EACH = 1 << 24, 16
 EPS2D = 0.3  # low-pass of the rasterizer, which widens Gaussians; square pixels of the full-size image
 WORLD_NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
-# Directions are clamped at this share of the image outside its borders, as in gsplat, since the first-order projection
-# is too inexact farther out
+# Directions are clamped at this share of the image's size outside its borders, as in gsplat, because the first-order
+# projection is too inexact farther outside
 SPARE_SHARE = 0.15
 
 
@@ -52,7 +52,7 @@ class TiledView:
     """Gaussians projected into one view, sorted by depth and listed by tile."""
 
     splats: Splats
-    ids: Array  # [m] int32, ascending: the Gaussians that may touch the image; a few near its border do not
+    ids: Array  # [m] int32 Gaussians that may touch the image, ascending; a few near its border do not
     conics: Array  # [m,8] float32, see gsmerge.kernels.raster.project
     depths: Array  # [m] float32, camera z
     flatten_ids: Array  # [intersections] int32 rows of `ids`, tile after tile, nearest first
@@ -63,17 +63,17 @@ class TiledView:
     viewmat: Array  # [4,4] float64, world to camera
     width: int  # pixels
     height: int  # pixels
-    top: int = 0  # first row of a band of the view; the band has `height` rows and can only be blended
+    top: int = 0  # first row of a band of the view, which has `height` rows and can only be blended
 
     @property
     def lists(self) -> tuple[Array, Array, Array, int]:
-        """First arguments of the kernels that read the lists of tiles; the last one is the number of tiles per row."""
+        """First arguments of the kernels that read the lists of tiles: arrays, and the number of tiles per row."""
         return self.conics, self.flatten_ids, self.isect_offsets, -(-self.width // projection.TILE)
 
 
-def _spread_origin(means: Array) -> Array:
+def _choose_origin(means: Array) -> Array:
     """Return zero, or the centre of the means if they are too far from zero for float32."""
-    origin_sample = 4096  # least number of means, if there are as many, on which centre and spread are measured
+    origin_sample = 4096  # centre and spread are measured on at least this many means, or on all if there are fewer
     sample = means[:: max(1, len(means) // origin_sample)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
@@ -90,37 +90,37 @@ def _shift_means(means: Array, origin: Array) -> Array:
     if means.dtype == np.float32:
         projection.shift_means(np.ascontiguousarray(means), np.ascontiguousarray(origin, np.float64), shifted)
         return shifted
-    for axis in range(3):  # one axis at a time takes NumPy a third of the time
+    for axis in range(3):  # NumPy takes a third of the time if it subtracts one axis at a time
         np.subtract(means[:, axis], origin[axis], out=shifted[:, axis], dtype=np.float64, casting="unsafe")
     return shifted
 
 
 def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
-    """Convert Gaussians to float32 splats for the kernels; arrays of the right type and layout are not copied.
+    """Convert Gaussians to float32 splats for the kernels, without a copy of arrays of the right type and layout.
 
     Means may be float64, for scenes in geographic coordinates. ``origin [3]`` is the world point that becomes the zero
-    of the arrays. By default it is the world's zero, or the centre of the means if they are far from zero for their
-    spread.
+    of the splats. By default it is the world's zero, or the centre of the means if it is many times as far from zero as
+    the means are spread.
     """
     gaussians = gaussians.numpy()
-    zero = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
+    zero = _choose_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
     columns = vars(gaussians) | {"means": _shift_means(gaussians.means, zero) if zero.any() else gaussians.means}
     return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}, origin=zero)
 
 
 def num_pieces(count: int, threads: int, least: int = THREAD_PIECE) -> int:
-    """Choose into how many pieces ``count`` items are split: up to four per thread, of ``least`` items or more."""
+    """Return into how many pieces to split ``count`` items: up to four per thread, with at least ``least`` items."""
     return 1 if threads == 1 else max(1, min(4 * threads, count // least))
 
 
 def pieces(count: int, threads: int) -> list[tuple[int, int]]:
-    """Split ``count`` items into ranges for the threads; results do not depend on the ranges."""
+    """Split ``count`` items into ranges for the threads, on which results do not depend."""
     num = num_pieces(count, threads)
     return [(count * i // num, count * (i + 1) // num) for i in range(num)]
 
 
 def tile_ranges(tiled: TiledView, threads: int, least: int = THREAD_PIECE) -> list[tuple[int, int]]:
-    """Split tiles into ranges for the threads with about equal numbers of intersections, at least about ``least``."""
+    """Split tiles into ranges for the threads, each with about the same number of intersections, at least ``least``."""
     count = len(tiled.flatten_ids)
     num = num_pieces(count, threads, least)
     cuts = np.searchsorted(tiled.isect_offsets, count * np.arange(1, num) / num)
@@ -150,7 +150,8 @@ def camera_numbers(
 def _corner_sums(tiles: Array, tile_height: int, tile_width: int) -> Array:
     """Count, for each corner of a tile, the True ``tiles`` above and to its left.
 
-    Returns ``[tile_height+1,tile_width+1]`` int32. ValueError if ``tiles`` have another shape.
+    The counts at the four corners of a box tell whether it contains a True tile. Returns
+    ``[tile_height+1,tile_width+1]`` int32. Raises ValueError if ``tiles`` have another shape.
     """
     if tiles.shape != (tile_height, tile_width):
         raise ValueError(f"tiles: expected shape {[tile_height, tile_width]}, got {list(tiles.shape)}")
@@ -163,6 +164,7 @@ def _find_visible(
     """Return the ascending ids of the Gaussians that may touch the image or, with ``corner_sums``, its chosen tiles."""
 
     def cull(span: tuple[int, int]) -> Array:
+        """Return the ids of such Gaussians from a range of rows."""
         rows, ids = slice(*span), np.empty(span[1] - span[0], np.int32)
         keep_rows = None if keep is None else keep[rows]
         count = projection.cull(
@@ -174,7 +176,7 @@ def _find_visible(
 
 
 def cache_line_rows(count: int, width: int) -> Array:
-    """Allocate ``[count,width]`` float32 at the start of a cache line, so that short rows do not span two lines."""
+    """Allocate ``[count,width]`` float32 from the start of a cache line, so that no short row lies in two lines."""
     cache_line = 16  # float32 values per cache line
     buffer = np.empty(count * width + cache_line, np.float32)
     start = -(buffer.ctypes.data // buffer.itemsize) % cache_line
@@ -182,12 +184,13 @@ def cache_line_rows(count: int, width: int) -> Array:
 
 
 def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, threads: int) -> tuple[Array, Array, Array]:
-    """Return conics ``[m,8]``, depths ``[m]`` and boxes of tiles ``[m,4]`` of the Gaussians ``ids [m]``."""
+    """Return the conics ``[m,8]``, the depths ``[m]`` and the boxes of tiles ``[m,4]`` of the Gaussians ``ids [m]``."""
     m = len(ids)
     conics, depths = cache_line_rows(m, projection.CONIC), np.empty(m, np.float32)
     boxes = np.empty((m, 4), np.int16)
 
     def project(span: tuple[int, int]) -> None:
+        """Write the conics, depths and boxes of a range of the Gaussians."""
         rows = slice(*span)
         projection.project(
             splats.means, splats.quats, splats.scales, opacities, ids[rows], camera,
@@ -204,12 +207,12 @@ def hides_most(num_intersections: int, num_visible: int) -> bool:
 
 
 def _list_by_tile(order: Array, boxes: Array, conics: Array, wanted: Array, threads: int) -> tuple[Array, Array]:
-    """List the Gaussians of each tile in their ``order`` of depth; return all lists in one array, and their starts.
+    """List the Gaussians of each tile in their ``order`` of depth.
 
-    Only ``wanted [tile_height,tile_width]`` tiles get a list; all others are empty. In crowded views, see
-    :func:`hides_most`, all tiles get one.
+    Returns all lists in one array, and their starts. Only ``wanted [tile_height,tile_width]`` tiles get a list, except
+    in crowded views, see :func:`hides_most`, where all tiles get a list.
     """
-    # Boxes are gathered once in advance, 8 bytes each, since the loops below would wait for every cache miss
+    # Boxes are sorted first, each as one number, because the loops below read neighbours in memory faster
     boxes = boxes.view(np.uint64).reshape(-1).take(order).view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], *wanted.shape), spans))
@@ -217,12 +220,13 @@ def _list_by_tile(order: Array, boxes: Array, conics: Array, wanted: Array, thre
         return _list_open_tiles(order, boxes, conics, wanted.shape[0], wanted.shape[1], threads)
     totals, is_wanted = counts.sum(0), wanted.reshape(-1)
     isect_offsets = np.concatenate([[0], np.cumsum(totals * is_wanted)])
-    # The lists of the other tiles are written behind these, and then cut off
+    # The lists of tiles that are not wanted are written behind the others, and then cut off
     ends = np.where(is_wanted, isect_offsets[1:], isect_offsets[-1] + np.cumsum(totals * ~is_wanted))
     cursors = ends - totals + np.cumsum(counts, 0) - counts
     flatten_ids = np.empty(totals.sum(), np.int32)
 
     def deal(piece: tuple[tuple[int, int], Array]) -> None:
+        """Append a range of Gaussians to the lists, from the position of each tile's cursor on."""
         (start, end), tile_cursors = piece
         deal_tiles(order[start:end], boxes[start:end], wanted.shape[1], tile_cursors, flatten_ids)
 
@@ -233,18 +237,19 @@ def _list_by_tile(order: Array, boxes: Array, conics: Array, wanted: Array, thre
 def _list_open_tiles(
     order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
 ) -> tuple[Array, Array]:
-    """Return the lists of :func:`_list_by_tile`, each without the Gaussians behind its last visible one."""
+    """Return lists like :func:`_list_by_tile`, but without the Gaussians behind the last visible one of a tile."""
     num = min(tile_height, 4 * threads)
     spans = [(tile_height * i // num, tile_height * (i + 1) // num) for i in range(num)]
 
     def deal(cursors: Array, flatten_ids: Array) -> None:
+        """Append Gaussians to the lists and advance the cursors, or only the cursors if there are no lists."""
         bounds = np.ones(len(cursors), np.float32)  # upper bounds of the transmittance of each tile
         parallel_map(
             lambda lines: deal_open_tiles(order, boxes, conics, tile_width, *lines, bounds, cursors, flatten_ids), spans
         )
 
     counts = np.zeros(tile_height * tile_width, np.int64)
-    deal(counts, np.empty(0, np.int32))  # without room for the lists, it only counts
+    deal(counts, np.empty(0, np.int32))
     isect_offsets = np.concatenate([[0], np.cumsum(counts)])
     flatten_ids = np.empty(isect_offsets[-1], np.int32)
     deal(isect_offsets[:-1].copy(), flatten_ids)
@@ -252,7 +257,7 @@ def _list_open_tiles(
 
 
 def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
-    """Raise ValueError for matrices of another shape, or a size or focal lengths that cannot be drawn."""
+    """Raise ValueError if matrices have another shape, or if the image size or a focal length is out of range."""
     if viewmat.shape != (4, 4) or K.shape != (3, 3):
         raise ValueError(f"expected a [4,4] view matrix and [3,3] K, got {list(viewmat.shape)} and {list(K.shape)}")
     if not (0 < width <= projection.MAX_SIZE and 0 < height <= projection.MAX_SIZE):
@@ -263,9 +268,9 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
 
 
 def _convert_for_kernels(splats: Splats, opacities: Array | None, keep: Array | None) -> tuple[Array, Array | None]:
-    """Convert opacities ``[n]`` (None: the splats' own) and the mask ``keep [n]`` to the types of the kernels.
+    """Convert opacities ``[n]`` and the mask ``keep [n]`` to the types of the kernels.
 
-    ValueError if they have another length than the splats.
+    By default, the opacities are those of the splats. Raises ValueError if the lengths differ from that of the splats.
     """
     opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
     keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
@@ -300,8 +305,8 @@ def tile_view(
     the Gaussians. Gaussians with a False ``keep [n]`` are left out.
 
     Tiles have 16 x 16 pixels. Only tiles with a True ``tiles [tile_height,tile_width]`` have to be complete. ``band``
-    has the first and last + 1 line of tiles; the result is a view of these lines alone. ``columns`` has the first and
-    last + 1 column of tiles; all other tiles are empty.
+    is the first line of tiles to draw and the line after the last. The result is a view of these lines alone.
+    ``columns`` is the first column of tiles and the column after the last. All other tiles are empty.
 
     The size of the result depends on the number of visible Gaussians, not on n. Raises ValueError if a size or a number
     is out of range.
@@ -311,7 +316,7 @@ def tile_view(
     if not (0 < near < far and eps2d >= 0):
         raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
     opacities, keep = _convert_for_kernels(splats, opacities, keep)
-    local_viewmat = viewmat.copy()  # from coordinates of the splats, whose zero is their origin
+    local_viewmat = viewmat.copy()  # from the coordinates of the splats, whose zero is at `splats.origin`
     local_viewmat[:3, 3] += matmul(local_viewmat[:3, :3], splats.origin)
     camera = camera_numbers(local_viewmat, K, width, height, eps2d, antialiased, near, far)
     tile_width, tile_height = -(-width // projection.TILE), -(-height // projection.TILE)

@@ -1,7 +1,7 @@
 """Store the blending weights of a view as a sparse matrix, for stages that render one geometry many times.
 
 The image is W times the colours. W has one row per pixel and one column per Gaussian. A row has some twenty entries, so
-a product takes a small share of the time of blending along the tile lists.
+a product takes much less time than blending along the tile lists.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class ViewWeights:
-    """Sparse matrix W of one view's blending weights (pixels x Gaussians), stored by tile and Gaussian."""
+    """Sparse matrix W of one view's blending weights, stored tile by tile and Gaussian by Gaussian."""
 
-    ids: Array  # [m] int32: the Gaussians that may touch the image
+    ids: Array  # [m] int32 Gaussians that may touch the image
     flatten_ids: Array  # [intersections] int32 rows of `ids`
     isect_offsets: Array  # [tiles + 1] int64 starts of the tiles' lists in `flatten_ids`
     tile_width: int  # tiles per row

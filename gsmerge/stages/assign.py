@@ -19,11 +19,12 @@ from gsmerge.types import Groups, Scene
 
 @stage("members")
 def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Members:
-    """Return all Gaussians of a canonical scene as members, each with its pixel; UsageError if no view sees any.
+    """Return all Gaussians of a canonical scene as members of superpixels, each with its pixel.
 
     A Gaussian belongs to the superpixel of its pixel. If views have no Gaussians of their own, ``by_contribution``
     assigns each Gaussian to the superpixel, of any view, in which the sum of its blending weights is largest (paper,
-    supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure these sums.
+    supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure these sums. Raises
+    UsageError if no view sees any Gaussian.
     """
     members = scene_members(scene)
     if by_contribution and not scene.has_own_pixels:
@@ -38,7 +39,7 @@ def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Me
 
 @dataclass(frozen=True, eq=False)
 class Owners:
-    """For each of n Gaussians, the superpixel of all views to which it contributes most."""
+    """Superpixels to which n Gaussians contribute most, one for each Gaussian."""
 
     values: np.ndarray  # [n] float32, blending weights summed over the superpixel, in pixels; 0 if unseen
     views: np.ndarray  # [n] int32, view of the superpixel; -1 if unseen
@@ -46,11 +47,15 @@ class Owners:
 
 
 def find_owners(scene: Scene, groups: Groups) -> Owners:
-    """Find the superpixel of all views to which each Gaussian contributes most; of equal ones, the first view's."""
+    """Find, in all views, the superpixel to which each Gaussian contributes most.
+
+    If a Gaussian contributes equally to superpixels of several views, the first view counts.
+    """
     count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
     def update_best(view: int, tiled: TiledView) -> None:
+        """Replace entries of ``best`` by superpixels of this view, where these have larger contributions."""
         values, labels = view_owners(tiled, groups.labels[view], groups.counts[view])
         with lock:
             best_values, best_views = best.values[tiled.ids], best.views[tiled.ids]
@@ -69,11 +74,15 @@ def view_owners(tiled: TiledView, labels: np.ndarray, count: int) -> tuple[np.nd
 
 
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
-    """Return the middle pixel ``[n]`` int64 of each Gaussian's superpixel, counted through all views; -1 if unseen."""
+    """Return the middle pixel ``[n]`` int64 of the superpixel of each Gaussian, or -1 if no view sees the Gaussian.
+
+    Pixels are numbered through all views.
+    """
     counts = np.asarray(groups.counts)
     pixels_per_view, offsets = groups.labels[0].size, np.cumsum(counts) - counts
 
     def view_middles(view: int) -> np.ndarray:
+        """Return the middle pixels of the superpixels of one view."""
         return middle_pixels(groups.labels[view], groups.counts[view]) + view * pixels_per_view
 
     middles = np.concatenate(parallel_map(view_middles, range(len(counts))))
@@ -81,7 +90,7 @@ def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
 
 
 def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the pixel ``[count]`` int64 nearest to the centroid of each superpixel; 0 if the superpixel is empty."""
+    """Return the pixel ``[count]`` int64 nearest to the centroid of each superpixel, or 0 if it is empty."""
     height, width = labels.shape
     flat = labels.reshape(-1)
     y, x = np.divmod(np.arange(height * width), width)
@@ -89,7 +98,7 @@ def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
     dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
     squares, min_squares = dx * dx + dy * dy, np.full(count, np.inf)
     np.minimum.at(min_squares, flat, squares)
-    # in descending order, so that of equally near pixels the first one overwrites the others
+    # The pixels are in descending order, so that of equally near pixels the first one overwrites the others
     nearest = np.flatnonzero(squares == min_squares[flat])[::-1]
     middles = np.zeros(count, np.int64)
     middles[flat[nearest]] = nearest

@@ -17,9 +17,9 @@ from gsmerge.types import Cameras, Gaussians
 
 BOX_QUANTILES = (1, 99)  # the scene's box reaches from the first to the second percentile of positions on each axis
 FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of this many nearest Gaussians
-# A Gaussian hangs across the scene like a curtain if its second largest scale exceeds the first share of half the
-# diagonal of the scene's box, or its largest scale exceeds the second share. This scale must also exceed CURTAIN_FACTOR
-# times its median over all Gaussians. Exports, and results without a fit, have no such Gaussians
+# A fit may leave Gaussians that hang across the scene like curtains. Their second largest scale exceeds CURTAIN[0]
+# times half the diagonal of the scene's box, or their largest scale exceeds CURTAIN[1] times this. The scale is also
+# more than CURTAIN_FACTOR times the median of all Gaussians
 CURTAIN, CURTAIN_FACTOR = (0.1, 0.33), 8.0
 FLOATER_GAUSSIANS = 200_000  # the share of floaters is estimated from at most about this many Gaussians
 
@@ -34,9 +34,9 @@ def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.nda
     if there are no samples.
     """
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
-    half = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
+    half_sides = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
     outlier_box = 10.0  # side of the larger box, in sides of the scene's box
-    return np.asarray((np.abs(means - (low + high) / 2) > outlier_box * half).any(1))
+    return np.asarray((np.abs(means - (low + high) / 2) > outlier_box * half_sides).any(1))
 
 
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
@@ -51,19 +51,21 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     means, sizes = gaussians.means.astype(np.float64), _sorted_scales(gaussians)[1].astype(np.float64)
     if len(means) <= FLOATER_NEIGHBORS:
         return np.zeros(len(rows), bool)
-    nearest, touched = _nearest_of(means, sizes, rows, 1)
+    nearest, touches = _nearest_distances(means, sizes, rows, 1)
     apart_factor = 3.0  # the nearest Gaussian of a floater is farther away than this many times the median distance
-    isolated = ~touched & (nearest > apart_factor * np.median(nearest))
+    isolated = ~touches & (nearest > apart_factor * np.median(nearest))
     candidates = np.flatnonzero(isolated)  # few, because most Gaussians touch their nearest neighbour
     if len(candidates):
-        isolated[candidates] = ~_nearest_of(means, sizes, rows[candidates], FLOATER_NEIGHBORS)[1]
+        isolated[candidates] = ~_nearest_distances(means, sizes, rows[candidates], FLOATER_NEIGHBORS)[1]
     return isolated | beyond_scene(means[rows], means) | curtains(gaussians, rows)
 
 
-def _nearest_of(means: np.ndarray, sizes: np.ndarray, rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance ``[m]`` from each of ``rows [m]`` to its nearest neighbour, and a mask ``[m]``.
+def _nearest_distances(
+    means: np.ndarray, sizes: np.ndarray, rows: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance ``[m]`` of each of the Gaussians ``rows [m]`` from its nearest neighbour, and a mask ``[m]``.
 
-    The mask is true for rows that touch one of their ``count`` nearest neighbours. ``means [n,3]`` and the largest
+    The mask is true for Gaussians that touch one of their ``count`` nearest neighbours. ``means [n,3]`` and the largest
     scales ``sizes [n]`` are those of all Gaussians.
     """
     ids, distances = find_nearest(means, count, rows)
@@ -73,24 +75,27 @@ def _nearest_of(means: np.ndarray, sizes: np.ndarray, rows: np.ndarray, count: i
 
 def _sorted_scales(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Return the second largest and the largest scale ``[n]`` of each Gaussian."""
-    x, y, z = gaussians.scales.T  # column by column takes NumPy a tenth of the time
+    x, y, z = gaussians.scales.T  # NumPy takes a tenth of the time if it works column by column
     larger = np.maximum(x, y)
     return np.maximum(np.minimum(x, y), np.minimum(larger, z)), np.maximum(larger, z)
 
 
 def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[m]`` of the Gaussians among ``rows [m]`` that hang across the scene like curtains."""
+    """Return a mask ``[m]`` of the Gaussians among ``rows [m]`` that hang across the scene like curtains.
+
+    Their second largest or their largest scale is too large for the scene, see ``CURTAIN``.
+    """
     low, high = np.percentile(gaussians.means.astype(np.float64), BOX_QUANTILES, axis=0)
     radius = np.sqrt(((high - low) ** 2).sum()) / 2
-    is_wide = [
+    is_wide, is_long = (
         (scales[rows] > radius * share) & (scales[rows] > CURTAIN_FACTOR * np.median(scales))
         for scales, share in zip(_sorted_scales(gaussians), CURTAIN, strict=True)
-    ]
-    return np.asarray(is_wide[0] | is_wide[1])
+    )
+    return np.asarray(is_wide | is_long)
 
 
 def floater_share(gaussians: Gaussians) -> float:
-    """Estimate the share of finite Gaussians that are :func:`floaters`, from a sample of them; 0 without Gaussians."""
+    """Estimate the share of finite Gaussians that are :func:`floaters` from a sample, or return 0 without Gaussians."""
     rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // FLOATER_GAUSSIANS)))
     return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
 
@@ -98,15 +103,16 @@ def floater_share(gaussians: Gaussians) -> float:
 def clean(
     gaussians: Gaussians, options: CleanOptions, cameras: Cameras | None, photos: np.ndarray | None, to_world: ToWorld
 ) -> tuple[np.ndarray, Counts]:
-    """Choose the Gaussians to keep; return their rows, and the number of dropped Gaussians for each reason.
+    """Return the rows of the Gaussians to keep, and the number of dropped Gaussians for each reason.
 
     The reasons are ``cropped`` and the names in ``options.drops``. Gaussians and ``cameras`` are canonical. The crop is
-    in the world's frame, to which ``to_world`` maps Gaussians. The sky is found in the ``photos [v,h,w,3]``. If there
-    are no cameras, some are placed, and a Gaussian is unseen if none of these shows it.
+    in the world's frame, to which ``to_world`` maps Gaussians. The sky is found in the ``photos [v,h,w,3]``. A Gaussian
+    is unseen if no camera shows it. If there are no cameras, some are placed.
     """
     rows, counts = np.arange(len(gaussians)), Counts()
 
     def remove(name: str, unwanted: np.ndarray) -> Gaussians:
+        """Drop the Gaussians in the mask ``unwanted``, count them under ``name``, and return the remaining ones."""
         nonlocal rows
         rows, counts[name] = rows[~unwanted], int(unwanted.sum())
         return gaussians[rows]
@@ -129,7 +135,10 @@ def clean(
 
 
 def describe_counts(counts: Counts, *, placed: bool) -> str:
-    """Describe how many Gaussians :func:`clean` dropped for each reason; ``placed`` is true if cameras were placed."""
+    """Describe how many Gaussians were dropped for each reason: those of :func:`clean`, and ``surplus``.
+
+    ``placed`` is true if cameras were placed, because the scene has none.
+    """
     words = {
         "cropped": "outside of the crop",
         "sky": "sky",
@@ -142,6 +151,6 @@ def describe_counts(counts: Counts, *, placed: bool) -> str:
 
 
 def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:
-    """Return the ``count`` Gaussians with the largest products of opacity and two largest scales, in their order."""
+    """Return, in their order, the ``count`` Gaussians with the largest products of opacity and two largest scales."""
     area = np.sort(gaussians.scales, axis=1)[:, 1:].prod(1)
     return gaussians[np.sort(np.argsort(-gaussians.opacities * area, kind="stable")[:count])]

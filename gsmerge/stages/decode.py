@@ -1,4 +1,4 @@
-"""Feature Gaussians -> Gaussians: make K children of every group by closed formulas; networks may correct them."""
+"""Feature Gaussians -> Gaussians: make K children of every group by closed formulas, which networks may correct."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ def decode(
     counts: np.ndarray | None = None,
     networks: Corrector = ANALYTIC,
 ) -> Gaussians:
-    """Decode each Feature Gaussian into K Gaussians, its children; there are fewer if its members are equal.
+    """Decode each Feature Gaussian into K Gaussians, which are its children.
 
     The members are halved repeatedly across their widest direction in colour and position, and each part becomes a
-    child. So the children for K = 2 are unions of those for K = 4. Networks with absolute outputs do not halve: they
-    make exactly K children of every group. ``counts [g]`` are the K of each group, at least 1; None: ``options.max_k``
-    for all. The children of a group are adjacent. Those below ``options.min_opacity`` are left out.
+    child. So the children for K = 2 are unions of those for K = 4, and equal members give fewer children. Networks with
+    absolute outputs do not halve, but make exactly K children of every group. ``counts [g]`` has a K of at least 1 for
+    each group. Without it, K is ``options.max_k``. The children of a group are adjacent. Children that are fainter than
+    ``options.min_opacity`` are left out.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)
@@ -48,7 +49,7 @@ def decode(
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:
-    """Return all Gaussians of a scene unchanged if ``count`` is at least their number; otherwise return None."""
+    """Return all Gaussians of a scene unchanged if ``count`` is at least their number, otherwise None."""
     if count is None or count < len(scene.gaussians):
         return None
     return Decoded(scene.gaussians, len(scene.gaussians), exact=True, is_input=True)
@@ -58,8 +59,8 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOptions, *, grows: bool) -> Decoded:
     """Decode merged views into the Gaussians that a fit starts from.
 
-    If an exact number was requested, there are as many, unless the fit ``grows`` to this number later. Otherwise there
-    are K for each group.
+    If an exact number was requested, this number is made, unless the fit ``grows`` to it later. Otherwise each group
+    gets K Gaussians.
     """
     count, exact = merged.segmentation.count, merged.segmentation.exact
     if exact and not grows:
@@ -72,9 +73,10 @@ def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOpti
 
 
 def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, options: DecodeOptions) -> Gaussians:
-    """Decode ``count`` Gaussians, more for groups in which they lower distortion most.
+    """Decode ``count`` Gaussians, or K of each Feature Gaussian if ``count`` is None.
 
-    If ``count`` is None, decode K for each Feature Gaussian. Faint ones are left out, so there may be fewer.
+    More Gaussians go to groups in which they lower distortion most. Faint Gaussians are left out, so the result may
+    have fewer than ``count``.
     """
     features, members, networks = merged.features, merged.members, merged.networks
     children = None
@@ -86,7 +88,7 @@ def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, 
 
 
 def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> Gaussians:
-    """Decode exactly ``count`` visible Gaussians, more for groups in which they lower distortion most."""
+    """Decode exactly ``count`` visible Gaussians, with more of them in groups where they lower distortion most."""
     features, members, networks = merged.features, merged.members, merged.networks
     with_faint = replace(options, min_opacity=0.0)
     return deal_visible(
@@ -103,13 +105,13 @@ def deal_visible(
 ) -> Gaussians:
     """Make ``total`` Gaussians that are visible, so not fainter than ``min_opacity``.
 
-    Each group gets one Gaussian. Further Gaussians go to the groups ``order [d]`` in turn, see :func:`deal_order`.
-    ``make`` takes the number of Gaussians for each group ``[g]`` and makes them. For each one that is too faint, the
-    next group in the order gets one more. There are fewer than ``total`` if the groups have too few members.
+    Each group gets one Gaussian. Further Gaussians go to the groups in the list ``order [d]``, see :func:`deal_order`.
+    ``make`` makes the given number of Gaussians ``[g]`` for each group. For each Gaussian that is too faint, one more
+    group in the list gets a Gaussian. The result has fewer than ``total`` Gaussians if the groups have too few members.
     """
     extra = max(0, total - num_groups)
-    refills = 3  # most rounds that replace faint Gaussians; a few of the new Gaussians are faint again
-    for _ in range(refills + 1):
+    max_retries = 3  # most rounds that replace faint Gaussians, of which a few are faint again
+    for _ in range(max_retries + 1):
         gaussians = make(1 + np.bincount(order[:extra], minlength=num_groups))
         missing = total - int((gaussians.opacities >= min_opacity).sum())
         if missing <= 0 or extra >= len(order):
@@ -126,8 +128,8 @@ def mixed_counts(
 ) -> np.ndarray:
     """Choose K for every group, 1 to 4, by the rule of the options (paper supplement, per-superpixel K).
 
-    ``saliency`` is that of every pixel of all views. The rule "distortion" deals out as many Gaussians in all as the
-    ranks of the saliency would.
+    ``saliency`` has a number for every pixel of all views. One rule ranks groups by their saliency. The rule
+    "distortion" makes as many Gaussians in all, but more of them where they lower distortion most.
     """
     counts = counts_by_saliency(group_saliency(features, members, saliency), options)
     if options.k_rule == "distortion":
@@ -136,14 +138,14 @@ def mixed_counts(
 
 
 def group_saliency(features: FeatureGaussians, members: Members, saliency: np.ndarray) -> np.ndarray:
-    """Return the mean saliency ``[g]`` of the pixels of each group's members; a member without a pixel counts as 0."""
+    """Return the mean saliency ``[g]`` of the pixels of each group's members, with 0 for members without a pixel."""
     starts, pixels = features.starts, members.pixels[features.members]
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
     return np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
 
 
 def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarray:
-    """Return K = 1, 2 or 4 for every group by the rank of its saliency ``[g]``."""
+    """Return a K of 1, 2 or 4 for groups whose ``saliency [g]`` is below, between or above two percentiles of it."""
     low, high = np.percentile(saliency, (options.k_low, options.k_high)) if len(saliency) else (0.0, 0.0)
     counts: np.ndarray = 1 + (saliency > low) + 2 * (saliency > high)
     return counts
@@ -152,9 +154,9 @@ def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarr
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
     """Return the number of Gaussians to decode merged views into, or None for K of each Feature Gaussian.
 
-    If an exact number was requested and no fit grows to it, this is the number. Otherwise other groups get the
-    Gaussians of empty superpixels. Superpixels of a far view may be empty, because Gaussians that a near view shows too
-    belong to the near view. Heads that make exactly K Gaussians of every group cannot give one group more.
+    If an exact number was requested and no fit grows to it, this number is returned. Otherwise it is K for each group
+    and for each superpixel without members, whose Gaussians other groups get. A superpixel has no members if its
+    Gaussians belong to a nearer view. Heads that make exactly K Gaussians of every group cannot give one group more.
     """
     segmentation, num_empty = merged.segmentation, len(merged.segmentation.groups) - merged.num_groups
     if segmentation.exact and not grows:
@@ -165,7 +167,7 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
 
 
 def repeat_groups(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Repeat each Feature Gaussian as ``counts [g]`` equal Gaussians, which heads replace.
+    """Repeat each Feature Gaussian ``counts [g]`` times, for heads that make all children themselves.
 
     Returns the Gaussians, and the group ``[n]`` of each.
     """
@@ -205,6 +207,7 @@ def halve_groups(
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
     def halve_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the sizes, the members and the groups of the children of the groups ``rows``."""
         row_starts, row_ids = gather_groups(starts, ids, rows)
         m = members
         child_starts, child_ids, parents = bisect(
@@ -218,11 +221,11 @@ def halve_groups(
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
-    """Return the number of children ``[g]`` of each group, if ``extra`` of them go where they lower distortion most.
+    """Return the number of children ``[g]`` of each group, if there are ``extra`` more children than groups.
 
-    Each group has at least one child, so the sum is ``g + extra``, or as much as the members allow. If a child lowers
-    distortion only together with the next child, both count with their mean gain, which is a slope of the convex hull
-    of the group's distortion. So a larger ``extra`` never takes a child away.
+    Each group has at least one child. Further children go to groups in which they lower distortion most, as far as the
+    members suffice. If a child lowers distortion only together with the next child, both count with their mean gain,
+    which is a slope of the convex hull of the group's distortion. So no group loses a child if ``extra`` grows.
     """
     if extra < 0:
         raise ValueError(f"extra: expected at least 0, got {extra}")
@@ -234,37 +237,34 @@ def split_counts(features: FeatureGaussians, members: Members, extra: int, max_c
 
 
 def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
-    """Return the groups ``[d]`` in the order in which they get further children; the largest gain comes first.
+    """Return the list ``[d]`` of groups to which further children go, the child with the largest gain first.
 
-    A group stands in this order once for each child after its first.
+    The list contains a group once for each child after its first.
     """
     if max_children == 1 or len(features) == 0:
         return np.zeros(0, np.int64)
     gains = hull_gains(_child_errors(features, members, max_children))
-    # stable, so that among equal gains of one group the first child comes first
+    # The order is stable, so that among equal gains of one group the first child comes first
     order = np.argsort(-gains.reshape(-1), kind="stable")
     return order[: int(np.isfinite(gains).sum())] // gains.shape[1]
 
 
 def _child_errors(features: FeatureGaussians, members: Members, max_children: int) -> np.ndarray:
-    """Return the distortion ``[g,max_children]`` of groups with 1, 2, ... children; NaN if there cannot be as many."""
+    """Return the distortion ``[g,max_children]`` of each group with 1, 2 and more children.
+
+    It is NaN for more children than there are members.
+    """
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
     def measure_rows(rows: np.ndarray) -> np.ndarray:
+        """Return the distortions of the groups ``rows``."""
         row_starts, row_ids = gather_groups(starts, ids, rows)
         m = members
         return split_errors(
-            row_starts,
-            row_ids,
-            m.means,
-            m.sh0,
-            m.opacities,
-            centres[rows],
-            footprints[rows],
-            max_children,
+            row_starts, row_ids, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children,
             PLANE_WEIGHT,
-        )
+        )  # fmt: skip
 
     groups = np.arange(len(features))
     tasks = [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)]
@@ -272,14 +272,14 @@ def _child_errors(features: FeatureGaussians, members: Members, max_children: in
 
 
 def hull_gains(errors: np.ndarray) -> np.ndarray:
-    """Return how much each further child of a group lowers its error: ``[f,c-1]`` from errors ``[f,c]``.
+    """Return how much each further child of a group lowers its error, ``[g,c-1]``.
 
-    The gains are slopes of the lower convex hull of the errors, so they fall from child to child. The gain of a child
-    that cannot exist is -inf.
+    ``errors [g,c]`` are those with 1, 2 and more children. The gains are slopes of the lower convex hull of the errors,
+    so they fall from child to child. The gain of a child that cannot exist is -inf.
     """
     num_groups, num_children = errors.shape
     gains = np.full((num_groups, num_children - 1), -np.inf)
-    # `corner` is the number of the last corner of each group's hull so far
+    # `corner` is the position in the errors of the last corner of each group's hull so far
     corner, rows = np.zeros(num_groups, int), np.arange(num_groups)
     for _ in range(num_children - 1):
         steps = np.arange(num_children)[None] - corner[:, None]

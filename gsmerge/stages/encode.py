@@ -1,4 +1,4 @@
-"""Groups -> Feature Gaussians: pool each superpixel by closed formulas; networks may correct the result.
+"""Groups -> Feature Gaussians: pool each superpixel by closed formulas. Networks may correct the result.
 
 A group becomes fainter if the depths of other views contradict it.
 """
@@ -22,13 +22,16 @@ from gsmerge.values.arrays import to_float32
 if TYPE_CHECKING:
     from gsmerge.networks.weights import RunnableNetworks
 
-# A group is contradicted if more views see through it than have a surface at its position. Its optical depth is
-# multiplied by ALONE if no other view has a surface there, and by DISPUTED if some have
+# A group is contradicted if more views see through it than have a surface at its position. If no other view has a
+# surface there, its optical depth is multiplied by ALONE, otherwise by DISPUTED
 ALONE, DISPUTED = 0.15, 0.39
 
 
 def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
-    """Combine networks with the members and cameras of a scene; without networks, return ``ANALYTIC``."""
+    """Return an object that corrects the results of the stages by networks, which read the scene.
+
+    Without networks it is ``ANALYTIC``, which changes nothing.
+    """
     if networks is None:
         return ANALYTIC
     from gsmerge.networks.apply import NetworkContext
@@ -52,7 +55,7 @@ def correct(
 ) -> FeatureGaussians:
     """Correct pooled Feature Gaussians with the encoder of the networks, which also adds latents.
 
-    ``weaken`` makes groups fainter that other views see through. This makes holes, which a long fit closes.
+    ``weaken`` makes groups fainter if other views see through them. This makes holes, which a long fit closes.
     """
     return networks.encode(weaken_contradicted(features, members, cameras) if weaken else features)
 
@@ -68,6 +71,7 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
     labels = np.empty(len(members.pixels), np.int32)
 
     def label(start: int) -> None:
+        """Write the superpixel of each member, numbered through all views, or -1 for a member without a pixel."""
         rows = slice(start, start + FOOTPRINT_ROWS)
         pixels = members.pixels[rows]
         labels[rows] = np.where(pixels >= 0, flat[pixels] + offsets[pixels // scene.pixels_per_view], -1)

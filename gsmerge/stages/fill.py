@@ -29,12 +29,12 @@ from gsmerge.types import Cameras, Gaussians
 
 # Chosen on seven training captures
 FILLED_SHARE = 0.03  # largest number of new Gaussians, as a share of the fitted ones
-FILL_LEVEL = 8  # width of a drawing's pixel, in pixels of the views; drawings are coarse, since fillings are blurred
+FILL_LEVEL = 8  # width of a drawing's pixel, in pixels of the views; it is large, since what fills gaps is blurred
 FILL_MARGIN = 0.05  # margin that is added to each side of a drawing, as a share of its width or height
-# A pixel is a gap if its transmittance is above the first number, and shows a surface if it is below the second
+# Gaps have a transmittance above the first number, and surfaces have a transmittance below the second one
 GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05
-# A surface is not continued if it is nearer than NEARER_SHARE times the farthest depth in a window around the pixel,
-# whose half side is WINDOW_SHARE times the width
+# A surface is not continued if its depth is less than NEARER_SHARE times the largest depth in a window around the
+# pixel. From the pixel, the window reaches WINDOW_SHARE of the picture's width to each side
 WINDOW_SHARE, NEARER_SHARE = 0.08, 0.85
 MOST_FILLED_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
 DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # depths that are tried for a new Gaussian, in depths of the surface
@@ -49,16 +49,17 @@ def fill_between(
     """Make Gaussians that fill gaps seen from cameras between or just beside those of the photos.
 
     There are at most ``most`` new Gaussians, and at most ``FILLED_SHARE`` times the number of ``fitted`` ones. Gaps
-    that cameras half-way between two views show are filled first. The new Gaussians stand where no photo and no view
-    from ``outside`` would show them. Each is in the field of view of some photo, unless ``beyond`` is true. Scenes of
-    more than ``MOST_FILLED_VIEWS`` views get none, because their photos show nearly everything between them.
+    that cameras half-way between two views show are filled first. The new Gaussians are at positions where neither a
+    photo nor a view from ``outside`` would show them. Each is in the field of view of some photo, unless ``beyond`` is
+    true. Scenes of more than ``MOST_FILLED_VIEWS`` views get none, because their photos show nearly everything between
+    them.
     """
     added, max_count = fitted[:0], min(most, int(FILLED_SHARE * len(fitted)))
     if max_count == 0 or not 1 < len(cameras) <= MOST_FILLED_VIEWS:
         return added
     cameras = _small_cameras(cameras)
-    # Position of a camera just beside a view, as a share of the way to the nearest view, so below 0. Chosen on seven
-    # training captures
+    # Distance of a camera just beside a view, as a share of the distance to the nearest view. It is negative, because
+    # the camera is on the other side. Chosen on seven training captures
     beside = -0.1
     between, splats = _widen(between_cameras(cameras, beside)), make_splats(fitted)
     if len(between) == 0:  # all views look in different directions
@@ -68,6 +69,7 @@ def fill_between(
     seen = _find_seen(cameras, depths), _find_seen(between, [drawing[:2] for drawing in drawings]).without_gaps()
 
     def continue_surfaces(view: int) -> Gaussians:
+        """Make the Gaussians that fill the gaps of one drawing."""
         return _continue_surfaces(drawings[view], between[[view]], seen, outside, fitted.shN.shape[1], beyond=beyond)
 
     for view, new in enumerate(parallel_map(continue_surfaces, range(len(between)))):
@@ -77,9 +79,9 @@ def fill_between(
 
 
 def _on_covered_pixels(gaussians: Gaussians, covering: Gaussians, camera: Cameras) -> np.ndarray:
-    """Return a mask ``[n]`` of the Gaussians on pixels that others cover; each covers the four pixels nearest to it.
+    """Return a mask ``[n]`` of the Gaussians whose centres are on pixels of ``camera`` that ``covering`` cover.
 
-    The pixels are those of ``camera``, and ``covering`` are the Gaussians that cover.
+    Each of the Gaussians ``covering`` covers the four pixels nearest to its centre.
     """
     covered, last = np.zeros((camera.height + 2, camera.width + 2), bool), (camera.width + 1, camera.height + 1)
     (positions,), (depths,) = project(covering.means, camera)
@@ -93,14 +95,14 @@ def _on_covered_pixels(gaussians: Gaussians, covering: Gaussians, camera: Camera
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """The surfaces and gaps that c cameras with pictures of one size see in a scene."""
+    """Surfaces and gaps of a scene, as c cameras with pictures of one size see them."""
 
     cameras: Cameras
     farthest: np.ndarray  # [c,h,w] largest mean depth of the pixels that a new Gaussian at this pixel would reach
     clear: np.ndarray  # [c,h,w] bool, true for gaps
 
     def without_gaps(self) -> Seen:
-        """Return a copy that contradicts no Gaussian in a gap, for the cameras whose gaps are to be filled."""
+        """Return a copy that contradicts no Gaussian in a gap, for cameras whose gaps shall be filled."""
         return Seen(self.cameras, np.where(self.clear, np.float32(0), self.farthest), np.zeros_like(self.clear))
 
     def show(self, points: np.ndarray) -> np.ndarray:
@@ -109,7 +111,7 @@ class Seen:
         return ((z > 0) & is_inside(pixels, self.cameras)).any(0)
 
     def contradict(self, points: np.ndarray) -> np.ndarray:
-        """Return a mask ``[n]`` of the ``points [n,3]`` that hide a surface or appear in a gap of some camera."""
+        """Return a mask ``[n]`` of the ``points [n,3]`` that would hide a surface or appear in a gap in some camera."""
         (pixels, z), size = project(points, self.cameras), np.array([self.cameras.width, self.cameras.height])
         inside = (z > 0) & ((pixels >= -BESIDE_PIXELS) & (pixels < size + BESIDE_PIXELS)).all(2)
         camera, point = np.nonzero(inside)
@@ -119,12 +121,12 @@ class Seen:
 
 
 def lies_between(known: np.ndarray) -> np.ndarray:
-    """Return a mask ``[h,w]`` of pixels that have ``known [h,w]`` ones on both sides, or both above and below."""
-    sides = []
-    for mask in (known, known.T):
+    """Return a mask ``[h,w]`` of pixels that lie between two pixels of the mask ``known`` in their row or column."""
+    masks = []
+    for mask in (known, known.T):  # rows, then columns
         before, after = (np.logical_or.accumulate(ordered, axis=1) for ordered in (mask, mask[:, ::-1]))
-        sides.append(before & after[:, ::-1])
-    return np.asarray(sides[0] | sides[1].T)
+        masks.append(before & after[:, ::-1])
+    return np.asarray(masks[0] | masks[1].T)
 
 
 def _small_cameras(cameras: Cameras) -> Cameras:
@@ -147,13 +149,13 @@ def _tile_camera(splats: Splats, cameras: Cameras, view: int) -> TiledView:
 
 
 def _draw(splats: Splats, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw what one camera sees; return mean depths ``[h,w]``, transmittances ``[h,w]`` and colours ``[h,w,3]``."""
+    """Return what one camera sees: mean depths ``[h,w]``, transmittances ``[h,w]`` and colours ``[h,w,3]``."""
     tiled = _tile_camera(splats, cameras, view)
     return *blend_depths(tiled), blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0]
 
 
 def _find_seen(cameras: Cameras, drawings: Sequence[tuple[np.ndarray, np.ndarray]]) -> Seen:
-    """Find the surfaces and gaps in drawings: mean depths ``[h,w]`` and transmittances ``[h,w]`` of each camera."""
+    """Find surfaces and gaps in the ``drawings``, which have depths ``[h,w]`` and transmittances ``[h,w]``."""
     around = np.ones((2 * BESIDE_PIXELS + 1,) * 2, np.uint8)
     farthest = np.stack([cv2.dilate(depths, around) for depths, _ in drawings])
     return Seen(cameras, farthest, np.stack([transmittance > GAP_TRANSMITTANCE for _, transmittance in drawings]))
@@ -168,11 +170,11 @@ def _continue_surfaces(
     *,
     beyond: bool,
 ) -> Gaussians:
-    """Make Gaussians in the gaps of the ``drawing`` of a camera, which continue the farthest surface beside each gap.
+    """Fill the gaps in a camera's ``drawing`` with Gaussians that continue the farthest surface beside each gap.
 
-    The depths that are tried for a Gaussian are ``DEPTH_FACTORS`` times the depth of that surface. The Gaussian gets
-    the first depth that no view contradicts, and is left out if views contradict all. ``seen`` has what the photos'
-    cameras see, and what the cameras between them see.
+    Depths of ``DEPTH_FACTORS`` times the surface's depth are tried for each Gaussian. It gets the first depth that no
+    view contradicts, and is left out if there is none. ``seen`` has what the photos' cameras see, and what the cameras
+    between them see. If ``beyond`` is true, Gaussians may be outside of the field of view of all photos.
     """
     gaps, surface_depths, colors = _spread_into_gaps(drawing, round(WINDOW_SHARE * camera.width), beyond=beyond)
     eye, rays = camera.centres[0], _rays(gaps, camera)
@@ -194,24 +196,25 @@ def _continue_surfaces(
 def _spread_into_gaps(
     drawing: tuple[np.ndarray, np.ndarray, np.ndarray], reach: int, *, beyond: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spread the depths and colours of the farthest surfaces at most ``reach`` pixels into the gaps of a drawing.
+    """Spread depths and colours of the farthest surfaces at most ``reach`` pixels into the gaps of a drawing.
 
-    Returns a mask ``[h,w]`` of the n pixels that are filled, the depth ``[n]`` of each, and its colour ``[n,3]``.
+    A gap is filled only between surfaces, unless ``beyond`` is true. Returns a mask ``[h,w]`` of the n pixels that are
+    filled, their depths ``[n]``, and their colours ``[n,3]``.
     """
     depths, transmittance, image = drawing
-    solid, clear = transmittance < SURFACE_TRANSMITTANCE, transmittance > GAP_TRANSMITTANCE
+    solid, filled = transmittance < SURFACE_TRANSMITTANCE, transmittance > GAP_TRANSMITTANCE
     window = np.ones((2 * reach + 1,) * 2, np.uint8)
-    known = solid & (depths >= NEARER_SHARE * cv2.dilate(np.where(solid, depths, np.float32(0)), window))
-    clear &= cv2.dilate(known.astype(np.uint8), window) > 0
-    clear &= beyond | lies_between(known)
+    far = solid & (depths >= NEARER_SHARE * cv2.dilate(np.where(solid, depths, np.float32(0)), window))
+    filled &= cv2.dilate(far.astype(np.uint8), window) > 0
+    filled &= beyond | lies_between(far)
     image = image / np.maximum(1 - transmittance, 1e-6)[..., None]
     values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
     # Standard deviation in pixels of the blur by which colours and inverse depths spread into gaps. Chosen on seven
     # training captures
     blur_pixels = 2.0
-    sums = blur(fill_gaps(values, known) * (clear | known)[..., None], blur_pixels)[clear]
+    sums = blur(fill_gaps(values, far) * (filled | far)[..., None], blur_pixels)[filled]
     inverse_depths, colors, weights = sums[:, 0], sums[:, 1:4], sums[:, 4]
-    return clear, weights / inverse_depths, colors / weights[:, None]
+    return filled, weights / inverse_depths, colors / weights[:, None]
 
 
 def _rays(mask: np.ndarray, camera: Cameras) -> np.ndarray:

@@ -15,22 +15,23 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.stages.pair_merge import POWERS, merge_neighbors
 from gsmerge.types import Decoded
 
-SHORT = 60  # steps of the short fits by which the better one of two starts is chosen
-# If all Gaussians stay, the step sizes of a fit to renders are this share of the usual ones, because the start is close
-# to the renders. If fewer stay, they are farther apart, and steps are larger by the root of the ratio of the numbers
+SHORT = 60  # steps of the short fits that decide between two starts
+# Step sizes of a fit to renders, as a share of the usual ones, if all Gaussians stay. They are small, because the start
+# is close to the renders. If only a share of the Gaussians stays, step sizes are divided by the root of this share
 RENDERS_STEP = 0.09
 
 
 def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int) -> float:
-    """Choose which of ``POWERS`` weighs masses in the costs of merging: the one whose Gaussians show the views best.
+    """Return the one of ``POWERS`` with which merged Gaussians show the views best after a short fit.
 
-    Each power is tried by a short fit, and judged by the median PSNR of the views.
+    Costs of merging are multiplied by masses to this power.
     """
     photos = scene_photos(prepared.scene)
     tuning = replace(options.tuning, outside_from=1.0)  # no steps for views from outside, which are not scored
     short = replace(options, fit_steps=min(options.steps, SHORT), tuning=tuning)
 
     def score(power: float) -> float:
+        """Return the median PSNR (dB) of the views after a short fit."""
         with record_part(silent=True):
             start = merge_scene(count, power, prepared)
             gaussians = fit_around(start, prepared, short, seed).gaussians
@@ -41,16 +42,16 @@ def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int)
 
 
 def merge_scene(count: int, power: float, prepared: Prepared) -> Decoded:
-    """Merge the Gaussians of a scene pair by pair into ``count``, which are the start of a fit."""
+    """Merge the Gaussians of a scene pair by pair into ``count`` Gaussians, from which a fit starts."""
     gaussians = merge_neighbors(prepared.scene.gaussians, count, power)
     return Decoded(gaussians, count, exact=True, is_input=gaussians is prepared.scene.gaussians)
 
 
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
-    """Fit a start to renders of the scene; a long fit also uses renders from cameras around the scene's own views.
+    """Fit Gaussians to renders of the scene from its own views and, in a long fit, from cameras around these.
 
-    If all views of the scene were placed, those on which the fit is scored take no part in it. If the fit makes most
-    views worse, the start is returned.
+    If the scene has no cameras, some are placed. Then the views that score the fit are left out of it. If the fit makes
+    most views worse, its start is returned.
     """
     share = len(start.gaussians) / len(prepared.scene.gaussians)
     options = replace(options, tuning=options.tuning.scaled(min(1.0, RENDERS_STEP / math.sqrt(share))))

@@ -1,4 +1,4 @@
-"""Feature Gaussians -> matches: cluster those that show the same piece of surface in different views."""
+"""Feature Gaussians -> matches: cluster Feature Gaussians of different views that show the same piece of surface."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     """Cluster Feature Gaussians of different views that show the same piece of surface.
 
     Each cluster grows from a leader. Leaders are chosen by weight, and by position if weights are equal, so the result
-    does not depend on the order of the Feature Gaussians. Each one that is fully transparent stays alone.
+    does not depend on the order of the Feature Gaussians. Feature Gaussians that are fully transparent stay alone.
     """
     count = len(features)
     clusters = np.full(count, -1, np.int64)
@@ -42,7 +42,7 @@ def _find_clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchO
     neighbors = nearest_of_other_views(means, views, options.num_neighbors)
     boxes = options.match == "aabb"
     latents = as_array(features.latents)
-    has_latents = boxes and bool(latents.any())  # without an encoder all latents are zero, and colours are compared
+    has_latents = boxes and bool(latents.any())  # an encoder makes them; otherwise colours are compared
     latents = normalize(latents[rows] if has_latents else np.zeros((len(rows), 0), latents.dtype))
     scores = np.empty(neighbors.shape)
     limits = options.max_color, options.similarity
@@ -50,5 +50,5 @@ def _find_clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchO
     if boxes:
         return connected_components(neighbors, scores, options.iou)
     order = np.lexsort((*means.T, -features.weights[rows]))
-    size = options.cluster_size or len(distinct(views))
-    return leader_clusters(order, neighbors, scores, views, options.overlap, size)
+    max_size = options.cluster_size or len(distinct(views))
+    return leader_clusters(order, neighbors, scores, views, options.overlap, max_size)

@@ -26,11 +26,12 @@ class MergedViews:
 
 @stage("match")
 def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = ANALYTIC) -> FeatureGaussians:
-    """Pool each cluster into one Feature Gaussian. Those that are alone in their cluster come first, unchanged.
+    """Pool each cluster into one Feature Gaussian.
 
-    The parts of a cluster are weighted by their opacities times their gains. Masses and integrated optical depths are
-    summed, so equal Gaussians on top of each other get the opacity 1 - prod(1 - alpha). Covariances are summed in
-    float64 about the cluster's mean, so the order of the parts changes the result only by rounding.
+    Feature Gaussians that are alone in their cluster come first, unchanged. The parts of a cluster are weighted by
+    their opacities times their gains. Masses and integrated optical depths are summed, so equal Gaussians on top of
+    each other get the opacity 1 - prod(1 - alpha). Covariances are summed in float64 about the cluster's mean, so the
+    order of the parts changes the result only by rounding.
     """
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
@@ -40,9 +41,9 @@ def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = AN
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows that are alone in their cluster, the other rows in order of cluster, and where clusters start.
+    """Split the rows into those that are alone in their cluster, and all others, in the order of their clusters.
 
-    The starts are positions among these other rows.
+    Returns the rows of both kinds, and the positions of the first row of each cluster in the second kind.
     """
     clusters = matches.clusters
     alone = np.bincount(clusters, minlength=matches.count)[clusters] == 1
@@ -55,16 +56,19 @@ def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def take_features(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
     """Return the Feature Gaussians in the rows ``index``, with their members."""
-    starts, members = _gather(features, index)
+    starts, members = _gather_members(features, index)
     names = [n for n in features.__dataclass_fields__ if n not in ("starts", "members")]
     return FeatureGaussians(starts=starts, members=members, **{n: getattr(features, n)[index] for n in names})
 
 
-def _gather(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the start ``[m+1]`` of the members of each Feature Gaussian in the rows ``index [m]``, and the members."""
-    begin, sizes = features.starts[index], np.diff(features.starts)[index]
+def _gather_members(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """List the members of the Feature Gaussians in the rows ``index [m]``.
+
+    Returns the start ``[m+1]`` of each Feature Gaussian in the list, and the list.
+    """
+    old_starts, sizes = features.starts[index], np.diff(features.starts)[index]
     starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
-    positions = (begin - starts[:-1]).astype(np.int32).repeat(sizes)  # in the members of all Feature Gaussians
+    positions = (old_starts - starts[:-1]).astype(np.int32).repeat(sizes)  # in the members of all Feature Gaussians
     positions += np.arange(starts[-1], dtype=np.int32)
     return starts, features.members[positions]
 
@@ -76,29 +80,31 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
     """
 
     def rows(array: np.ndarray) -> np.ndarray:
+        """Return the values of an array in the order of the clusters."""
         return array[order].astype(np.float64)
 
     def total(values: np.ndarray) -> np.ndarray:
+        """Return the sum of the values of each cluster."""
         return np.add.reduceat(values, cuts, axis=0)
 
     sizes = np.diff(np.append(cuts, len(order)))
     run = np.repeat(np.arange(len(cuts)), sizes)
     gains, extinctions = rows(features.gains), rows(features.extinctions)
     share = np.maximum(rows(features.weights) * gains, 1e-12)
-    share /= total(share)[run]
+    share /= total(share)[run]  # of each part in its cluster
     means = total(share[:, None] * rows(features.means))
     delta = rows(features.means) - means[run]
     covars = total(share[:, None, None] * (rows(features.covars) + delta[:, :, None] * delta[:, None]))
-    summed = total(extinctions)
-    starts, members = _gather(features, order)
+    optical_depths = total(extinctions)
+    starts, members = _gather_members(features, order)
 
     return FeatureGaussians(
         means=to_float32(means),
         covars=to_float32(covars),
         weights=to_float32(total(rows(features.weights))),
         masses=to_float32(total(rows(features.masses))),
-        extinctions=to_float32(summed),
-        gains=to_float32(total(gains * extinctions) / np.maximum(summed, 1e-30)),
+        extinctions=to_float32(optical_depths),
+        gains=to_float32(total(gains * extinctions) / np.maximum(optical_depths, 1e-30)),
         sh0=to_float32(total(share[:, None, None] * rows(features.sh0))),
         shN=to_float32(total(share[:, None, None] * rows(features.shN))),
         footprints=to_float32(total(share * rows(features.footprints))),
@@ -110,7 +116,10 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
 
 
 def _pool_latents(latents: Array, share: np.ndarray, run: np.ndarray, count: int) -> Array:
-    """Return the weighted sum of the ``latents [m,d]`` of each run, ``[count,d]``; tensors pass gradients."""
+    """Return the sum ``[count,d]`` of the ``latents [m,d]`` of each cluster, weighted by ``share [m]``.
+
+    ``run [m]`` are the clusters. Tensors, which training uses, pass gradients.
+    """
     if isinstance(latents, np.ndarray):
         sums = np.zeros((count, latents.shape[1]), np.float32)
         np.add.at(sums, run, latents * share[:, None])

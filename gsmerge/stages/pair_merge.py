@@ -23,8 +23,8 @@ from gsmerge.values.arrays import to_float32
 
 # Chosen on training scenes by the PSNR of views from random cameras (docs/internals/notebook.md#bare-files)
 COLOR_WEIGHT = 0.6  # weight of squared differences of sh0 in a cost, whose other part is a divergence in nats
-# Costs are multiplied by the masses to one of these powers. The first one keeps what is large in pictures, which suits
-# scenes. The second one keeps detail, which suits objects
+# Costs are multiplied by the masses to one of these powers. Power 1 keeps what is large in pictures, which suits
+# scenes. Power 0.3 keeps detail, which suits objects
 POWERS = 1.0, 0.3
 FLATNESS = 0.01  # least scale as a share of the largest scale, so that the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4  # least opacity of Gaussians that are merged, so that masses stay positive
@@ -54,7 +54,7 @@ class Cloud:
 
 @stage("reduce")
 def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) -> Gaussians:
-    """Merge finite Gaussians in any frame into ``count`` Gaussians, at least one.
+    """Merge finite Gaussians in any frame into ``count`` Gaussians, or into one if ``count`` is less.
 
     If there are at most ``count`` Gaussians, they are returned unchanged. Costs are weighted by the masses to the
     ``power``, see ``POWERS``.
@@ -71,7 +71,7 @@ def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) 
 
 
 def cloud_of(g: Gaussians) -> Cloud:
-    """Return the moments of Gaussians; flat Gaussians get a little thickness, so that they have a volume."""
+    """Return the moments of Gaussians. Flat Gaussians get a little thickness, so that they have a volume."""
     count = len(g)
     covars, masses = np.empty((count, 6), np.float32), np.empty(count, np.float32)
     quats, scales = (np.ascontiguousarray(column, np.float32) for column in (g.quats, g.scales))
@@ -82,7 +82,7 @@ def cloud_of(g: Gaussians) -> Cloud:
 
 
 def _merge_round(cloud: Cloud, count: int) -> Cloud:
-    """Merge the cheapest pairs of all cells, at most until ``count`` Gaussians remain; return the new cloud.
+    """Merge the cheapest pairs of all cells, at most until ``count`` Gaussians remain, and return the new cloud.
 
     If no pair has a finite cost, the Gaussians with the largest masses are kept.
     """
@@ -90,16 +90,17 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
     pairs, costs = np.zeros((len(cloud), 2), np.int32), np.full(len(cloud), np.inf, np.float32)
     colors = np.ascontiguousarray(cloud.sh[:, :3])
 
-    def merge_cells(begin: int) -> None:
+    def plan_merges(begin: int) -> None:
+        """Write the pairs to merge in the cells from ``begin`` on, and their costs, to ``pairs`` and ``costs``."""
         end = min(begin + CELLS_PER_TASK, len(starts) - 1)
-        # Least share of a cell's Gaussians that remains after a round; with fewer, merged Gaussians look like haze
+        # Least share of a cell's Gaussians that remains after a round. With less, merged Gaussians look like haze
         cell_share = 0.2
         agglomerate(
             cloud.means, cloud.covars, cloud.masses, cloud.weights, colors, order, starts, COLOR_WEIGHT, cell_share,
             begin, end, pairs, costs,
-        )  # fills `pairs` and `costs`  # fmt: skip
+        )  # fmt: skip
 
-    parallel_map(merge_cells, range(0, len(starts) - 1, CELLS_PER_TASK))
+    parallel_map(plan_merges, range(0, len(starts) - 1, CELLS_PER_TASK))
     cheapest_pairs = pairs[_cheapest(costs, len(cloud) - count)]
     if len(cheapest_pairs) == 0:
         return cloud[np.sort(np.argsort(-cloud.masses, kind="stable")[:count])]
@@ -107,7 +108,7 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
 
 
 def merge_rows(cloud: Cloud, pairs: np.ndarray) -> Cloud:
-    """Merge pairs of rows ``[m,2]`` int32, one after another; each result takes the place of the first row.
+    """Merge pairs of rows ``[m,2]`` int32, one after another, into the first row of each pair.
 
     Changes ``cloud``, and returns it without the second rows.
     """
@@ -130,7 +131,10 @@ def _divide_into_cells(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices, ascending, of the ``count`` lowest finite ``costs [n]``; of equal costs the first count."""
+    """Return the indices, ascending, of the ``count`` lowest finite ``costs [n]``.
+
+    If there are more equal costs than wanted, those with the lowest indices are returned.
+    """
     finite = np.isfinite(costs)
     count = min(count, int(finite.sum()))
     if count == 0:
@@ -141,10 +145,10 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
 
 
 def gaussians_of_cloud(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
-    """Convert moments to Gaussians; those that were not merged are copied from ``source``, the input of the merging.
+    """Convert moments to Gaussians, but copy those that were not merged from ``source``, the input of the merging.
 
-    If a mass would need an opacity above one, scales grow instead, at most by the share ``wider`` for each doubling of
-    the number of input Gaussians in a merged one.
+    If a mass would need an opacity above one, scales grow instead. They grow at most by the share ``wider`` for each
+    doubling of the number of input Gaussians that a Gaussian was merged from.
     """
     scales, quats = principal_axes(cloud.covars[:, FULL_MATRIX].reshape(-1, 3, 3))
     squares = scales * scales

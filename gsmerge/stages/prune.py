@@ -20,18 +20,18 @@ from gsmerge.types import Cameras, Gaussians
 ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of the change that rounding to eight bits makes
 TARGET_CHANGE = 0.9 * ROUNDING  # each next limit is chosen so that it should make this change
 ENOUGH_CHANGE = 0.75 * ROUNDING  # change at which the search for a larger limit ends
-# Distance from one drawn pixel to the next, in pixels of the photos: first where blending weights are measured, then
-# where pictures are compared. Pixels are drawn with the low-pass of the photos, so the root mean square is the same
+# Blending weights are measured in pictures whose sides are divided by the first number, and pictures with sides divided
+# by the second one are compared. Their low-pass is that of the photos, so changes have the same root mean square
 COMPARED_LEVELS = 2, 4
 
 
 @stage("prune")
 def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gaussians]:
-    """Split Gaussians into those that ``cameras`` see and those that they do not; return both.
+    """Return the Gaussians that ``cameras`` see, and those that no camera sees.
 
-    A Gaussian is unseen if its largest blending weight is below a limit. The limit is as large as possible, while the
-    picture of no camera changes by more than ``ROUNDING`` (root mean square) without the unseen Gaussians. The unseen
-    ones are returned in order of this weight, the largest first. Gaussians outside of all pictures count as seen.
+    A Gaussian is unseen if its largest blending weight is below a limit. The limit is as large as possible, while
+    without the unseen Gaussians no picture changes by more than ``ROUNDING`` (root mean square). Unseen Gaussians are
+    returned in the order of their weights, the largest first. Gaussians outside of all pictures count as seen.
     """
     peaks, inside = peak_weights(gaussians, blank_photos(cameras, COMPARED_LEVELS[0]))
     peaks[~inside] = np.inf
@@ -43,16 +43,17 @@ def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gau
 
 
 def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> float:
-    """Return the largest limit that was tried and not noticed, or 0 if each one was noticed.
+    """Try some limits, and return the largest one that is not noticed, or 0 if all are noticed.
 
     A limit is noticed if a picture changes by more than ``ROUNDING`` without the Gaussians whose largest blending
-    weight in ``peaks [n]`` is below it.
+    weight, in ``peaks [n]``, is below this limit.
     """
     start_limit = 0.02  # limit of the first trial
-    # up to the limit `low` changes are not noticed, and from `high` on they are
+    # Limits up to `low` are not noticed, and limits from `high` on are noticed
     splats, low, high, limit = make_splats(gaussians), 0.0, math.inf, start_limit
 
     def clip(_: int, image: np.ndarray, __: np.ndarray) -> np.ndarray:
+        """Clip a render as a picture on a screen is."""
         return np.clip(image, 0, 1, out=image)
 
     whole = photo_errors(splats, photos, clip)
@@ -62,6 +63,7 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
         shown = peaks >= limit
 
         def compare(view: int, image: np.ndarray, transmittance: np.ndarray) -> float:
+            """Return the mean squared change of a render from that of all Gaussians."""
             return float(((clip(view, image, transmittance) - whole[view]) ** 2).mean(dtype=np.float64))
 
         return math.sqrt(max(photo_errors(splats, photos, compare, keep=lambda _: shown)))

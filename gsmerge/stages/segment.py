@@ -1,6 +1,6 @@
-"""Scene -> groups: cut every view into superpixels, either the same number in each, or as a region tree says.
+"""Scene -> groups: cut every view into superpixels, either equally many in each, or as many as a region tree gives it.
 
-The tree merges neighbouring superpixels in order of the distortion that this adds, in all views together. A cut through
+The tree merges neighbouring superpixels of all views. Merges that add the least distortion come first. A cut through
 the tree has few superpixels where merges lose little, and many elsewhere, so every Gaussian lowers the distortion about
 equally. Distortion is measured in the image. It is the squared error of colours plus the squared relative error of
 depths from a plane. So a flat wall costs nothing from any angle, and far things count as much as near ones.
@@ -32,33 +32,33 @@ from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 
 DEPTH_WEIGHT = 1.0  # weight of squared relative depth errors, relative to squared colour errors (sRGB in [0, 1])
-# Largest side of a region, as a share of the image's longer side. In larger Gaussians the error of the rasterizer's
-# affine approximation shows. A region is larger only if the budget allows no more regions
+# Largest side of a region, as a share of the image's longer side. Larger Gaussians show the error of the rasterizer's
+# affine approximation. Regions are larger only if the budget is too small
 MAX_EXTENT = 1 / 8
-# More Gaussians gain too little if the slope of the curve is less: dB of predicted quality per relative increase of the
-# number of Gaussians
+# More Gaussians gain too little if the slope of the curve is less, in dB of predicted quality per relative increase of
+# the number of Gaussians
 REGION_KNEE_SLOPE = 1.0
 KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no number of Gaussians removes, such as noise
 
 
 @dataclass(frozen=True, eq=False)
 class SuperpixelChoices:
-    """What decides how a scene is cut into superpixels."""
+    """Options and limits by which a scene is cut into superpixels."""
 
     options: SegmentOptions  # Method, and number of superpixels
     limits: CountLimits  # Limits of the number of Gaussians
-    start_share: float  # Share of the Gaussians that the fit starts with; it adds the rest
-    shared: SharedTree | None  # Region tree for all counts that a run tries; None if each count builds its own
+    start_share: float  # Share of the Gaussians with which the fit starts, before it adds the rest
+    shared: SharedTree | None  # Region tree for all counts that a run tries, or None if each count builds its own
 
 
 @dataclass(eq=False)
 class SharedTree:
-    """The region tree from which all counts that a run tries are cut; the first call of :meth:`get` builds it."""
+    """Holder of the region tree from which all counts that a run tries are cut."""
 
     tree: RegionTree | None = None
 
     def get(self, scene: PicturedScene, choices: SuperpixelChoices) -> RegionTree:
-        """Return the tree of a scene, fine enough for the count that the budget asks for."""
+        """Return the tree of a scene, which the first call builds with enough superpixels for the requested count."""
         if self.tree is None:
             limits = choices.limits
             self.tree = scene_tree(scene, choices.options, limits, limits.exact or limits.default)
@@ -67,7 +67,7 @@ class SharedTree:
 
 @stage("segment")
 def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int | None) -> Segmentation:
-    """Cut every view into superpixels, for exactly ``count`` Gaussians, or for the number in the options if None.
+    """Cut every view into superpixels, for exactly ``count`` Gaussians, or for the default number if None.
 
     An exact count is cut from the region tree, which gives a plain wall few superpixels and a fern many. Scenes whose
     pixels differ in importance are always cut from the tree. If the shared tree is too coarse, a finer tree is built.
@@ -87,20 +87,20 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
 
 @stage("segment")
 def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
-    """Build the region tree of a scene, which starts with enough superpixels for ``count`` Gaussians.
+    """Build the region tree of a scene from enough superpixels for ``count`` Gaussians.
 
-    The squared colour error of a pixel is multiplied by its importance.
+    The squared colour error of a pixel is multiplied by its importance. Colours are multiplied by the square root.
     """
-    images, leaves = scene.images, max(limits.per_view, -(-count // len(scene)))
-    if scene.importance is not None:  # colours are multiplied by its square root, because their errors are squared
+    images, per_view = scene.images, max(limits.per_view, -(-count // len(scene)))
+    if scene.importance is not None:
         images = images * np.sqrt(scene.importance)[..., None]
-        leaves = int(leaves * scene.importance.max())
-    groups = segment(scene.images, options, min(leaves, scene.pixels_per_view))
+        per_view = int(per_view * scene.importance.max())  # important pixels need more superpixels
+    groups = segment(scene.images, options, min(per_view, scene.pixels_per_view))
     return region_tree(images, front_depths(scene), groups, scene.get_pixels().shown)
 
 
 def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
-    """Return the number of Gaussians at the knee of the scene's distortion curve, but within the limits."""
+    """Return the number of Gaussians at the knee of the scene's distortion curve, clipped to the limits."""
     limits, shared = choices.limits, choices.shared or SharedTree()
     tree = shared.get(scene, choices)
     usable = tree.counts >= tree.min_regions  # counts without regions larger than MAX_EXTENT
@@ -109,11 +109,11 @@ def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
 
 @dataclass(frozen=True, eq=False)
 class RegionTree:
-    """All merges of neighbouring regions, from the superpixels of all views to a single region in each view."""
+    """Merges of neighbouring regions, from the superpixels of all views to a single region in each view."""
 
     groups: Groups  # The superpixels before all merges, which are the leaves of the tree
-    parents: tuple[np.ndarray, ...]  # For each view [2·leaves-1] int32: the region that a merge makes of each, or -1
-    order: np.ndarray  # [m] int64, the numbers of all merges, cheapest first; those of view v start at `offsets[v]`
+    parents: tuple[np.ndarray, ...]  # For each view [2·leaves-1] int32, the parent of each region, or -1
+    order: np.ndarray  # [m] int64 numbers of all merges, the cheapest first; those of view v start at `offsets[v]`
     offsets: np.ndarray  # [v+1] int64, number of merges in all views before each
     distortions: np.ndarray  # [m+1] float64 mean squared error after 0 to m merges
     min_regions: int  # Least number of regions of which none is larger than `MAX_EXTENT`
@@ -133,6 +133,7 @@ def front_depths(scene: Scene) -> np.ndarray:
     cameras, means, fronts = scene.cameras, scene.gaussians.means, scene.get_pixels().fronts
 
     def view_depths(view: int) -> np.ndarray:
+        """Return the depths ``[h,w]`` of one view."""
         depths = camera_depths(means[fronts[view]], cameras.viewmats[view].astype(means.dtype))
         return depths.astype(np.float32)
 
@@ -143,30 +144,31 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
     """Merge neighbouring superpixels in order of the distortion that this adds, until each view is a single region.
 
     ``images [v,h,w,3]`` are sRGB in [0, 1]. ``depths [v,h,w]`` of 0 or less count as very near. ``groups`` are
-    4-connected, and none is empty. Pixels that are not ``valid [v,h,w]`` do not count, and superpixels without valid
-    pixels are merged first. Raises ValueError if the arguments do not fit together.
+    4-connected and not empty. Pixels that are not ``valid [v,h,w]`` do not count, and superpixels without valid pixels
+    are merged first. Raises ValueError if the arguments do not fit together.
     """
     _check_pictures(images, depths, groups, valid)
-    extent = max(1.0, MAX_EXTENT * max(images.shape[1:3]))
+    max_extent = max(1.0, MAX_EXTENT * max(images.shape[1:3]))
 
     def merge_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, int]:
+        """Return three arrays of :func:`merge_order`, the error before all merges, and the number of usable pixels."""
         usable = _usable_depths(depths[view], valid[view])
         labels, count = pad_labels(groups.labels[view]), groups.counts[view]
         pixels = np.ascontiguousarray(images[view], np.float32)
         rows = np.empty((2 * count, TREE_COLUMNS))
-        start = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
+        error = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
         pairs = adjacent_pairs(labels)
-        # Weight of squared distances in pixels, relative to squared differences of colours. Without it regions become
-        # long and winding, and no Gaussian fits them
+        # Weight of squared distances in pixels, relative to squared differences of colours. With a smaller weight,
+        # regions become long and winding, so that no Gaussian fits them
         compactness = 1e-5
-        return *merge_order(pairs, rows, DEPTH_WEIGHT, compactness, extent), start, int((usable > 0).sum())
+        return *merge_order(pairs, rows, DEPTH_WEIGHT, compactness, max_extent), error, int((usable > 0).sum())
 
     merged_views = parallel_map(merge_view, range(len(images)))
-    parents, view_heights, growths, starts, num_pixels = zip(*merged_views, strict=True)
+    parents, view_heights, growths, errors, num_pixels = zip(*merged_views, strict=True)
     offsets, heights = np.concatenate([[0], np.cumsum([len(h) for h in view_heights])]), np.concatenate(view_heights)
-    # Heights never fall from child to parent, and children come first, so a stable sort keeps children before parents
+    # A parent is at least as high as its children, and comes after them. A stable sort keeps this order
     order = np.argsort(heights, kind="stable")
-    added = np.concatenate([[sum(starts)], np.concatenate(growths)[order]])
+    added = np.concatenate([[sum(errors)], np.concatenate(growths)[order]])
     distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))
     min_regions = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
     return RegionTree(groups, parents, order, offsets, distortions, min_regions)
@@ -185,7 +187,7 @@ def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, vali
 
 
 def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return depths in units of their median, float32; 0 for pixels that are not valid or have no finite depth."""
+    """Return depths in units of their median, float32, and 0 for pixels that are not valid or have no finite depth."""
     usable = valid & np.isfinite(depths)
     positive = usable & (depths > 0)
     median = float(np.median(depths[positive])) if positive.any() else 1.0
@@ -197,8 +199,8 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def cut_tree(tree: RegionTree, budget: int) -> Groups:
     """Cut the tree into exactly ``budget`` regions in all views together, at least one in each view.
 
-    A ``budget`` above the number of superpixels gives all superpixels. The regions of a smaller budget are unions of
-    those of a larger budget. Raises ValueError if ``budget`` is below the number of views.
+    If ``budget`` is above the number of superpixels, all superpixels are returned. The regions of a smaller budget are
+    unions of those of a larger budget. Raises ValueError if ``budget`` is below the number of views.
     """
     num_views = len(tree.parents)
     if budget < num_views:
@@ -207,6 +209,7 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
     is_merged[tree.order[: max(0, len(tree) - budget)]] = True
 
     def cut_view(view: int) -> tuple[np.ndarray, int]:
+        """Return the labels of the pixels of a view, and the number of its regions."""
         is_view_merged = is_merged[tree.offsets[view] : tree.offsets[view + 1]]
         leaves = tree.groups.counts[view]
         leaf_labels = cut_labels(tree.parents[view], is_view_merged, leaves)
@@ -219,9 +222,9 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
 def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
-    The predicted quality of N Gaussians is q(N) = -10 log10(``KNEE_FLOOR`` + D(N)) dB, where D is the distortion. Its
-    slope at N is measured between N / 1.25 and N, in dB per relative increase of N. The knee is the largest N with a
-    slope of at least ``REGION_KNEE_SLOPE``, or the least N if there is none. ``counts [m]`` are all different, and
+    The predicted quality of N Gaussians is q(N) = -10 log10(``KNEE_FLOOR`` + D(N)) dB, where D is the distortion. The
+    slope of q at N is measured between N / 1.25 and N, in dB per relative increase of N. The knee is the largest N with
+    a slope of at least ``REGION_KNEE_SLOPE``, or the least N if there is none. ``counts [m]`` are all different, and
     ``distortions [m]`` are mean squared errors per pixel and channel.
     """
     counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)

@@ -1,9 +1,9 @@
 """Find the Gaussians of the sky in photos, without a network or a download.
 
 In a photo, the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. It also becomes
-paler towards the horizon, as air does. If it does not, as under clouds, it must be several times as far away as the
-rest. Ceilings and white walls may be smooth, grey and at the upper border as well. But they seldom become paler or are
-far away, and never in several views.
+paler towards the horizon. A cloudy sky may not become paler, so a region also counts if it is several times as far away
+as the rest. Ceilings and white walls may be smooth, grey and at the upper border as well. But they seldom become paler
+or are far away, and never in several views.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
 GRADIENT_PIXELS = 480.0  # gradients are those of a photo with this many pixels on its longer side
-# Sky is blue and brighter than DARK_SKY, or brighter than WHITE_SKY with less chroma than GREY_SKY
+# Blue sky is brighter than DARK_SKY. White sky is brighter than WHITE_SKY, and has less chroma than GREY_SKY
 DARK_SKY, WHITE_SKY, GREY_SKY = 0.35, 0.75, 0.12
 FAR_RATIO = 3.0  # the sky is more than this many times as far away as the rest
-# Sky has to show in this many views and in this share of all views. In fewer views, something else may look like sky
+# Least number of views that show sky, and their least share of all views. In fewer views, something else may look like
+# sky
 LEAST_SKY_VIEWS, LEAST_SKY_SHARE = 2, 0.2
 SKY_GAUSSIANS = 200_000  # the depths of at most this many Gaussians are compared
 
@@ -35,7 +36,7 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
     regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
     if not regions:
         return mask
-    # There are at most this many rounds. A round is the last one if it adds less than this share of all sky so far
+    # There are at most max_rounds. A round that adds less than last_share of the sky so far is the last one
     max_rounds, last_share = 6, 0.02
     for _ in range(max_rounds):  # each round finds Gaussians that those of earlier rounds have hidden
         rows = np.flatnonzero(~mask)
@@ -47,18 +48,18 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
 
 
 def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:
-    """Return a mask ``[h,w]`` of the sky for each view that shows sky, by view; empty if too few views show sky."""
-    regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
-    shown = {
+    """Return a mask ``[h,w]`` of the sky for each view that shows sky, or none at all if too few views do."""
+    candidates = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
+    skies = {
         view: region
-        for view, region in regions.items()
-        if _pales_downwards(photos[view], region) or _is_far(means, cameras[[view]], region)
+        for view, region in candidates.items()
+        if _pales_downwards(photos[view], region) or _is_farther_than_rest(means, cameras[[view]], region)
     }
-    return shown if len(shown) >= max(LEAST_SKY_VIEWS, LEAST_SKY_SHARE * len(photos)) else {}
+    return skies if len(skies) >= max(LEAST_SKY_VIEWS, LEAST_SKY_SHARE * len(photos)) else {}
 
 
 def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Return a mask ``[n]`` of the Gaussians with most of their blending weight inside the regions, masks by view."""
+    """Return a mask ``[n]`` of the Gaussians with most of their blending weight inside the regions of the views."""
     splats = make_splats(gaussians)
     inside, total = np.zeros(len(splats)), np.zeros(len(splats))
     for view, region in regions.items():
@@ -71,8 +72,8 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
     return np.asarray((inside > 0) & (inside >= min_share * total))
 
 
-def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
-    """Return true if a region ``[h,w]`` of a camera's picture is several times as far away as the rest."""
+def _is_farther_than_rest(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
+    """Return true if a region ``[h,w]`` of a picture is several times as far away as the rest, by median depth."""
     (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // SKY_GAUSSIANS))], camera)
     inside = (depths > 0) & is_inside(pixels, camera)
     x, y = pixels[inside].astype(int).T
@@ -109,7 +110,7 @@ def _like_sky(soft: np.ndarray, scale: float) -> np.ndarray:
     bright, dark = reduce(np.maximum, colors), reduce(np.minimum, colors)  # takes a tenth of the time of max(2)
     is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK_SKY)
     is_white = (bright > WHITE_SKY) & (bright - dark < GREY_SKY)
-    max_gradient = 0.02  # largest gradient of a colour per pixel
+    max_gradient = 0.02  # largest gradient of a colour per pixel of a photo of GRADIENT_PIXELS
     return np.asarray((np.sqrt(right * right + down * down) * scale < max_gradient) & (is_blue | is_white))
 
 
@@ -119,8 +120,8 @@ def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
     bright = colors.max(1)
     saturation = (bright - colors.min(1)) / np.maximum(bright, 1e-6)
     low, high = np.percentile(saturation, (10, 90))
-    # Least difference between percentiles 10 and 90 of the saturation, and largest correlation with the row, which
-    # counts downwards
+    # Least difference between percentiles 10 and 90 of the saturation, and largest correlation between saturation and
+    # row. Rows are counted downwards
     min_spread, max_correlation = 0.08, -0.12
     if high - low < min_spread or np.ptp(rows) == 0:
         return False

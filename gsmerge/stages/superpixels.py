@@ -1,12 +1,12 @@
 """Partition each view into superpixels of similar colour and regular shape (paper section 4.1).
 
-The default, ``rdseg``, places superpixels where they lower the squared colour error most. It first cuts the image into
-more rectangles than requested, the best cuts first. It merges these with Ward's rule to the exact number. Then it moves
-pixels at borders between superpixels if this lowers the error. ``bass`` is Bayesian adaptive superpixel segmentation
-from a hexagonal grid. ``bass-st`` starts from seeds that are drawn by the Shi-Tomasi response instead, as in the paper.
-``grid`` makes plain rectangles. If these are a few pixels large and no fit follows, they are as good as the results of
-the other methods, and cost nothing. There are exactly as many superpixels as requested. None is empty, each is
-4-connected, and each run gives the same bits.
+The default, ``rdseg``, places superpixels where they lower the squared colour error most. First it cuts the image into
+more rectangles than requested, where cuts lower the error most. It merges rectangles with Ward's rule to the exact
+number. Then it moves pixels at borders between superpixels if this lowers the error. ``bass`` is Bayesian adaptive
+superpixel segmentation from a hexagonal grid. ``bass-st`` starts from seeds that are drawn by the Shi-Tomasi response
+instead, as in the paper. ``grid`` makes plain rectangles. Rectangles of a few pixels are as good as other superpixels
+if no fit follows, and take no time. All methods make exactly as many superpixels as requested. No superpixel is empty,
+each is 4-connected, and each run gives the same bits.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ RECTANGLES, EARLY_SWEEPS = 2.0, 0  # defaults of rdseg: rectangles per superpixe
 def segment(images: np.ndarray, options: SegmentOptions, count: int | None = None) -> Groups:
     """Cut every view into the same number of superpixels.
 
-    ``images [v,h,w,3]`` are float in [0, 1] or uint8. ``count`` is the number per view; if None, the options give it.
+    ``images [v,h,w,3]`` are float in [0, 1] or uint8. ``count`` is the number per view, by default that of the options.
     """
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
@@ -68,15 +68,15 @@ def superpixels(
     """Cut an image into exactly ``count`` superpixels, each non-empty and 4-connected.
 
     Args:
-        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
+        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8, as an array or a tensor.
         count: Superpixels, 1 to h·w.
         segmentation: ``rdseg``, ``bass``, ``bass-st`` or ``grid``.
-        rectangles: For ``rdseg``: rectangles per superpixel that it begins with, at least 1.
-        early_sweeps: For ``rdseg``: sweeps over border pixels before rectangles are merged.
+        rectangles: For ``rdseg``: rectangles per superpixel before merging, at least 1.
+        early_sweeps: For ``rdseg``: sweeps over border pixels before merging.
         compactness: Weight of squared pixels, relative to squared colours, in [0, 1] (not for the BASS methods).
 
     Returns:
-        Labels ``[h,w]`` int32 without gaps from 0 on, the same in every run; a tensor for a tensor.
+        Labels ``[h,w]`` int32 from 0 on without gaps, the same in every run. A tensor gives a tensor.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -105,7 +105,7 @@ def superpixels(
 
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
-    """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows; their numbers per row differ by at most one."""
+    """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows of equal or almost equal numbers."""
     min_rows = -(-count // width)  # least number of rows in which each rectangle has a pixel
     num_rows = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
     first_labels = np.arange(num_rows + 1) * count // num_rows  # first label of each row of rectangles
@@ -120,10 +120,10 @@ def saliency(image: Array) -> Array:
     It is the smaller eigenvalue of the structure tensor.
 
     Args:
-        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
+        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8, as an array or a tensor.
 
     Returns:
-        ``[h,w]`` float32, at least 0; 0 everywhere in a flat image; a tensor for a tensor.
+        ``[h,w]`` float32, at least 0, and 0 everywhere in a flat image. A tensor gives a tensor.
 
     Raises:
         ValueError: If the image has the wrong shape or range.
@@ -141,7 +141,7 @@ def scene_saliency(images: np.ndarray) -> np.ndarray:
 
 
 def _as_pixels(array: np.ndarray) -> np.ndarray:
-    """Return an image as float32 ``[h,w,3]`` in [0, 1], contiguous; raise ValueError for other content."""
+    """Return an image as contiguous float32 ``[h,w,3]``, or raise ValueError if its values are not in [0, 1]."""
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
         raise ValueError(f"image: expected shape [h, w, 3], got {list(array.shape)}")
     if array.dtype == np.uint8:
@@ -156,7 +156,7 @@ def _as_pixels(array: np.ndarray) -> np.ndarray:
 
 
 def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int, compactness: float) -> np.ndarray:
-    """Cut an image by the method ``rdseg``; return labels with a border of one pixel that belongs to no superpixel."""
+    """Cut an image by the method ``rdseg``, and return padded labels, see :func:`pad_labels`."""
     height, width, _ = pixels.shape
     spread = np.float32(compactness**0.5)
     num_rectangles = int(rectangles * count)
@@ -174,7 +174,7 @@ def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int,
 
 
 def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
-    """Cut an image by BASS from seeds on a hexagonal grid or drawn by saliency; return labels padded as by rdseg."""
+    """Cut an image by BASS, and return padded labels. Seeds are on a hexagonal grid, or drawn by saliency."""
     from gsmerge.kernels.superpixels.bass import infer_labels
 
     height, width, _ = pixels.shape
@@ -182,7 +182,7 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
         seeds = hexagonal_seeds(height, width, count)
     else:
         seeds = seeds_from_density(seed_density(corner_response(pixels), count), count)
-    # CIELAB divided by 100; OpenCV computes it by tables, so the bits are the same on every processor
+    # CIELAB divided by 100. OpenCV computes it by tables, so the bits are the same on every processor
     colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
     labels = pad_labels(voronoi(seeds, height, width))
     return infer_labels(labels, colours, count)

@@ -1,1 +1,1 @@
-"""Kernels on Gaussians and their parameters."""
+"""Compute with the parameters of Gaussians, without drawing them."""

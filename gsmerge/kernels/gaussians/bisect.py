@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8
 
-# `features` to `room` are work space for the longest group and the most children; `errors` may have no columns
+# `features` to `room` are work space for the longest group and the most children. `errors` may have no columns
 _split_groups = declare(
     "split_groups", STATUS, starts=i8("ends", least=0, ascending=True), ids=i4("m"), means=f4("n", 3),
     sh0=f4("n", 1, 3), opacities=f4("n"), centres=f8("groups", 3), footprints=f8("groups"),
@@ -20,16 +20,17 @@ _split_groups = declare(
 def gather_groups(starts, ids, rows):
     """Return the starts ``[r+1]`` and the ids of the members of the groups ``rows [r]``, group after group."""
     sizes = starts[rows + 1] - starts[rows]
-    local = np.concatenate([[0], np.cumsum(sizes)])
-    return local, ids[np.repeat(starts[rows] - local[:-1], sizes) + np.arange(local[-1])]
+    row_starts = np.concatenate([[0], np.cumsum(sizes)])
+    return row_starts, ids[np.repeat(starts[rows] - row_starts[:-1], sizes) + np.arange(row_starts[-1])]
 
 
 def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children):
-    """Divide the members of every group into ``num_children`` children, one number or ``[g]``, at least 1.
+    """Divide the members of every group into ``num_children`` children, by halving.
 
-    The child with the largest spread of features is halved again and again. The features of a member are its colour,
-    and its position relative to ``centres [g,3]`` in units of ``footprints [g]``. Groups of equal members give fewer
-    children. The children for 2 are unions of the children for 4.
+    ``num_children`` is one number for all groups or ``[g]``, at least 1. In each step, the child with the largest
+    spread of features is halved. The features of a member are its colour, and its position relative to ``centres
+    [g,3]`` in units of ``footprints [g]``. A group with equal members gives fewer children. Two children of a group are
+    unions of its four children.
 
     Returns the start ``[m+1]`` of each child in a list of members, this list, and the group ``[m]`` of each child.
     """
@@ -41,11 +42,11 @@ def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children
 
 
 def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_children, plane_weight):
-    """Return the squared error ``[g,max_children]`` of every group with 1, 2, ... children of :func:`bisect`.
+    """Return the squared error ``[g,max_children]`` of every group with 1, 2 and more children of :func:`bisect`.
 
-    It is NaN for more children than the group can have. The error of a member is its squared distance from the child's
-    mean colour, plus ``plane_weight`` times that from a plane through the child, both in features. The mean weight of
-    the members is one, and opaque members weigh more.
+    The error is NaN for more children than a group can have. It is a weighted sum over the members. The error of a
+    member is its squared distance from the child's mean colour, plus ``plane_weight`` times that from a plane through
+    the child, both in features. The mean weight of the members is one, and opaque members weigh more.
     """
     num_groups = len(starts) - 1
     counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)
@@ -54,16 +55,16 @@ def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_ch
 
 
 def _split_into_children(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight):
-    """Split groups as :func:`bisect` does, and return the same; also write errors to ``errors [g, any]``."""
+    """Return the result of :func:`bisect`, and write an error for each number of children to ``errors [g, any]``."""
     sizes = np.diff(starts)
     counts = np.minimum(counts, np.maximum(sizes, 1))
     longest, most, total = int(sizes.max(initial=0)), int(counts.max(initial=1)), int(counts.sum())
     child_starts, parents = np.empty(total + 1, np.int64), np.empty(total, np.int64)
-    child_ids, made = np.empty(starts[-1] - starts[0], np.int32), np.empty(1, np.int64)
+    child_ids, num_children = np.empty(starts[-1] - starts[0], np.int32), np.empty(1, np.int64)
     _split_groups(
         starts, np.asarray(ids, np.int32), means, sh0, opacities, centres, footprints, counts, plane_weight,
         np.empty((longest, 8)), np.empty(longest), np.empty((2, longest), np.int64), np.empty(most + 1, np.int64),
-        np.empty((most, 18)), child_starts, child_ids, parents, made, errors,
+        np.empty((most, 18)), child_starts, child_ids, parents, num_children, errors,
     )  # fmt: skip
-    count = int(made[0])
+    count = int(num_children[0])
     return child_starts[: count + 1].copy(), child_ids, parents[:count].copy()

@@ -19,7 +19,7 @@ def bhattacharyya(mean_a, cov_a, mean_b, cov_b):
 def box_overlap(mean_a, cov_a, mean_b, cov_b):
     """Return the intersection over union of the boxes of two Gaussians (paper section 4.4).
 
-    A box is aligned with the axes, and reaches one standard deviation from the mean to each side.
+    A box is aligned with the axes. On each axis it reaches from one standard deviation below the mean to one above.
     """
 
 
@@ -28,18 +28,20 @@ def box_overlap(mean_a, cov_a, mean_b, cov_b):
     views=i8("g"), max_color=f8(), similarity=f8(), boxes=i4(), out=f8("g", "k", out=True),
 )  # fmt: skip
 def edge_scores(neighbors, means, covars, colors, latents, views, max_color, similarity, boxes, out):
-    """Write the overlap of every Gaussian with each of its neighbours, which is an edge of a graph of Gaussians.
+    """Write the overlap of every Gaussian with each of its neighbours.
+
+    Gaussians are clustered in a graph whose edges have these overlaps.
 
     Args:
-        neighbors: ``[g,k]`` int64 rows of neighbours; below 0 for none.
+        neighbors: ``[g,k]`` int64 rows of neighbours, below 0 where there is none.
         covars: ``[g,6]`` float64, as xx xy xz yy yz zz.
         colors: ``[g,3]`` float64 base colours.
-        latents: ``[g,d]`` float32, each of length 1; d is 0 if there are none.
-        views: ``[g]`` int64; a view below 0 means no view.
+        latents: ``[g,d]`` float32, each of length 1, or with d = 0.
+        views: ``[g]`` int64, below 0 for Gaussians of no view.
         max_color: Largest difference of the colours of similar Gaussians, if there are no latents.
         similarity: Least cosine of the latents of similar Gaussians.
         boxes: 1 to measure overlap by :func:`box_overlap`, 0 to measure it by :func:`bhattacharyya`.
-        out: ``[g,k]`` float64, written; -1 if there is no neighbour, or it is of the same view or not similar.
+        out: ``[g,k]`` float64, written: overlaps with similar neighbours of other views, and -1 for all others.
     """
 
 
@@ -50,17 +52,17 @@ _find_stars = declare(
 
 
 def leader_clusters(order, neighbors, scores, views, threshold, max_size):
-    """Cluster Gaussians around leaders, so that each cluster is a star and no chain.
+    """Cluster Gaussians around leaders, so that all Gaussians of a cluster overlap with its leader.
 
-    In ``order``, each Gaussian that is in no cluster yet becomes a leader. Those of its neighbours that overlap enough
-    and are in no cluster join it, the ones with the most overlap first, at most one from each view. Returns the cluster
-    ``[n]`` int64 of each Gaussian and the number of clusters.
+    The Gaussians are visited in a given order, and each one that is in no cluster yet becomes a leader. Neighbours that
+    overlap enough and are in no cluster join the leader, those with the most overlap first, at most one from each view.
+    Returns the cluster ``[n]`` int64 of each Gaussian and the number of clusters.
 
     Args:
         order: ``[n]`` int64 rows of all Gaussians.
-        neighbors: ``[n,k]`` int64 rows of neighbours; below 0 for none.
+        neighbors: ``[n,k]`` int64 rows of neighbours, below 0 where there is none.
         scores: ``[n,k]`` float64 overlaps with the neighbours.
-        views: ``[n]`` int64; a view below 0 means no view.
+        views: ``[n]`` int64, below 0 for Gaussians of no view.
         threshold: Least overlap.
         max_size: Largest number of Gaussians in a cluster, with the leader.
     """

@@ -1,8 +1,8 @@
 """Find the nearest points of other views, and measure how points agree with the Gaussians of other views.
 
-Nearest points are found by a balanced k-d tree. Node i of the tree is a run of the array ``order``. Its children
-2 i + 1 and 2 i + 2 are the two halves of this run, which are on different sides of a plane across one axis. Agreement
-is measured in each view at the one pixel to which a point projects.
+Nearest points are found by a balanced k-d tree. Node i of the tree is a run of the array ``order``. Its children 2 i +
+1 and 2 i + 2 are the halves of this run. A plane across one axis separates their points. Agreement is measured in each
+view at the pixel to which a point projects.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ def build_tree(points, order, axes, splits):
     """Build the k-d tree of finite ``points [n,3]``.
 
     Args:
-        order: ``[n]`` int64 rows of the points, in any order, which this function changes.
+        order: ``[n]`` int64 rows of the points in any order, sorted into the runs of the tree.
         axes: ``[nodes]`` int8, written: axis along which each node is divided.
         splits: ``[nodes]`` float64, written: coordinate at which each node is divided.
     """
 
 
 def make_tree(points):
-    """Return the k-d tree of finite ``points [n,3]`` in C order: its order, axes and splits, see :func:`build_tree`."""
+    """Return order, axes and splits of the k-d tree of finite ``points [n,3]`` in C order, see :func:`build_tree`."""
     leaf = 16  # runs of at most this many points are not divided
     nodes = 4 << (len(points) // leaf).bit_length()
     order, axes, splits = np.arange(len(points)), np.zeros(nodes, np.int8), np.zeros(nodes)
@@ -47,20 +47,20 @@ def nearest_of_others(points, views, order, axes, splits, first, last, most, out
     """Write the nearest points of other views, for the points from ``first`` to before ``last``.
 
     Args:
-        points: Those of the tree.
-        views: ``[n]`` int64. A point with a view below 0 belongs to no view, so all others are of other views.
-        order: As :func:`build_tree` wrote it, like ``axes`` and ``splits``.
+        points: Points of the tree.
+        views: ``[n]`` int64. A view below 0 differs from all views.
+        order, axes, splits: Results of :func:`build_tree`.
         first: First row.
         last: Last row, exclusive.
-        most: The search for a point ends once it was compared with this many others.
-        out: ``[n,k]`` int64, written: rows of the k nearest points, nearest first; -1 if there are fewer.
+        most: Largest number of points with which a point is compared.
+        out: ``[n,k]`` int64, written: rows of the k nearest points, nearest first, and -1 if there are fewer.
     """
     _search_tree(points, views, order, axes, splits, first, last, most, np.empty(out.shape[1]), out)
 
 
 @native(STATUS, values=f8("n"), order=i8("m", out=True, least=0, below="n"), low=i8(least=0), high=i8(), place=i8())
 def partition(values, order, low, high, place):
-    """Reorder a part of ``order`` so that one position has the value that sorting would put there.
+    """Reorder a part of ``order`` so that one position gets the value that it would have after sorting.
 
     No value before this position is larger, and no value after it is smaller.
 
@@ -87,18 +87,20 @@ def sum_cross_view(
 
     Args:
         colors: ``[g,3]`` float32 base colours minus 0.5.
-        own: ``[g]`` int64 view of each point, which is left out; below 0 if the point is compared with all views.
+        own: ``[g]`` int64 own view of each point, with which it is not compared. Points with a number below 0 are
+            compared with all views.
         asked: ``[v,most]`` int32 views with which the points of each view are compared.
         width: Width of the views, pixels.
         height: Height of the views, pixels.
         fronts: ``[v,h,w]`` int32 row of the front Gaussian of each pixel, -1 for none.
         color_scale: Factor from ``sh0`` to colours.
         near: Largest difference of the logarithms of two depths of the same surface.
-        far: Differences of the logarithms of depths are clipped to this.
-        min_opacity: A Gaussian with less opacity shows no surface.
+        far: Largest difference of the logarithms of depths that is added. Larger ones are clipped.
+        min_opacity: Least opacity of a Gaussian that shows a surface.
         first: First point.
         last: Last point, exclusive.
-        out: ``[g,6]`` float64, to which six sums are added. They are the number of views that see the point; the
-            numbers of those whose surface is at the point, behind it, and in front of it; the absolute difference of
-            colours if the surface is at the point; and the difference of the logarithms of depths.
+        out: ``[g,6]`` float64, to which sums over the views that see the point are added. Column 0 is the number of
+            these views. Columns 1 to 3 are the numbers of views whose surface is at the point, behind it, and in front
+            of it. Column 4 is the absolute difference of colours where the surface is at the point. Column 5 is the
+            difference of the logarithms of depths.
     """

@@ -13,19 +13,17 @@ NUM_EDGES = 4  # a photo has this many edges
     covars=f8("n", 3, 3, out=True), is_cut=u1("n", out=True),
 )  # fmt: skip
 def cut_at_edges(quats, scales, normals, offsets, first, last, means, covars, is_cut):
-    """Cut rows ``first`` to ``last - 1`` of Gaussians that reach past the edges of all v photos.
+    """Cut Gaussians, of the rows ``first`` to ``last - 1``, that reach past the edges of all v photos.
 
-    The cut is made at the nearest edge of the photo in which the Gaussian lies deepest. Distances from edges are
-    measured in standard deviations of the Gaussian across the plane of the edge. If the mean is within two standard
-    deviations of the edge, the Gaussian gets the moments of its part inside (truncated normal distribution). This is
-    done at most twice, because a corner has two edges. Gaussians farther outside do not change.
-
-    The edge of each cut is not returned. ``gsmerge.fit.edges`` splits Gaussians instead of cutting them, and finds the
-    edge again by the same rule.
+    A Gaussian is cut at the nearest edge of the photo in which it lies deepest. Distances from edges are measured in
+    standard deviations of the Gaussian across the plane of the edge. If the mean is within two standard deviations of
+    the edge, the Gaussian gets the moments of its part inside (truncated normal distribution). This is done at most
+    twice, because a corner has two edges. Gaussians farther outside do not change. ``gsmerge.fit.edges`` splits
+    Gaussians at the same edges, which it finds by the same rule.
 
     Args:
         normals: Outward unit normals of the planes through the cameras and the edges of their photos.
-        offsets: Offsets of the planes; points x inside have ``normal @ x <= offset``.
+        offsets: Offsets of the planes. Points x inside have ``normal @ x <= offset``.
         means: Means, written for Gaussians that are cut.
         covars: Covariances, written for Gaussians that are cut.
         is_cut: Written: 1 for Gaussians that are cut.

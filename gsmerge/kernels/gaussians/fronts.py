@@ -24,7 +24,7 @@ _weigh_centres = declare(
 
 
 def order_by_depth(depths):
-    """Return the order ``[m]`` int32 of ``depths [m]`` float32 above 0, nearest first; equal ones keep their order."""
+    """Return the order ``[m]`` int32 of ``depths [m]`` float32 above 0, nearest first. Equal depths stay in order."""
     return depth_order(depths.view(np.uint32))
 
 
@@ -35,12 +35,12 @@ def project_centres(means, scales, viewmat, K, width, height, near):
         viewmat: ``[4,4]`` float64, world to camera.
         width: Width of the picture, pixels.
         height: Height of the picture, pixels.
-        near: Gaussians at this depth or nearer are left out, world units.
+        near: Depth in world units up to which Gaussians are left out.
 
     Returns:
-        For the m Gaussians that reach into the picture: rows ``[m]`` int32, ascending; pixels ``[m]`` int32; depths
-        ``[m]`` float32; and areas ``[m]`` float32, the products of the two longest axes in square pixels. If the centre
-        is outside of the picture, the area is multiplied by the falloff up to the picture, and negative.
+        Rows ``[m]`` int32, ascending, pixels ``[m]`` int32, depths ``[m]`` float32 and areas ``[m]`` float32 of the m
+        Gaussians that reach into the picture. An area is the product of the two longest axes in square pixels. If the
+        centre is outside of the picture, the area is multiplied by the Gaussian's falloff at the border, and negative.
     """
     n = len(means)
     ids, pixels, depths, areas = (np.empty(n, kind) for kind in (np.int32, np.int32, np.float32, np.float32))
@@ -48,22 +48,22 @@ def project_centres(means, scales, viewmat, K, width, height, near):
     return tuple(array[:m].copy() for array in (ids, pixels, depths, areas))
 
 
-def weigh_centres(order, ids, places, areas, opacities, fronts):
-    """Compute the weights of Gaussians at the pixels or cells of their centres.
+def weigh_centres(order, ids, pixels, areas, opacities, fronts):
+    """Compute the weights of Gaussians at the pixels of their centres, which may also be cells of a coarser grid.
 
     Args:
-        order: ``[k]`` int32, those of the m Gaussians that count, nearest first.
-        ids: ``[m]`` int32 rows.
-        places: ``[m]`` int32 pixel or cell of each, which is ``row * w + column``.
+        order: ``[k]`` int32 positions, from 0 to m - 1, of the Gaussians to weigh, nearest first.
+        ids: ``[m]`` int32 rows of the Gaussians.
+        pixels: ``[m]`` int32 pixel of each Gaussian, which is ``row * w + column``.
         areas: ``[m]`` float32, see :func:`project_centres`.
         opacities: ``[n]`` float32 of all Gaussians.
         fronts: ``[h,w]`` int32, written: row of the Gaussian with the largest opacity times transmittance at each
-            place; -1 if there is none.
+            pixel, or -1 if there is none.
 
     Returns:
-        Opacity times transmittance times area ``[m]`` float32; 0 for Gaussians that do not count.
+        Opacity times transmittance times area ``[m]`` float32, and 0 for Gaussians that are not in ``order``.
     """
     weights, passing = np.zeros(len(ids), np.float32), np.ones(fronts.shape, np.float32)
     fronts[:] = -1
-    _weigh_centres(order, ids, places, areas, opacities, passing, np.zeros_like(passing), fronts, weights)
+    _weigh_centres(order, ids, pixels, areas, opacities, passing, np.zeros_like(passing), fronts, weights)
     return weights

@@ -6,7 +6,8 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, f4, i4, i8, native, u1
 
-# First columns of the parameters: mean 3, log scale 3, quaternion 4, opacity logit 1, colour 3; and their number
+# First columns of mean, log scale, quaternion, logit of the opacity and colour in the parameters, and number of all
+# columns
 MEAN, SIZE, QUAT, LOGIT, COLOR, COLUMNS = 0, 3, 6, 10, 11, 14
 MAX_FIT_LOGIT, MIN_FIT_LOGIT = np.float32(6.9), np.float32(-5.5)
 
@@ -25,19 +26,21 @@ def adam(
 ):  # fmt: skip
     """Change the rows ``ids[first]`` to ``ids[last - 1]`` of parameters ``x [n,COLUMNS]`` by one Adam step.
 
-    Parameters are clipped to a box about ``x0``. The momentum is Nesterov's, which looks ahead to the first moment of
-    the next step (Dozat, 2016). The components of the mean share one second moment, and so do those of the quaternion,
-    so that steps rotate with the scene. Rows that are not in ``ids`` keep their parameters and moments.
+    Parameters stay in a box around those at the start of the fit, ``x0``. The momentum is Nesterov's, which looks ahead
+    to the first moment of the next step (Dozat, 2016). The components of the mean share one second moment, and so do
+    those of the quaternion, so that steps rotate with the scene. Rows that are not in ``ids`` keep their parameters and
+    moments ``m`` and ``v``.
 
     Args:
-        box_shares: ``[n]`` share of the limits of mean and log scale that each Gaussian may use.
-        min_sizes: ``[n]`` least log scale of each Gaussian, which counts even if it is outside the box.
+        units: ``[n]`` sizes of the Gaussians at the start, which are the units of their means.
+        box_shares: ``[n]`` share of the box for mean and log scale that each Gaussian may use.
+        min_sizes: ``[n]`` least log scale of each Gaussian, even if it is outside the box.
         ids: ``[k]`` rows with a gradient, each once. The gradients have k rows.
-        rates: Learning rates of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
-        limits: Half sides of the box for mean (in sizes), log scale and logit. Then by how much the largest log scale
-            may exceed the second one, and by how much it may exceed ``min_sizes``, whichever allows more.
+        rates: Learning rates of mean (in ``units``), log scale, quaternion, logit and colour.
+        limits: Half sides of the box for mean (in ``units``), log scale and logit. Then by how much the largest log
+            scale may exceed the second one, and by how much it may exceed ``min_sizes``. The higher limit counts.
         betas: Decays of the first and the second moment.
-        regs: Numbers added to the gradients of opacities, and of scales in units of the Gaussian's size.
+        regs: Numbers added to the gradients of opacities, and of scales in ``units``.
         step: Number of the step, from 1.
         means, quats, scales, opacities, colors: Written: the new parameters as the rasterizer takes them.
     """

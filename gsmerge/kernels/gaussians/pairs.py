@@ -1,4 +1,4 @@
-"""Merge Gaussians in pairs, in each cell of neighbours the cheapest pair first."""
+"""Merge Gaussians in pairs. In each cell of neighbours, the cheapest pair is merged first."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def gaussian_moments(quats, scales, opacities, flatness, covars, masses):
     """Write the covariances ``[n,6]`` (xx, xy, xz, yy, yz, zz) and the masses ``[n]`` of Gaussians.
 
     A mass is the opacity times the root of (ab)^2 + (bc)^2 + (ca)^2, where a, b and c are the scales. This root is
-    about proportional to the area that is seen from any side.
+    about proportional to the visible area from any side.
 
     Args:
         quats: ``[n,4]`` wxyz of any length.
         scales: ``[n,3]`` standard deviations.
-        flatness: Least scale, as a share of the largest.
+        flatness: Least scale, as a share of the largest scale. Smaller scales count as this.
         covars: Written, float32.
         masses: Written, float32.
     """
@@ -41,23 +41,23 @@ _agglomerate = declare(
 def agglomerate(
     means, covars, masses, weights, colors, order, starts, color_weight, least_share, first, last, pairs, costs
 ):
-    """Plan merges of pairs in some cells, in each cell the cheapest pair that remains, again and again.
+    """Plan merges in some cells, without changing the Gaussians. The cheapest pair of a cell is always merged next.
 
-    The Gaussians do not change. The cost of a pair is Runnalls' bound (2007) on the divergence that its merge causes,
-    per mass, plus the squared difference of colours, times the sum of both weights. A written cost is at least that of
-    the merge before it in the same cell. So the merges up to any cost are the first ones of each cell.
+    The cost of a pair is a difference times the sum of both weights. The difference is Runnalls' bound (2007) on the
+    divergence that the merge causes, per mass, plus the squared difference of colours. A merge costs at least as much
+    as the merge before it in the same cell. So the merges up to any cost are the first merges of each cell.
 
     Args:
         covars: ``[n,6]`` float32, upper triangles.
-        weights: ``[n]`` float32 factors of the costs; weights of merged Gaussians add up.
+        weights: ``[n]`` float32 factors of the costs. Weights of merged Gaussians add up.
         order: ``[n]`` int64 rows, cell by cell.
-        starts: ``[c+1]`` int64 starts of the cells in the order; a cell has at most ``CELL`` rows.
+        starts: ``[c+1]`` int64 starts of the cells in the order. A cell has at most ``CELL`` rows.
         color_weight: Weight of squared differences of colours, relative to a divergence in nats.
         least_share: Merges stop when this share of a cell's Gaussians is left, or a single one.
         first: First cell.
         last: Last cell, exclusive.
-        pairs: ``[n,2]`` int32, written from each cell's start on: the row that stays after a merge, and the other row.
-        costs: ``[n]`` float32, written like ``pairs``: costs of the merges. Entries without a merge do not change.
+        pairs: ``[n,2]`` int32, written from each cell's start on: the row that gets the merged Gaussian, and the other.
+        costs: ``[n]`` float32 costs of the merges, written from each cell's start on. Other entries do not change.
     """
     work, spare = np.empty((WORK, CELL), np.float32), np.empty((3, CELL), np.int32)
     _agglomerate(

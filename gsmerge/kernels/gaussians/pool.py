@@ -10,9 +10,10 @@ _sort_labels = declare("sort_labels", STATUS, labels=i4("n"), starts=i8("ends", 
 
 
 def group_members(labels, count):
-    """Sort members by label; return the start ``[count+1]`` int64 of each label in a list of rows, and this int32 list.
+    """Sort members by label.
 
-    Members with labels below 0 are left out.
+    Returns the start ``[count+1]`` int64 of each label in a list of rows, and this int32 list. Members with labels
+    below 0 are left out.
 
     Args:
         labels: ``[n]`` int32, below ``count``.
@@ -33,7 +34,7 @@ _pool_groups = declare(
 
 
 def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own_covariance, out_geometry, out_sh):
-    """Write the moments of every group, which are computed in float64 about the group's own mean.
+    """Write the moments of every group, in float64 and about the mean of the group.
 
     Args:
         starts: ``[g+1]`` int64 starts of the groups in ``ids``, ascending from 0 or above.
@@ -43,10 +44,11 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
         scales: ``[n,3]`` standard deviations.
         footprints: ``[n]`` sizes of the members' pixels, world units.
         own_covariance: True to add the covariances of the members, with capped extents, to the covariance of their
-            means. Otherwise only the latter counts (paper eq. teacher_cov).
-        out_geometry: ``[g,13]`` float64: mean 3, covariance xx xy xz yy yz zz, sum of opacities, mass (paper eq. mass),
-            integrated optical depth (sum of -ln(1 - opacity) x disc area), footprint. Empty groups do not change.
-        out_sh: ``[g,k,3]`` float32, zero before: weighted means of the harmonics.
+            means. Otherwise only the covariance of the means counts (paper eq. teacher_cov).
+        out_geometry: ``[g,13]`` float64, written for groups with members: mean (3), covariance xx xy xz yy yz zz, sum
+            of opacities, mass (paper eq. mass), integrated optical depth and footprint. The optical depth is the sum of
+            -ln(1 - opacity) times disc area.
+        out_sh: ``[g,k,3]`` float32, zero before, written: weighted means of the harmonics.
     """
     longest = int(np.diff(starts).max(initial=0))
     _pool_groups(
@@ -57,4 +59,7 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
 
 @native(covars=f8("g", 3, 3), out_scales=f8("g", 3, out=True), out_quats=f8("g", 4, out=True))
 def decompose(covars, out_scales, out_quats):
-    """Write the standard deviations of covariances, ascending, and the unit quaternions wxyz, w >= 0, of their axes."""
+    """Write the ascending standard deviations of covariances along their axes, and unit quaternions of these axes.
+
+    The quaternions are wxyz with w >= 0.
+    """

@@ -1,4 +1,4 @@
-"""Compute the layers of the networks on tables of tokens in float32, every row by itself."""
+"""Compute the layers of the networks on tables of tokens in float32. Every row is computed by itself."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, f4, i8, native, u1
 
-VECTOR_LANES = 16  # number of floats in a vector of the processor; weights are padded to whole vectors
+VECTOR_LANES = 16  # number of floats in a vector of the processor, to which weights are padded
 PLAIN, GELU, TANH = range(3)  # activations of dense layers
 
 
@@ -17,13 +17,13 @@ PLAIN, GELU, TANH = range(3)  # activations of dense layers
 def dense(x, weight, bias, residual, activation, out):
     """Write ``activation(x W + b + residual)``, with the weights W and the bias b from :func:`pack_weights`.
 
-    ``activation`` is PLAIN, GELU or TANH. TANH gives 0 for NaN. A ``residual`` of None stands for zeros.
+    ``activation`` is PLAIN, GELU or TANH. TANH gives 0 for NaN. Without a ``residual`` (None), nothing is added.
     """
 
 
 @native(x=f4("rows", "width"), gains=f4("width"), shifts=f4("width"), out=f4("rows", "width", out=True))
 def normalise(x, gains, shifts, out):
-    """Normalise the rows of ``x`` to mean 0 and variance 1, and write them times ``gains`` plus ``shifts``."""
+    """Normalise the rows of ``x`` to mean 0 and variance 1, multiply them by ``gains``, and add ``shifts``."""
 
 
 @native(
@@ -31,16 +31,18 @@ def normalise(x, gains, shifts, out):
     heads=i8(least=1), scratch=f4("space", out=True), out=f4("sets", "queries", "mixed", out=True),
 )  # fmt: skip
 def attend(query, pairs, mask, heads, scratch, out):
-    """Write for each query the mean of the values of its set's tokens, weighted by their keys' similarity to the query.
+    """Run attention: write, for each query, a mean of the values of the tokens in its set.
+
+    Tokens are weighted by the similarity of their keys to the query.
 
     Args:
         query: ``[sets,queries,width]`` queries, head by head.
-        pairs: ``[sets,tokens,columns]`` keys, as wide as the queries, then values, in which each head is padded to
-            :func:`padded` columns.
-        mask: ``[sets,tokens]`` uint8, 0 for tokens that do not count.
+        pairs: ``[sets,tokens,columns]`` keys of the width of the queries, then values. The values of each head are
+            padded to :func:`padded` columns.
+        mask: ``[sets,tokens]`` uint8, 0 for tokens to leave out.
         heads: Number of heads.
-        scratch: Room for the keys of a set, see :func:`scratch_size`.
-        out: ``[sets,queries,mixed]``, written: the means of the values, in which each head is padded.
+        scratch: Scratch for the keys of a set, see :func:`scratch_size`.
+        out: ``[sets,queries,mixed]``, written: means of the values, of which each head is padded.
     """
 
 
@@ -57,7 +59,7 @@ def scratch_size(tokens: int, width: int) -> int:
 def pack_weights(weight: np.ndarray, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return weights ``[outputs,inputs]`` and a bias ``[outputs]`` in blocks of sixteen outputs, padded with zeros."""
     outputs, inputs = weight.shape
-    full, shift = np.zeros((padded(outputs), inputs), np.float32), np.zeros(padded(outputs), np.float32)
-    full[:outputs], shift[:outputs] = weight, bias
-    blocks = full.reshape(-(-outputs // VECTOR_LANES), VECTOR_LANES, inputs).swapaxes(1, 2)
-    return np.ascontiguousarray(blocks), shift.reshape(-1, VECTOR_LANES)
+    padded_weight, padded_bias = np.zeros((padded(outputs), inputs), np.float32), np.zeros(padded(outputs), np.float32)
+    padded_weight[:outputs], padded_bias[:outputs] = weight, bias
+    blocks = padded_weight.reshape(-(-outputs // VECTOR_LANES), VECTOR_LANES, inputs).swapaxes(1, 2)
+    return np.ascontiguousarray(blocks), padded_bias.reshape(-1, VECTOR_LANES)

@@ -1,7 +1,7 @@
-"""Compute the inputs of the networks in the frame of each group, and apply the corrections that they output.
+"""Compute the inputs of the networks in the frame of each group, and apply the corrections that networks put out.
 
-Arrays are float32, and ids int64. Corrections have 13 columns, see :mod:`gsmerge.networks.corrections`. They are
-applied in place, and a correction of zero changes no bit. The columns of a frame are its axes.
+Arrays are float32, and ids int64. Corrections ``residuals`` have 13 columns, see :mod:`gsmerge.networks.corrections`.
+They are applied in place, and a correction of zero changes no bit. The columns of a frame are its axes.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from gsmerge.kernels.signature import STATUS, f4, f8, i8, native
     frames=f4("g", 3, 3, out=True), sizes=f4("g", out=True),
 )  # fmt: skip
 def place_frames(means, scales, viewmats, views, frames, sizes):
-    """Write the frame of each group in its view, and its size, the geometric mean of its two largest scales.
+    """Write the frame and the size of each group. The size is the geometric mean of the two largest scales.
 
-    The columns of a frame are the picture's right and down, and the ray from the camera to the group, in the world.
+    The columns of a frame are axes in the world: right and down in the picture of the group's view, and along the ray
+    from the camera to the group.
     """
 
 
@@ -31,9 +32,9 @@ def describe_groups(
 ):  # fmt: skip
     """Write the first 19 numbers that describe each group.
 
-    They are three log scales, the logit of the opacity, the mass, the optical depth, the number of members ``counts``,
-    their mean opacity, three colours, six entries of the covariance, and the tangents of the two angles between the ray
-    and the axis of the view.
+    The numbers are log scales (3), the logit of the opacity, the mass, the optical depth, the number of members
+    ``counts``, their mean opacity, the colour (3), entries of the covariance (6), and the tangents of the two angles
+    between the ray and the axis of the view.
     """
 
 
@@ -46,10 +47,10 @@ def describe_groups(
 def describe_parts(
     means, quats, scales, opacities, sh0, group_means, group_sh0, frames, sizes, footprints, ids, owners, members, out
 ):
-    """Write 13 numbers that describe each of the parts ``ids`` relative to its group in ``owners``.
+    """Write 13 numbers that describe each of the Gaussians ``ids`` relative to its group in ``owners``.
 
-    They are three of the position, three log scales, the logit of the opacity, three of the colour and three of the
-    normal. If ``members`` is 1, there are six more: the position in pixels, and the colour itself.
+    The numbers are the position (3), log scales (3), the logit of the opacity, the colour (3) and the normal (3). If
+    ``members`` is 1, six more follow: the position in pixels (3), and the colour, which is not relative (3).
     """
 
 
@@ -59,7 +60,10 @@ def describe_parts(
     frames=f4("g", 3, 3), residuals=f4("g", 13),
 )  # fmt: skip
 def correct_features(means, covars, masses, extinctions, sh0, quats, scales, frames, residuals):
-    """Apply ``residuals`` to Feature Gaussians, whose principal axes are ``quats`` and ``scales``, in place."""
+    """Apply the corrections ``residuals [g,13]`` to Feature Gaussians in place.
+
+    ``quats`` and ``scales`` are those of Gaussians with the moments of the Feature Gaussians.
+    """
 
 
 @native(
@@ -67,4 +71,4 @@ def correct_features(means, covars, masses, extinctions, sh0, quats, scales, fra
     sh0=f4("n", 1, 3, out=True), residuals=f4("n", 13), frames=f4("g", 3, 3), owners=i8("n", least=0, below="g"),
 )  # fmt: skip
 def correct_gaussians(means, quats, scales, opacities, sh0, residuals, frames, owners):
-    """Apply ``residuals`` to Gaussians, in the ``frames`` of their groups ``owners``, in place."""
+    """Apply corrections ``residuals [n,13]`` to Gaussians in place, in the ``frames`` of their groups ``owners``."""

@@ -12,7 +12,7 @@ MOST_TILES = 2**15 - 1  # most tiles in a row and in a column, because boxes hav
 
 @native(bits=u4("m"), order=i4("m", out=True), keys=u8("m", out=True), spare=u8("m", out=True))
 def sort_bits(bits, order, keys, spare):
-    """Write the stable ascending order of ``bits`` to ``order``; ``keys`` and ``spare`` are scratch."""
+    """Write the stable ascending order of ``bits`` to ``order``, with ``keys`` and ``spare`` as scratch."""
 
 
 def depth_order(bits):
@@ -28,13 +28,13 @@ def depth_order(bits):
     corners=i8("num_corners", out=True), counts=i8("tiles", out=True),
 )  # fmt: skip
 def count_boxes(boxes, tile_height, tile_width, corners, counts):
-    """Write the number of boxes over each tile; ``corners`` is scratch for each corner of a tile, and zero before."""
+    """Write the number of boxes over each tile. ``corners`` is scratch for the corners of tiles, and zero before."""
 
 
 def count_tiles(boxes, tile_height, tile_width):
     """Return the number of boxes over each tile, ``[tile_height * tile_width]`` int64.
 
-    ``boxes [m,4]`` int16 are the first and the (exclusive) last column of tiles, and the first and the last row.
+    ``boxes [m,4]`` int16 are the first and last column of tiles, and the first and last row. Last ones are exclusive.
     """
     counts = np.empty(tile_height * tile_width, np.int64)
     count_boxes(boxes, tile_height, tile_width, np.zeros((tile_height + 1) * (tile_width + 1), np.int64), counts)
@@ -52,7 +52,7 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
         order: ``[m]`` int32 Gaussians in depth order.
         boxes: ``[m,4]`` int16 boxes of the Gaussians, in the same order.
         tile_width: Number of tiles in a row.
-        cursors: ``[tiles]`` int64 ends of the lists in ``flatten_ids``, which move on.
+        cursors: ``[tiles]`` int64 ends of the lists in ``flatten_ids``, which are advanced.
     """
 
 
@@ -63,8 +63,8 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
 def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors, flatten_ids):
     """Append Gaussians to the lists of a range of rows of tiles, but leave out hidden Gaussians.
 
-    The lists are those of :func:`deal_tiles`, but each ends with the Gaussian after which all pixels of the tile are
-    opaque. So the drawn pixels are the same.
+    A list of :func:`deal_tiles` also has the Gaussians behind the one after which all pixels of the tile are opaque.
+    The pixels that are drawn are the same.
 
     Args:
         order: ``[m]`` int32 Gaussians in depth order.
@@ -73,7 +73,7 @@ def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors
         tile_width: Number of tiles in a row.
         first: First row of tiles.
         last: Last row of tiles, exclusive.
-        left: ``[tiles]`` float32 upper bound of the transmittance of each tile, 1 before, which becomes less.
-        cursors: ``[tiles]`` int64 ends of the lists, which move on.
-        flatten_ids: ``[intersections]`` int32, written; if it is empty, only the cursors are advanced.
+        left: ``[tiles]`` float32 upper bounds of the transmittance of each tile, 1 before, which are lowered.
+        cursors: ``[tiles]`` int64 ends of the lists, which are advanced.
+        flatten_ids: ``[intersections]`` int32, written. If it is empty, only the cursors are advanced.
     """

@@ -1,9 +1,9 @@
 """Blend a view front to back, tile by tile, sum over its blending weights, and run the backward pass.
 
-All kernels here use the same lists and the same weights, see ``gsmerge/kernels/raster/walk.h``. The backward pass
-writes the sums of a Gaussian over a tile to a row for this intersection, and then adds these rows in the order of the
-lists. Threads share no numbers, so results do not depend on how many there are. The formula is in
-``gsmerge/kernels/raster/blend_backward.c``.
+All kernels here use the same lists and the same weights, see ``gsmerge/kernels/raster/walk.h``. An intersection is a
+Gaussian in the list of a tile. The backward pass writes sums over the pixels of a tile to a row for each intersection.
+Then it adds the rows of each Gaussian in the order of the lists. Threads share no numbers, so results do not depend on
+the number of threads. The formula is in ``gsmerge/kernels/raster/blend_backward.c``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 CHANNELS = 4  # number of channels that weighted_sums adds up at a time
 MAX_ALPHA = 0.99  # largest alpha of a Gaussian at a pixel, as in gsplat
 
-# Arguments of every kernel that reads the lists of tiles, see gsmerge.kernels.raster; C code checks their indices
+# Arguments of every kernel that reads the lists of tiles, see gsmerge.kernels.raster. C code checks their indices
 LISTS = {
     "conics": f4("m", CONIC),
     "flatten_ids": i4("n"),
@@ -30,18 +30,18 @@ TILES = {"first": i8(), "last": i8()}
     image=f4("h", "w", 3, out=True), transmittance=f4("h", "w", out=True),
 )  # fmt: skip
 def blend(conics, flatten_ids, isect_offsets, tile_width, colors, first, last, top, background, image, transmittance):
-    """Blend a range of tiles over ``background [3]``; write the pixels ``image [h,w,3]`` and ``transmittance [h,w]``.
+    """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``.
 
-    These arrays have the rows of the view from ``top`` on. Tiles that begin outside of them are left out.
+    These arrays have the rows of the view from ``top`` on. Tiles that begin outside of these rows are left out.
     """
 
 
 @native(STATUS, **LISTS, **TILES, image=f4("h", "w", "channels"), slots=f4("n", CHANNELS, out=True))
 def weighted_sums(conics, flatten_ids, isect_offsets, tile_width, first, last, image, slots):
-    """Write to ``slots [intersections,CHANNELS]`` the sums of weights times up to four channels of an image.
+    """Write sums of blending weights times the channels of an image, for each intersection of a range of tiles.
 
-    A sum is over the pixels of a tile, and for each intersection of a range of tiles. ``image [h,w,c]`` has at most
-    ``CHANNELS`` channels.
+    The sums are over the pixels of a tile, and are written to ``slots [intersections,CHANNELS]``. ``image [h,w,c]`` has
+    at most ``CHANNELS`` channels.
     """
 
 
@@ -50,15 +50,15 @@ def weighted_sums(conics, flatten_ids, isect_offsets, tile_width, first, last, i
     first=i8(least=0, below="channels"), sums=f4("gaussians", "channels", out=True),
 )  # fmt: skip
 def add_slots(flatten_ids, slots, ids, first, sums):
-    """Add the ``slots [intersections,CHANNELS]`` of each Gaussian to ``sums [n,c]``, from channel ``first`` on.
+    """Add the ``slots [intersections,CHANNELS]`` of each Gaussian, in the order of the lists, to ``sums [n,c]``.
 
-    They are added in the order of the lists.
+    The channels of the slots are added to the channels of the sums from ``first`` on.
     """
 
 
 @native(STATUS, **LISTS, colors=f4("m", 3), image=f4("h", "w", 3, out=True), totals=f4("m", 2, out=True))
 def survey(conics, flatten_ids, isect_offsets, tile_width, colors, image, totals):
-    """Blend all tiles over black, and in the same pass sum the weights as :func:`contributions` does."""
+    """Blend all tiles over black, and sum the weights in the same pass, as :func:`contributions` does."""
 
 
 @native(STATUS, **LISTS, height=i8(least=1), width=i8(least=1), totals=f4("m", 2, out=True))
@@ -73,10 +73,10 @@ def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width,
     STATUS, conics=LISTS["conics"], flatten_ids=LISTS["flatten_ids"], left=i8(), top=i8(), parts=i4("n", 3, out=True),
 )  # fmt: skip
 def parts_of_tile(conics, flatten_ids, left, top, parts):
-    """Write for each Gaussian of a list the part of a tile in which it shows, as all kernels use it.
+    """Write the part of a tile in which each Gaussian of a list shows. The other kernels blend only these parts.
 
     The tile begins at the pixel (``left``, ``top``). A part is a first row, a last row, and the first of eight columns
-    that cover the Gaussian, which is -1 if eight are too few.
+    that contain all of the Gaussian, or -1 if eight are too few.
     """
 
 
@@ -88,13 +88,16 @@ def blend_backward(
     conics, flatten_ids, isect_offsets, tile_width, colors, first, last,
     image, transmittance, grad_image, grad_left, slots,
 ):  # fmt: skip
-    """Write the sums from which gradients follow, a row for each intersection of a range of tiles.
+    """Run the backward pass of :func:`blend` for a range of tiles.
+
+    A row of ``SUMS`` numbers is written for each intersection. From the sum of a Gaussian's rows,
+    :func:`gsmerge.kernels.raster.project.project_backward` computes its gradients.
 
     Args:
         image: ``[h,w,3]`` float32 blended image with its background.
         transmittance: ``[h,w]`` float32 transmittance of all Gaussians together.
-        grad_image: ``[h,w,3]`` float32 gradient of the loss by ``image``.
-        grad_left: ``[h,w]`` float32 gradient of the loss by ``transmittance``; None for zero.
+        grad_image: ``[h,w,3]`` float32 gradient of the loss with respect to ``image``.
+        grad_left: ``[h,w]`` float32 gradient of the loss with respect to ``transmittance``, or None for zero.
         slots: ``[intersections,SUMS]`` float32, written at the intersections of these tiles.
     """
 

@@ -1,11 +1,10 @@
 """Find the superpixel of a view to which each Gaussian contributes most.
 
-This is the rule of the paper's supplement on non-pixel-aligned backbones.
+The paper's supplement has this rule for backbones whose Gaussians do not belong to pixels.
 
-A pair is a Gaussian and a superpixel that it touches, with the sum of its blending weights there. Pairs are summed one
-row of tiles after another, and linked in a chain for each Gaussian. At the end of a row, Gaussians that do not reach
-into the next row are finished, and the pairs of the others are carried over. So memory grows with the width of the
-view, not with its height.
+A pair is a Gaussian and a superpixel that it touches, with the sum of its blending weights there. Tiles are read row by
+row. The pairs of a Gaussian form a linked list. After each row, the pairs of Gaussians that do not reach into the next
+row are evaluated, and all others are kept. So memory grows with the width of the view, not with its height.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from gsmerge.kernels.raster.project import CONIC, TILE
 from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
 
 FIRST_PAIRS = 1 << 16  # room for this many pairs at the start
-PAIR = 3  # columns of a pair: label, sum, and the next pair of the same Gaussian or -1
-# Places in `counts`: number of pairs, number of Gaussians with pairs, and the next tile; and the length of `counts`
+PAIR = 3  # columns of a pair: label, sum, and the next pair of the Gaussian or -1
+# Positions in `counts` of the number of pairs, the number of Gaussians with pairs, and the next tile. Then its length
 NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, PAIR_COUNTS = 0, 1, 2, 3
 
 
@@ -39,30 +38,33 @@ def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads,
     counts=i8(PAIR_COUNTS, out=True),
 )  # fmt: skip
 def settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, out_values, out_labels, counts):
-    """Sum the pairs of each Gaussian by superpixel; finish those that end above ``bottom``, carry over the others."""
+    """Evaluate the pairs of the Gaussians that end above the row ``bottom``, and copy all other pairs to ``carried``.
+
+    The largest sum of a Gaussian over the pairs of one superpixel is written, and the label of this superpixel.
+    """
 
 
 def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, count):
     """Return each Gaussian's largest sum of blending weights in a superpixel, and the superpixel's label.
 
-    Both are ``[m]``, float32 and int32.
-
-    Of superpixels with equal sums the smallest label is returned. Gaussians that no pixel shows have 0 and -1.
+    Both results are ``[m]``, float32 and int32. The smallest label is returned if sums are equal. Gaussians that no
+    pixel shows have 0 and -1.
 
     Args:
         labels: ``[h,w]`` int32, below ``count``.
     """
-    num, last = len(conics), -(-labels.shape[0] // TILE) - 1
+    num, last_line = len(conics), -(-labels.shape[0] // TILE) - 1  # lines of tiles
     values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
+    # Scratch for superpixels, then the first pair of each Gaussian, the Gaussians with pairs, and `counts`
     stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
     heads, active, counts = np.full(num, -1, np.int32), np.empty(num + 1, np.int32), np.zeros(PAIR_COUNTS, np.int64)
     pairs = np.empty((FIRST_PAIRS, PAIR))
-    for line in range(last + 1):
+    for line in range(last_line + 1):
         while counts[NEXT_TILE] < (line + 1) * tile_width:
             add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads, pairs, active, stamps, counts)
-            if counts[NEXT_TILE] < (line + 1) * tile_width:
+            if counts[NEXT_TILE] < (line + 1) * tile_width:  # the pairs of some tiles did not fit
                 pairs = np.concatenate([pairs, np.empty_like(pairs)])
-        bottom = (line + 1) * TILE if line < last else np.iinfo(np.int32).max
+        bottom = (line + 1) * TILE if line < last_line else np.iinfo(np.int32).max
         carried = np.empty_like(pairs)
         settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, values, owners, counts)
         pairs = carried

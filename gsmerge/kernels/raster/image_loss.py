@@ -1,8 +1,9 @@
 """Compute the gradient of the fit's image loss in one pass over the rows, without images of intermediate values.
 
-Structural similarity needs sums over windows of the image, the photo and their products, and then sums over windows of
-derivatives that follow from these. Differences between neighbouring pixels are computed row by row. Each sum is added
-up in the same order wherever a range of rows begins. So results do not depend on how rows are divided among threads.
+Structural similarity needs sums of the image, the photo and their products over windows. Derivatives follow from these
+sums, and are summed over windows as well. Differences between neighbouring pixels are computed row by row. Each sum is
+added up in the same order wherever a range of rows begins. So results do not depend on how rows are divided among
+threads.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ SUM_CHUNK, PAD = 96, 9  # number of values that are summed at a time, and of zer
 
 
 def room_of(width):
-    """Return how many values a buffer for a row of ``width`` pixels needs."""
+    """Return how many values a buffer for a row of ``width`` pixels needs, with zeros beside the row."""
     return -(-3 * width // SUM_CHUNK) * SUM_CHUNK + PAD
 
 
@@ -33,9 +34,9 @@ def room_of(width):
 def loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows):
     """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.
 
-    e is ``image - photo``. Differences of e are taken to the next pixel of the row and to that of the column. Pixels
-    have weights, and a difference has the smaller weight of its two pixels. The windows of SSIM have 7 x 7 pixels of
-    equal weight. Beyond the border all values are zero.
+    The error e is ``image - photo``. Its differences are those between each pixel and the next pixel in its row and in
+    its column. Pixels have weights, and a difference has the smaller weight of its two pixels. The windows of SSIM have
+    7 x 7 pixels of equal weight. Beyond the border all values are zero.
 
     Args:
         image: ``[h,3w]`` float32, with the three channels of a pixel side by side.
@@ -43,7 +44,7 @@ def loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, g
         edge_weight: Weight of the differences between neighbouring pixels, float32.
         first: First row.
         last: Last row, exclusive.
-        gradient: ``[h,3w]`` float32, written in the given rows: the gradient divided by the number of pixels.
+        gradient: ``[h,3w]`` float32, written in these rows: the gradient, divided by the number of pixels.
         errors: ``[h]`` float32, written: weighted squared error of each row.
-        terms, rows: Scratch, as long as :func:`room_of` says.
+        terms, rows: Scratch, whose last axis has the length of :func:`room_of`.
     """

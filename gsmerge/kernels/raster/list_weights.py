@@ -1,4 +1,4 @@
-"""List the blending weights of a view as entries of a pixel and a weight, and multiply images by them."""
+"""List the blending weights of a view, each with its pixel, and multiply images by them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ENTRIES = {
 }
 
 
-# Appends the entries of tiles from progress[0] on, behind the first progress[1] entries, as far as they fit
+# Appends the entries of further tiles, as far as they fit. progress has the next tile, and the number of entries so far
 _list_weights = declare(
     "list_weights", STATUS, **blend.LISTS, height=i8(least=1), width=i8(least=1), starts=i8("more", out=True),
     lanes=u1("room", out=True), weights=f4("room", out=True), progress=i8(2, least=0, out=True),
@@ -31,8 +31,9 @@ def list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width):
     """List all blending weights of a view that are not zero.
 
     Returns:
-        The start ``[intersections + 1]`` int64 of the entries of each intersection, and for each entry its pixel within
-        the tile, row by row, as uint8, and its weight, float32.
+        The start ``[intersections + 1]`` int64 of each intersection in a list of entries, and two arrays with the
+        pixels and the weights of the entries. Pixels are uint8, and are numbered row by row within the tile. Weights
+        are float32.
     """
     starts, progress = np.zeros(len(flatten_ids) + 1, np.int64), np.zeros(2, np.int64)
     first_entries = 40  # room for this many entries for each pixel at the start
@@ -41,12 +42,12 @@ def list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width):
     )
     while True:
         _list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width, starts, lanes, weights, progress)
-        tile, count = progress
-        if tile == len(isect_offsets) - 1:
+        next_tile, count = progress
+        if next_tile == len(isect_offsets) - 1:
             return starts, lanes[:count].copy(), weights[:count].copy()
         lanes, weights = (np.concatenate([array, np.empty_like(array)]) for array in (lanes, weights))
 
 
 @native(STATUS, **ENTRIES, image=f4("h", "w", LANES), sums=f8("m", LANES, out=True))
 def collect(starts, lanes, weights, flatten_ids, isect_offsets, tile_width, image, sums):
-    """Add to ``sums [m,LANES]`` float64, for each Gaussian, its weights times the pixels of ``image [h,w,LANES]``."""
+    """Add each Gaussian's weights times the pixels of ``image [h,w,LANES]`` to ``sums [m,LANES]`` float64."""

@@ -1,8 +1,8 @@
-"""Project Gaussians into a view: find those that it may show, their conics and boxes; and run the backward pass.
+"""Project Gaussians into a view, to find which ones it may show, with their conics and boxes. Run the backward pass.
 
-The conventions are those of gsplat: the dilation is 0.3 square pixels, conics follow from the first-order (EWA)
-projection with directions clamped 15 % outside the image, and contributions below 1/255 are left out. A conic is stored
-with its square completed, so that the exponent of a pixel is never positive, however thin the Gaussian::
+The conventions are those of gsplat. The dilation is 0.3 square pixels. Conics follow from the first-order (EWA)
+projection, whose directions are clamped 15 % outside the image. Contributions below 1/255 are left out. A conic is
+stored with its square completed, so that the exponent of a pixel is never positive, however thin the Gaussian::
 
     ln w(x, y) = lnop - (rate_x (x - mean_x - slope (y - mean_y)))^2 - rate_y (y - mean_y)^2
 
@@ -19,13 +19,13 @@ from gsmerge.kernels.signature import STATUS, f4, f8, i2, i4, i8, native, u1
 TILE = 16  # pixels per side; one row of a tile is one AVX-512 vector
 MAX_SIZE = 32767 * TILE  # most pixels per side of a view, since tile columns and rows have 16 bits
 CONIC = 8  # numbers of a conic: mean_x, mean_y, rate_x, slope, rate_y, lnop, first row, last row
-# Sums of a Gaussian over pixels: weight times gradient of the colour (3), v = d loss / d exponent, and v times x, y,
-# xx, xy and yy relative to the mean
+# Sums of a Gaussian over pixels: weight times the gradient of the colour (3), v = d loss / d exponent, and v times x,
+# y, xx, xy and yy, where x and y are relative to the mean
 SUMS = 9
 
 # Positions of numbers in the array of a camera
 ROTATION, SHIFT, FX, FY, CX, CY, WIDTH, HEIGHT, NEAR, FAR, EPS2D = 0, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20
-LIMIT_X, LIMIT_Y, ANTIALIASED = 21, 23, 25  # further positions; a limit has two numbers
+LIMIT_X, LIMIT_Y, ANTIALIASED = 21, 23, 25  # further positions, where a limit has two numbers
 CAMERA = 26  # length of the array of a camera
 BLOCK = 128  # gradients of the pose are summed over blocks of this many Gaussians
 POSE = 12  # numbers of a world-to-camera matrix: rotation (9, row by row), shift (3)
@@ -36,14 +36,14 @@ POSE = 12  # numbers of a world-to-camera matrix: rotation (9, row by row), shif
     wanted=i4("lines", "columns", optional=True), camera=f4(CAMERA), start=i4(), ids=i4("n", out=True),
 )  # fmt: skip
 def cull(means, scales, opacities, keep, wanted, camera, start, ids):
-    """List the Gaussians that may touch a wanted tile; return their number.
+    """List the Gaussians that may touch a wanted tile, and return their number.
 
     Args:
-        keep: ``[n]`` uint8, 0 for Gaussians to leave out; None for none.
-        wanted: ``[tile_height + 1, tile_width + 1]`` int32 number of wanted tiles above and to the left of each corner;
-            None if all tiles are wanted.
+        keep: ``[n]`` uint8, 0 for Gaussians to leave out, or None to leave out none.
+        wanted: ``[tile_height + 1, tile_width + 1]`` int32 number of wanted tiles above and to the left of each corner,
+            or None if all tiles are wanted.
         start: Number of the first Gaussian, which is added to all ids.
-        ids: ``[n]`` int32, whose first entries are written: ids of the listed Gaussians, ascending.
+        ids: ``[n]`` int32, of which the first entries are written: ascending ids of the listed Gaussians.
     """
 
 
@@ -56,10 +56,10 @@ def project(means, quats, scales, opacities, ids, camera, conics, depths, boxes)
 
     Args:
         quats: ``[n,4]`` wxyz of any length.
-        opacities: ``[n]``; opacities above 1 count as 1.
+        opacities: ``[n]``, of which values above 1 count as 1.
         depths: ``[m]`` float32, written: camera z.
-        boxes: ``[m,4]`` int16, written: first and (exclusive) last column of tiles, first and last row; all 0 for
-            Gaussians that are not drawn.
+        boxes: ``[m,4]`` int16, written: first and last column of tiles, first and last row, or zeros for Gaussians that
+            are not drawn. Last ones are exclusive.
     """
 
 
@@ -73,22 +73,22 @@ def project_backward(
     means, quats, scales, opacities, ids, sums, camera, first, last,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_poses,
 ):  # fmt: skip
-    """Write the gradients of the loss by the parameters of a range of the listed Gaussians.
+    """Write the gradients of the loss with respect to the parameters of a range of the listed Gaussians.
 
     Args:
-        sums: ``[m,SUMS]`` float32, see :func:`gsmerge.kernels.raster.blend.blend_backward`.
+        sums: ``[m,SUMS]`` float32 rows of :func:`gsmerge.kernels.raster.blend.blend_backward`, summed over all tiles.
         first: Start of the range, a multiple of BLOCK.
         last: End of the range, exclusive.
-        grad_poses: ``[blocks,POSE]`` float32, written: gradient by the world-to-camera matrix, summed over blocks of
-            ``BLOCK`` Gaussians; None if it is not needed.
+        grad_poses: ``[blocks,POSE]`` float32, written: gradient with respect to the world-to-camera matrix, summed over
+            blocks of ``BLOCK`` Gaussians. It may be None.
     """
 
 
 @native(STATUS, ids=i4("m"), rows=f4("m", "c"), totals=f4("n", "c", out=True))
 def add_rows(ids, rows, totals):
-    """Add each of ``rows [m,c]`` to the row of ``totals [n,c]`` that ``ids [m]`` int32 name."""
+    """Add the ``rows [m,c]`` to the rows ``ids [m]`` int32 of ``totals [n,c]``."""
 
 
 @native(means=f4("n", 3), origin=f8(3), out=f4("n", 3, out=True))
 def shift_means(means, origin, out):
-    """Write the means minus ``origin``; the differences are computed in float64."""
+    """Write the means minus ``origin``, computed in float64."""

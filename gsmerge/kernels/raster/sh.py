@@ -1,4 +1,4 @@
-"""Evaluate spherical harmonics: the colours of Gaussians as seen from a point, and their gradients."""
+"""Evaluate spherical harmonics, to get the colours that Gaussians show to a camera, and the gradients of these."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
     first=i8(least=0, most="m"), last=i8(least="first", most="m"), colors=f4("m", 3, out=True),
 )  # fmt: skip
 def view_colors(means, sh0, shN, ids, eye, first, last, colors):
-    """Write the colours of a range of the listed Gaussians as seen from ``eye [3]``; none is below 0."""
+    """Write the colours of a range of the listed Gaussians as seen from ``eye [3]``, at least 0."""
 
 
 @native(
@@ -19,9 +19,9 @@ def view_colors(means, sh0, shN, ids, eye, first, last, colors):
     grad_shN=f4("m", "num", 3, out=True), grad_means=f4("m", 3, out=True),
 )  # fmt: skip
 def view_colors_backward(means, shN, ids, eye, first, last, colors, grad_colors, grad_sh0, grad_shN, grad_means):
-    """Write the gradients of a range of the listed Gaussians from those of their colours as seen from ``eye [3]``.
+    """Run the backward pass of :func:`view_colors` for a range of the listed Gaussians.
 
     Args:
-        colors: ``[m,3]`` float32 colours as seen; no gradient passes where they are 0.
-        grad_means: ``[m,3]`` float32, written: the part of the gradient that comes from the viewing direction.
+        colors: ``[m,3]`` float32 colours of :func:`view_colors`. No gradient passes where they are 0.
+        grad_means: ``[m,3]`` float32, written: gradient through the direction in which the eye sees the Gaussian.
     """

@@ -1,8 +1,8 @@
 """Take a step of a fit, from projection to the optimiser, in phases that work on one table of buffers.
 
-The kernels are those of the other modules, and give the same bits. The buffers are checked once, when the table is
-filled. Then each phase is one call on every thread, with no argument but the table and its number, see
-``gsmerge/kernels/raster/step.c``.
+The phases run the kernels of the other modules, with the same bits. The buffers are checked once, when the table is
+filled. Then every thread makes one call for each phase, whose only arguments are the table and the number of the phase,
+see ``gsmerge/kernels/raster/step.c``.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from gsmerge.kernels.raster.image_loss import DERIVATIVE_ROWS, EDGE_ROWS, TERMS
 from gsmerge.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
 from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
 
-# If most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces "deal". Then the list
-# of a tile ends with the Gaussian behind which all pixels of the tile are opaque
+# Phases of a step. If most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces
+# "deal". Then the list of a tile ends at its last visible Gaussian
 PHASES = ("cull", "project", "count", "count_open", "deal", "deal_open", "blend", "loss", "backward", "update")
 THREAD_GAUSSIANS = 1 << 13  # number of Gaussians that a thread culls or projects at a time
 
-# The arrays of the table are in this order: the state of the fit; buffers with a row for each of its n Gaussians, for
-# each tile, for each intersection, and for each pixel; and what each step sets
+# The arrays of the table are in this order. The first ones are the state of the fit. Then follow buffers with a row for
+# each of n Gaussians, each tile, each intersection and each pixel. The last arrays are set in each step
 STEP = Table(
     "Step",
     ("step", "num_visible", "num_intersections", "next", "arrived", "failed"),
@@ -44,8 +44,9 @@ STEP = Table(
 
 @native(STATUS, table=i8("fields", out=True), phase=i8(least=0, below=len(PHASES)))
 def fit_phase(table, phase):
-    """Take part in a phase of a step until it is finished. Each of the ``threads`` makes one such call.
+    """Do a thread's share of a phase of a step. ``phase`` is the index of its name in ``PHASES``.
 
-    A phase begins when all calls of the phase before have ended. After "count" and "count_open" the table holds the
-    number of intersections, and the buffers must have room for them before the next phase.
+    Each of the ``threads`` makes one such call. A phase may begin when all calls of the phase before have ended. After
+    "count" and "count_open" the table has the number of intersections, for which the buffers need room before the next
+    phase.
     """

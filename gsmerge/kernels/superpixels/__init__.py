@@ -1,1 +1,1 @@
-"""Cut pictures into superpixels, and merge superpixels."""
+"""Cut pictures into superpixels, and merge neighbouring superpixels."""

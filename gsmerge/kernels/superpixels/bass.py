@@ -1,9 +1,9 @@
 """Cut pictures into superpixels by BASS (Uziel, Ronen and Freifeld 2019), without its splits and merges.
 
-Each region is a Gaussian in colour, with a fixed standard deviation, and in position, with a normal-inverse-Wishart
-prior. Each round fits these Gaussians, and then moves pixels to the most likely regions (hard expectation
-maximisation), with a Potts term that keeps borders short. A pixel may change its label only if every region stays
-connected. Pixels at the border of the picture may change, too, and no region can become empty.
+Each region is a Gaussian in colour and in position. The colour has a fixed standard deviation, the position a
+normal-inverse-Wishart prior. Each round fits these Gaussians, and then moves pixels to the most likely regions (hard
+expectation maximisation). A Potts term keeps borders short. A pixel may change its label only if every region stays
+connected, so no region becomes empty. Pixels at the border of the picture may change as well.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ REGION_COLUMNS = 9  # number of a region's parameters
 def simple_point_table():
     """Return a table ``[256]`` uint8 that is 1 for rings of eight neighbours with which a pixel may change its label.
 
-    Such a ring has one arc of pixels with the label and one arc of others, and in each arc a pixel that shares a side
-    with the pixel in the middle. Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the label.
+    Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the label of the pixel. The pixel may
+    change if the ring consists of one arc of neighbours with this label and one arc of other neighbours. In each arc, a
+    neighbour has to share a side with the pixel.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     changes = (cells != np.roll(cells, 1, axis=1)).sum(1)
@@ -38,8 +39,8 @@ _fit_regions = declare(
 def fit_regions(labels, colours, areas):
     """Return the parameters ``[count,9]`` float32 of every region: means, inverse covariance, and its log-determinant.
 
-    The covariance is ``(A² I + S) / (n + 50 A - 3)``. S is the scatter of the region's n positions, and A its expected
-    area in pixels, from ``areas [count]`` float64.
+    The covariance is ``(A² I + S) / (n + 50 A - 3)``. S is the scatter of the n positions of a region. A is its
+    expected area in pixels, from ``areas [count]`` float64.
     """
     rows = np.empty((len(areas), REGION_COLUMNS), np.float32)
     _fit_regions(labels, colours, areas, np.zeros((len(areas), 9)), rows)
@@ -53,15 +54,15 @@ def fit_regions(labels, colours, areas):
 def label_pass(labels, colours, rows, table, foreign, precision):
     """Visit all pixels at borders between regions once, and return how many changed their label.
 
-    The pixels are visited in four grids. No two pixels of a grid are neighbours, so their order does not matter.
+    The pixels are visited in four grids. No two pixels of a grid are neighbours, so their order has no effect.
     """
 
 
 def infer_labels(labels, colours, count):
-    """Improve padded labels in place, in as many rounds as the side of a superpixel has pixels; return the labels.
+    """Improve padded labels in place, and return them.
 
-    Each of the ``count`` regions is 4-connected and not empty, before and after. ``colours [h,w,3]`` are CIELAB values
-    divided by 100.
+    There are as many rounds as the side of a superpixel has pixels. Each of the ``count`` regions is 4-connected and
+    not empty, and stays so. ``colours [h,w,3]`` are CIELAB values divided by 100.
     """
     height, width, _ = colours.shape
     areas = np.full(count, height * width / count)
@@ -71,8 +72,9 @@ def infer_labels(labels, colours, count):
 
 
 def improve_labels(labels, colours, areas):
-    """Run one round in place: fit the regions, and move pixels; ``areas`` are as in :func:`fit_regions`."""
+    """Fit the regions, and move pixels to the most likely ones in place, with ``areas`` of :func:`fit_regions`."""
     table = simple_point_table()
+    # Number of neighbours with other labels, for each ring of `simple_point_table`
     foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
     precision = np.float32(1 / COLOUR_DEVIATION**2)
     rows = fit_regions(labels, colours, areas)

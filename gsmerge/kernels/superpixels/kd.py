@@ -1,6 +1,6 @@
-"""Cut a picture into rectangles, from which merging starts. The best cut comes first, found with integral images.
+"""Cut a picture into rectangles, from which merging starts. The best cut, by integral images, is made first.
 
-Label pictures are padded: ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel has to check for the border.
+Padded labels are ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel has to check for the border.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ _integral_image = declare("integral_image", STATUS, pixels=f4("height", "width",
 
 
 def integral_image(pixels):
-    """Return the sum of all pixels above and to the left of each corner of a pixel, ``[(h+1)·(w+1),3]`` float64."""
+    """Return, for each corner of a pixel, the sum of all pixels above and to the left, ``[(h+1)·(w+1),3]`` float64."""
     height, width, _ = pixels.shape
     integral = np.empty(((height + 1) * (width + 1), 3))
     _integral_image(pixels, integral)
     return integral
 
 
-# Writes the gain of the best cut of a rectangle across one of its sides, which is below 0 if it cannot be cut, and the
-# place of this cut, 1 to side - 1. The gain is the reduction of the squared error. Let a rectangle have n pixels whose
-# colours sum to t, and let its side of length S be cut at c into parts with sums s and t - s. Then the colour error
-# falls by |S s - c t|² / (n c (S - c)), and the position error by n c (S - c) / 4 times the compactness. near and far
-# are the places in the integral image of the rectangle's first corner, and of the corner at the other end of the side
-# that is not cut. step is the distance of neighbours along the side that is cut.
+# Finds the best cut of a rectangle across one of its sides. Writes its gain, which is the reduction of the squared
+# error, and its position, 1 to side - 1. The gain is below 0 if the rectangle cannot be cut. Let the rectangle have n
+# pixels whose colours sum to t. A cut at c of the side of length S makes parts with sums s and t - s. It lowers the
+# colour error by |S s - c t|² / (n c (S - c)), and the position error by n c (S - c) / 4 times the compactness. near is
+# the index in the integral image of the rectangle's first corner, and far that of the corner at the other end of the
+# side that is not cut. step is the difference of indices of neighbours along the side that is cut.
 cut_gain = declare(
     "cut_gain", STATUS, integral=f8("places", 3), near=i8(least=0), far=i8(least=0), step=i8(least=1), side=i8(least=0),
     num_pixels=f8(), compactness=f8(), found=f8(2, out=True),
@@ -45,11 +45,13 @@ _split_rectangles = declare(
 
 
 def split_rectangles(pixels, count, block, compactness):
-    """Cut a picture into ``count`` rectangles, but at least one in each block; cuts with the largest gain come first.
+    """Cut a picture into ``count`` rectangles, or into more if there are more blocks.
+
+    The picture is first divided into square blocks. Then the cuts with the largest gain are made.
 
     Args:
         count: Wanted number of rectangles, at most h·w.
-        block: Side, in pixels, of the square blocks into which the picture is divided at the start.
+        block: Side of the blocks, pixels.
         compactness: Weight of squared distances in pixels, relative to squared differences of colours.
 
     Returns:

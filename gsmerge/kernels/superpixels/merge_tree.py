@@ -1,9 +1,9 @@
-"""Merge the neighbouring regions of a view, one pair after another, cheapest first, down to a single region.
+"""Merge neighbouring regions of a view, the cheapest pair first, down to a single region.
 
-A region has a row of float64 numbers: its mean colour and position, its number of pixels, the sums to which a plane is
-fitted, the error of this plane, and a box. The plane is 1 / z = a x + b y + c, fitted with weights z², where z are the
-depths. So the error is relative to the depth. It does not depend on the scale of the world, adds up over regions, and
-is zero for any flat surface.
+A region has a row of float64 numbers: its mean colour and position, its number of pixels, the sums from which a plane
+is fitted, the error of this plane, and a box. The plane is 1 / z = a x + b y + c, where z are the depths. It is fitted
+with weights z², so its error is relative to the depth. This error does not depend on the scale of the world, adds up
+over regions, and is zero for any flat surface.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
-TREE_PIXELS, PLANE_ERROR, TREE_COLUMNS = 5, 15, 20  # columns of the number of pixels and the error; length of a row
+TREE_PIXELS, PLANE_ERROR, TREE_COLUMNS = 5, 15, 20  # columns of number of pixels and plane's error, row length
 OVERSIZE = 1e9  # added to the cost of a merge that makes too large a region, so that such merges come last
 
 
@@ -24,17 +24,18 @@ _region_sums = declare(
 
 
 def region_sums(labels, pixels, depths, count, rows):
-    """Fill the first ``count`` of ``rows [2·count,20]`` with the regions of padded labels; return their colour error.
+    """Describe the regions of padded labels in the first ``count`` rows, and return their colour error.
 
-    Pixels with a depth of 0 do not count. The coordinates x and y of planes are relative to the middle of the view.
+    ``rows`` are ``[2·count,20]``, to have room for merged regions. Pixels with a depth of 0 do not count. The
+    coordinates x and y of planes are relative to the middle of the view.
     """
     squares = np.empty(1)
     _region_sums(labels, pixels, depths, rows, np.empty((count, 4), np.int32), squares)
     return float(squares[0])
 
 
-# Writes by how much the error grows if regions u and v merge: that of colour and depth, and that of position times the
-# compactness
+# Writes by how much two errors grow if regions u and v merge. The first is the error of colour and depth, the second
+# that of position times the compactness
 merge_growth = declare(
     "merge_growth", rows=f8("capacity", TREE_COLUMNS), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"),
     depth_weight=f8(), compactness=f8(), growth=f8(2, out=True),
@@ -52,24 +53,25 @@ _merge_order = declare(
 
 
 def merge_order(pairs, rows, depth_weight, compactness, max_extent):
-    """Merge the regions of a view into a single one, each time the cheapest pair of neighbours; return the tree.
+    """Merge the regions of a view, the cheapest pair of neighbours first, into one region, and return the tree.
 
     Args:
-        pairs: ``[e,2]`` int32 neighbouring regions, which connect all regions; a pair may be repeated.
-        rows: ``[2·leaves,20]`` rows of the leaves, then room for those of merged regions, which are written.
+        pairs: ``[e,2]`` int32 neighbouring regions, which connect all regions. A pair may be repeated.
+        rows: ``[2·leaves,20]`` rows of the leaves, behind which the rows of merged regions are written.
         depth_weight: Weight of squared relative errors of depth, relative to squared differences of colours.
         compactness: Weight of squared distances in pixels, relative to squared differences of colours.
         max_extent: Merges that make regions with a side of this many pixels come last.
 
     Returns:
-        For each region and merge its parent ``[2·leaves-1]`` int32, which is -1 at the root; children come before their
-        parents. For each merge its height and its growth. The height is the cost of the merge, or the largest height of
-        its children if that is larger. The growth is by how much the error of colour and depth grows.
+        The parent ``[2·leaves-1]`` int32 of each leaf and merge, which is -1 at the root, and the height and the growth
+        of each merge. Children come before their parents. The height of a merge is its cost, or the largest height of
+        its children if that is larger. The growth is the increase of the error of colour and depth.
     """
     num_nodes, num_pairs = len(rows), len(pairs)
     num_leaves, last = num_nodes // 2, max(num_nodes - 1, 0)
     parents, heads, marks = (np.empty(num_nodes, np.int32) for _ in range(3))
     heights, growths, costs = np.empty(num_nodes), np.empty(num_nodes), np.empty(num_pairs)
+    # Scratch for the pairs of each region, and for a heap of all pairs by their costs
     nexts, ends = np.empty(2 * num_pairs, np.int32), np.empty(2 * num_pairs, np.int32)
     heap, places = np.empty(num_pairs, np.int32), np.empty(num_pairs, np.int32)
     _merge_order(
@@ -88,7 +90,7 @@ _cut_labels = declare(
 def cut_labels(parents, keep, num_leaves):
     """Return the label of each leaf if only the merges in the mask ``keep`` are made.
 
-    Labels count from 0, in the order of the first leaf of each region.
+    Labels are numbered from 0, in the order of the first leaf of each region.
     """
     labels, tops, names = np.empty(num_leaves, np.int32), np.empty_like(parents), np.empty_like(parents)
     _cut_labels(parents, keep.view(np.uint8), tops, names, labels)

@@ -1,10 +1,10 @@
-"""Describe the regions of a picture by padded labels and a row of numbers for each, and move pixels between regions.
+"""Describe the regions of a picture by padded labels and a row of numbers, and move pixels between regions.
 
-Label pictures are padded: ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel has to check for the border. The
-row of a region has its mean feature, its number of pixels, and two columns for the algorithm that uses it. These are
-eight float32 numbers, half a cache line, from which costs are computed. The feature of a pixel is r, g, b, y·spread and
-x·spread, where spread² is the weight of squared distances in pixels, relative to squared differences of colours. Rows
-have means instead of sums, because float32 is then exact enough for pictures of any size.
+Padded labels are ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel has to check for the border. The row of a
+region has its mean features (5), its number of pixels, and two columns for the algorithm that uses it. Costs are
+computed from these eight float32 numbers, which are half a cache line. The features of a pixel are r, g, b, y·spread
+and x·spread, where spread² is the weight of squared distances in pixels, relative to squared differences of colours.
+Rows have means instead of sums, because means are exact enough in float32 for pictures of any size.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8, native, u1
 
-NUM_PIXELS, ROW_COLUMNS = 5, 8  # column of the number of pixels, after the mean; length of a row
+NUM_PIXELS, ROW_COLUMNS = 5, 8  # column of the number of pixels, after the means, and length of a row
 LEAVE, JOIN = 6, 7  # columns of n / (n - 1), for a pixel that leaves, and of n / (n + 1), for one that joins
 
 
 def pad_labels(labels):
-    """Return a label picture ``[h,w]`` with a frame of -1, as the kernels take it."""
+    """Return padded labels: the labels ``[h,w]`` with a frame of -1, as the kernels take them."""
     return np.pad(np.ascontiguousarray(labels, np.int32), 1, constant_values=-1)
 
 
-# `sums` are zero before; the first `count` rows are written
+# `sums` are zero before. The first `count` rows are written
 _region_rows = declare(
     "region_rows", STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3), spread=f4(),
     sums=f8("count", 6, out=True), rows=f4("capacity", ROW_COLUMNS, out=True),
@@ -42,10 +42,10 @@ def region_rows(labels, pixels, count, capacity, spread):
 def connectivity_table() -> np.ndarray:
     """Return a table ``[256]`` uint8 that is 1 for rings of neighbours with which a pixel may leave its region.
 
-    Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the pixel's label. The region stays in one
-    piece if its pixels in the ring that share a side with the pixel are 4-connected within the ring. They form as many
-    parts as there are such pixels, minus the corner pixels of the region that join two of them (Yokoi's connectivity
-    number). If the whole ring is of the region, both numbers are equal.
+    Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) is in the pixel's region. The region stays in
+    one piece if its neighbours at the sides are 4-connected within the ring. The number of their parts is the number of
+    these neighbours minus the number of corner neighbours that join two of them (Yokoi's connectivity number). If the
+    whole ring is in the region, the difference is 0, but there is one part.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     edges, corners = cells[:, 0::2], cells[:, 1::2]
@@ -66,13 +66,13 @@ def sweep(labels, pixels, rows, table, spread, backward):
     """Visit the pixels at borders between regions once, and move each pixel if this lowers the total squared error.
 
     A pixel moves from region A to the region B of a 4-neighbour if ``n_A/(n_A-1)·d_A² > n_B/(n_B+1)·d_B²``, where n are
-    numbers of pixels and d distances from the means, and if A stays connected without it. Only a pixel with a neighbour
-    in A may move, so no region becomes empty. The means are updated after each move.
+    numbers of pixels and d distances from the means. A must stay connected without the pixel. A pixel without a
+    neighbour in A stays, so no region becomes empty. The means are updated after each move.
 
     Args:
         labels: Padded labels 0 to ``count - 1``, changed.
         rows: ``[count,8]`` float32 rows of the regions with the columns LEAVE and JOIN, changed.
-        table: From :func:`connectivity_table`.
+        table: Result of :func:`connectivity_table`.
         spread: Square root of the weight of squared distances in pixels.
         backward: 1 to visit the last pixel first, 0 to visit it last.
 
@@ -85,10 +85,11 @@ CONNECTIVITY = connectivity_table()
 
 
 def refine(labels, pixels, count, num_sweeps, spread):
-    """Run sweeps in place, forward and backward in turn, until no pixel moves or ``num_sweeps`` are done.
+    """Move pixels at borders between regions in place, if this lowers the squared error, and return the padded labels.
 
-    Returns the padded labels. Each of the ``count`` regions is 4-connected and not empty, before and after. ``spread``
-    is the square root of the weight of squared distances in pixels, float32.
+    Sweeps run forward and backward alternately, until no pixel moves or ``num_sweeps`` are done. Each of the ``count``
+    regions is 4-connected and not empty, and stays so. ``spread`` is the square root of the weight of squared distances
+    in pixels, float32.
     """
     rows = region_rows(labels, pixels, count, count, spread)
     num_pixels = rows[:, NUM_PIXELS]

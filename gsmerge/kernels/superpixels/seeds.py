@@ -1,4 +1,4 @@
-"""Measure how much like a corner each pixel of a picture is, choose seeds for superpixels, and grow regions of them."""
+"""Measure how much each pixel resembles a corner, choose seeds of superpixels by this, and grow regions from them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ def corner_response(pixels):
     """Return the smaller eigenvalue of the grey picture's structure tensor (Shi and Tomasi), ``[h,w]`` float32.
 
     The tensor is the mean over 3 x 3 pixels of products of Sobel's derivatives, with the picture mirrored at its
-    borders. The scale is that of OpenCV, whose own last bits depend on the processor. ``pixels [h,w,3]`` are float32.
+    borders. The result has the scale of OpenCV's function, whose last bits depend on the processor. ``pixels [h,w,3]``
+    are float32.
     """
     height, width, _ = pixels.shape
     response = np.empty((height, width), np.float32)
@@ -32,20 +33,20 @@ def corner_response(pixels):
 def hexagonal_seeds(height, width, count):
     """Return the positions (y, x) ``[count,2]`` int64 of different pixels near the points of a hexagonal grid.
 
-    The numbers of pixels in the rows of the grid differ by at most one.
+    The numbers of points in the rows of the grid differ by at most one.
     """
     row_distance = math.sqrt(height * width / count * math.sqrt(3) / 2)
     num_rows = min(max(round(height / row_distance), math.ceil(count / width)), height, count)
-    first = np.arange(num_rows + 1) * count // num_rows
-    row = np.repeat(np.arange(num_rows), np.diff(first))
-    place, row_length = np.arange(count) - first[row], np.diff(first)[row]
+    row_starts = np.arange(num_rows + 1) * count // num_rows
+    row = np.repeat(np.arange(num_rows), np.diff(row_starts))
+    column, row_length = np.arange(count) - row_starts[row], np.diff(row_starts)[row]
     y = (2 * row + 1) * height // (2 * num_rows)
-    x = (place + np.where(row % 2 == 0, 0.25, 0.75)) * width / row_length
+    x = (column + np.where(row % 2 == 0, 0.25, 0.75)) * width / row_length
     return np.stack([y, x.astype(np.int64)], 1)
 
 
 def seed_density(saliency, count):
-    """Return how many seeds each pixel should get, ``[h,w]`` float64: at most 1, and ``count`` in all.
+    """Return how many seeds each pixel should get, ``[h,w]`` float64, from 0 to 1 with a sum of ``count``.
 
     The numbers grow with the root of ``saliency [h,w]``. They are uniform if the saliency is zero everywhere.
     """
@@ -69,7 +70,7 @@ _dither = declare(
 
 
 def dither(density):
-    """Return a mask ``[h,w]`` of seeds, by serpentine Floyd-Steinberg dithering with a noisy threshold."""
+    """Return a mask ``[h,w]`` of seeds by Floyd-Steinberg dithering, in alternating directions and with noise."""
     height, width = density.shape
     seeds = np.empty((height, width), np.uint8)
     _dither(density, JITTER, np.zeros((2, width + 2)), seeds)
@@ -77,7 +78,7 @@ def dither(density):
 
 
 def _spread_picks(weights, count):
-    """Return ``count`` different indices, ascending, which are spread evenly over the cumulative sum of the weights."""
+    """Return ``count`` different indices of weights, ascending, at equal steps of the cumulative sum."""
     total = np.cumsum(weights)
     order = np.arange(count)
     picks = np.searchsorted(total, (order + 0.5) * (total[-1] / count))
@@ -86,9 +87,9 @@ def _spread_picks(weights, count):
 
 
 def seeds_from_density(density, count):
-    """Return the positions (y, x) ``[count,2]`` int64 of different pixels, distributed as the density says.
+    """Return the positions (y, x) ``[count,2]`` int64 of different pixels, distributed by their ``density [h,w]``.
 
-    Dithering loses a few seeds at the border of the picture. So seeds are added or removed evenly to reach the exact
+    Dithering loses a few seeds at the border of the picture. So seeds are added or removed evenly to get the exact
     number.
     """
     seeds = dither(density).reshape(-1)
@@ -106,10 +107,10 @@ _voronoi = declare(
 
 
 def voronoi(seeds, height, width):
-    """Return the index ``[h,w]`` int32 of the seed nearest to each pixel, by the number of steps to 4-neighbours.
+    """Return the index ``[h,w]`` int32 of the seed that is the fewest steps away from each pixel.
 
-    So every region is connected. ``seeds [count,2]`` int64 are y and x of pixels. Raises ValueError for a seed outside
-    of the picture.
+    Steps go to 4-neighbours, so every region is connected. ``seeds [count,2]`` int64 are y and x of pixels. Raises
+    ValueError for a seed outside of the picture.
     """
     labels = np.empty((height, width), np.int32)
     _voronoi(seeds, np.empty((height * width + len(seeds), 2), np.int32), labels)

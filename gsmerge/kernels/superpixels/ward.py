@@ -1,10 +1,10 @@
 """Merge neighbouring regions by Ward's method down to an exact number.
 
-An edge is a pair of neighbouring regions. In each round every region finds its cheapest neighbour, and pairs that
-choose each other are merged. Edges that cost more than a ceiling are put aside, so that a round reads only the few
-edges that matter. The ceiling rises when no cheap edges are left. Rounds merge some pairs out of order, and merge too
-many. So the merges are recorded as a tree with heights, and the tree is cut where exactly the wanted number of regions
-is left.
+An edge is a pair of neighbouring regions. In each round every region chooses its cheapest neighbour, and two regions
+that choose each other are merged. Edges that cost more than a ceiling are put aside, so that a round reads only few
+edges. The ceiling is raised when no cheaper edges are left. Rounds merge too many pairs, and some of them out of order.
+So the merges are recorded as a tree with heights, and the tree is cut where exactly the wanted number of regions is
+left.
 """
 
 from __future__ import annotations
@@ -22,17 +22,16 @@ _adjacent_pairs = declare("adjacent_pairs", COUNT, labels=i4("rows", "columns"),
 
 
 def adjacent_pairs(labels):
-    """Return the labels of all pairs of neighbouring regions, ``[e,2]`` int32, in which pairs may be repeated.
+    """Return the labels ``[e,2]`` int32 of all pairs of neighbouring regions of padded ``labels``.
 
-    ``labels`` has a border that is one pixel wide and belongs to no region. There is about one pair for each straight
-    piece of a common border.
+    Pairs may be repeated. There is about one pair for each straight piece of a common border.
     """
-    # at most two pairs for each pixel inside the border: to the right, and below
+    # There are at most two pairs for each pixel, with the pixels to the right and below
     pairs = np.empty((2 * (labels.shape[0] - 2) * (labels.shape[1] - 2) + 1, 2), np.int32)
     return pairs[: _adjacent_pairs(labels, pairs)]
 
 
-# Writes by how much the squared error grows if two regions merge: n_u n_v / (n_u + n_v) |mean_u - mean_v|²
+# Writes the growth of the squared error if two regions merge, n_u n_v / (n_u + n_v) |mean_u - mean_v|²
 merge_costs = declare(
     "merge_costs", rows=f4("capacity", ROW_COLUMNS), pairs=i4("count", 2, least=0, below="capacity"),
     costs=f4("count", out=True),
@@ -40,17 +39,17 @@ merge_costs = declare(
 
 
 def _first_ceiling(pairs, rows, share):
-    """Estimate a cost slightly above that of the last merge, if merges remove the ``share`` of the regions.
+    """Estimate the cost above which edges are put aside, slightly above that of the last merge.
 
-    In photos with 1.5 to 3 times as many regions as wanted, about this share of the edges is cheaper at the start than
-    the last merge.
+    Merges remove the ``share`` of the regions. In photos with 1.5 to 3 times as many regions as wanted, about the same
+    share of the edges costs less at the start than the last merge does.
     """
     sample_edges = 4096  # the ceiling is estimated from the costs of about this many edges
     step = max(1, len(pairs) // sample_edges)
     costs = np.empty(len(pairs) // step, np.float32)
     merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
     rank = min(int(share * len(costs)), len(costs) - 1)
-    # The kernel adds at most this to a cost, so that costs differ and flat pictures merge many pairs in a round
+    # The kernel adds at most this to each cost. So equal costs differ, and a round merges many pairs of a flat picture
     tie_break = 1e-7
     return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * tie_break))
 
@@ -69,10 +68,10 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
     """Merge neighbouring regions until at least ``num_merges`` pairs are merged, or no pair with a finite cost is left.
 
     Args:
-        pairs: From :func:`adjacent_pairs`; overwritten.
-        rows: ``[2·leaves,8]`` rows of the leaves, then room for those of merged regions, which are written.
+        pairs: Result of :func:`adjacent_pairs`, which is overwritten.
+        rows: ``[2·leaves,8]`` rows of the leaves, behind which the rows of merged regions are written.
         num_leaves: Number of regions at the start.
-        num_merges: Wanted number of merges; the regions must be connected.
+        num_merges: Wanted number of merges, for which enough regions have to be connected.
         ceiling: First ceiling of costs, which are squared differences of colours times pixels.
 
     Returns:
@@ -80,6 +79,7 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
         before their parents.
     """
     parents, best_costs = np.empty(len(rows), np.int32), np.empty(len(rows), np.float32)
+    # Costs of the edges, and the edges above the ceiling with their costs
     costs, parked_costs = np.empty(len(pairs), np.float32), np.empty(len(pairs) + 1, np.float32)
     parked = np.empty((len(pairs) + 1, 2), np.int32)
     num_nodes = _merge_tree(
@@ -88,7 +88,7 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
     return parents, num_nodes
 
 
-# Writes the labels of the leaves, from 0 without gaps, if only the merges in `keep` are made
+# Writes the labels of the leaves to `names`, from 0 without gaps, if only the merges in `keep` are made
 _label_leaves = declare(
     "label_leaves", STATUS, parents=i4("num_nodes", below="num_nodes"), keep=u1("num_nodes"),
     names=i4("num_nodes", out=True), num_leaves=i8(),
@@ -120,12 +120,12 @@ def merge_regions(labels, pixels, num_regions, count, spread):
     if num_nodes - num_regions < num_merges:
         raise ValueError(f"expected finite colours of regions that touch, to merge {num_regions} down to {count}")
     heights = rows[:num_nodes, MERGE_HEIGHT]
-    merges = heights[num_regions:]
-    cut = np.partition(merges, num_merges - 1)[num_merges - 1]
-    keep = heights < cut
-    ties = np.flatnonzero(merges == cut) + num_regions
-    # Children come before their parents, so the first ones of merges with equal heights have all their children
-    keep[ties[: num_merges - np.count_nonzero(merges < cut)]] = True
-    names = np.empty(num_nodes, np.int32)
-    _label_leaves(parents[:num_nodes], keep.view(np.uint8), names, num_regions)
-    return np.append(names[:num_regions], np.int32(-1))[labels]  # the frame's -1 reads the last entry
+    merge_heights = heights[num_regions:]
+    cut_height = np.partition(merge_heights, num_merges - 1)[num_merges - 1]
+    keep = heights < cut_height
+    ties = np.flatnonzero(merge_heights == cut_height) + num_regions
+    # Children come before their parents, so the first of several merges at the cut have all their children
+    keep[ties[: num_merges - np.count_nonzero(merge_heights < cut_height)]] = True
+    leaf_labels = np.empty(num_nodes, np.int32)
+    _label_leaves(parents[:num_nodes], keep.view(np.uint8), leaf_labels, num_regions)
+    return np.append(leaf_labels[:num_regions], np.int32(-1))[labels]  # labels of -1, in the frame, read the last entry
