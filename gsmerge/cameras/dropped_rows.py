@@ -190,7 +190,7 @@ def _drop_rare_columns(view: _GridView) -> _GridView:
 
 
 def _shift_columns(view: _GridView, columns: int) -> _GridView:
-    """Add a number to the columns of a view's pixels, and shift its camera alike."""
+    """Add a number of columns to the pixels of a view, and change its camera so that it projects there."""
     camera = view.camera.copy()
     camera[0] += columns * camera[2]
     return replace(view, x=view.x + columns, camera=camera)
@@ -267,7 +267,8 @@ def _make_layout(rows: np.ndarray, views: list[_GridView], count: int) -> Layout
 def _choose_shifts(coordinates: Sequence[np.ndarray], middles: Sequence[float]) -> tuple[list[int], int]:
     """Choose the shift of each view along an axis, and the size of the grid along this axis; all in pixels.
 
-    ``coordinates`` are those of the pixels of each view along the axis, and ``middles`` those of principal points.
+    ``coordinates`` has the coordinates of each view's pixels along the axis. ``middles`` has the coordinates of the
+    views' principal points.
     """
     firsts = np.array([pixels.min() for pixels in coordinates])
     sizes = np.array([pixels.max() for pixels in coordinates]) - firsts + 1

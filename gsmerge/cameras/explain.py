@@ -42,7 +42,7 @@ def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> Non
 
 
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
-    """Make the SceneError for rows that are as many as the pixels, but do not lie in them.
+    """Make the SceneError for rows that do not lie in the pixels, although there are as many rows as pixels.
 
     ``reason`` names another order that fits, see :func:`explain_misalignment`; None if no order does.
     """

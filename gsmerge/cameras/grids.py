@@ -1,4 +1,4 @@
-"""Bring cameras and photos to the size of the pixel grid, which is the size of the photos or that of the cameras."""
+"""Bring cameras and photos to the size of the pixel grid, which is the size of the photos or of the cameras."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
     """
     if size is None:
         return Grid(camera_file, to_cameras(camera_file), None, ())
-    if camera_file.photo_map is not None:
+    if camera_file.photo_map is not None:  # the size of photos, and how they are resized and cropped to the grid
         return _mapped_grid(camera_file, size, *camera_file.photo_map)
     width, height = size
     for w, h in sizes_of(camera_file):

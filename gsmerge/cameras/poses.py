@@ -150,7 +150,8 @@ def _photos_confirm(pairs: Correspondences, images: np.ndarray, cameras: Cameras
 def _measure_disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
     """Measure the median difference in colour between photos of the same points; inf if no point is in two photos.
 
-    A point's own colour is that of its pixel in ``pairs``. Other views show it where ``points [t,3]`` project.
+    The first colour of a point is the colour of its pixel in ``pairs``. Other views show the point where it projects
+    from its position in ``points [t,3]``.
     """
     x, y = pairs.pixels.astype(np.int64).T
     own_colors, errors = photo_colors(images, pairs.views, y, x), []

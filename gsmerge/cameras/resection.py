@@ -44,9 +44,9 @@ def refine_poses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
 
-    ``free`` is the number of intrinsics, common to all views, that are solved for as well: 0, ONE_FOCAL, TWO_FOCALS or
-    ALL_INTRINSICS. Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the points do
-    not determine them.
+    ``free`` is the number of intrinsics that are also solved for: 0, ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS. They are
+    common to all views. Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the
+    points do not determine them.
     """
 
     def linearise(new_K: np.ndarray, new_poses: np.ndarray) -> _PoseFit:

@@ -168,7 +168,7 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     if source.order == "none":
         return None
     count, num_pixels = len(source.ply.gaussians), len(grid.cameras) * math.prod(grid.size)
-    layout, layers = Layout(len(grid.cameras), *grid.size), count // num_pixels
+    layout, layers = Layout(len(grid.cameras), *grid.size), count // num_pixels  # layers: whole rows per pixel
     if source.camera_file.pixel_ids is not None:
         layouts = [replace(layout, ids=source.camera_file.pixel_ids)]
     elif count != layers * num_pixels or source.order == "view-fastest":  # some pixels may have no row
@@ -199,7 +199,10 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
     shuffled = replace(pairs, pixels=np.random.default_rng(0).permutation(pairs.pixels))
 
     def accept(grid: Grid, frame: Similarity, limit: float) -> Recovery | None:
-        """Return the result for a frame; None if the rows of a view lie farther than ``limit`` pixels from theirs."""
+        """Return the result for a frame; None if rows do not lie in their pixels.
+
+        ``limit`` is the largest median distance of a view's rows from their pixels.
+        """
         cameras = frame.move_cameras(grid.cameras)
         alignment = check_pairs(pairs, cameras)
         far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
@@ -281,7 +284,7 @@ def _follow_order(source: RowSource, grid: Grid, frames: Iterable[Similarity]) -
 
 
 def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
-    """Yield the frames of exporters, and then the frame in which the cameras fit those estimated from the rows."""
+    """Yield the frames of exporters, and then the frame in which the cameras fit cameras estimated from the rows."""
     yield from exporter_frames(grid.cameras, source.scale)
     if source.own_cameras is not None and len(source.own_cameras) == len(grid.cameras):
         yield fit_frame(grid.cameras, source.own_cameras.viewmats, source.scale)

@@ -24,7 +24,7 @@ RANDOM_SHARE = 0.85
 # Least score of another convention, divided by the score of the usual one. _MARGIN is for scores without colours
 _COLOR_MARGIN, _MARGIN = 1.3, 2.0
 _FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the cameras as they are
-_SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to count those that cameras see
+_SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to estimate the share that cameras see
 # Gaussians that are compared in other conventions and frames. So many give scores an error of 0.4 %, while the scores
 # of two frames have to differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
@@ -240,11 +240,11 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels
 
 
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
-    """Choose a frame in which the colours fit the photos clearly better than in the frame of the cameras; else None.
+    """Choose a frame in which the colours fit the photos clearly better than in the frame of the cameras.
 
-    The frames are those of exporters. ``usual`` is the check of the cameras as they are. Colours fit best at the true
-    scale, so the chosen frame must fit better than the same frame at nearby scales. If no frame does so at the scale of
-    the cameras, the scale is solved for.
+    Returns None if there is no such frame. The frames of exporters are tried. ``usual`` is the check of the cameras as
+    they are. Colours fit best at the true scale, so the chosen frame must fit better than the same frame at nearby
+    scales. If no frame does at the scale of the cameras, the scale is solved for.
     """
     if not len(inputs.images):
         return None
@@ -275,7 +275,7 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMP
 def _best_frame(
     inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
 ) -> tuple[Similarity, float]:
-    """Return the frame with the highest score, the first one of equals, and its score."""
+    """Return the first frame with the highest score, and this score."""
     scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
     return max(scored, key=lambda frame_and_score: frame_and_score[1])
 
@@ -289,7 +289,7 @@ def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool
 
 
 def _scale_frame(frame: Similarity, factor: float) -> Similarity:
-    """Return a frame whose scale is ``factor`` times that of ``frame``, about the origin of the Gaussians."""
+    """Return a frame scaled by ``factor``, about the origin of the Gaussians."""
     scale = factor * frame.scale
     text = f"positions scaled by {scale:.4g} (--hint scene_scale={scale:.4g})"
     name = frame.description.partition("positions scaled")[0].removesuffix(", ")

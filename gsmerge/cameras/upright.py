@@ -69,7 +69,10 @@ def _measure_deviation(points: np.ndarray) -> float:
 
 
 def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Similarity:
-    """Solve for the frame of upright rows from their colours in the photos; SceneError if too few stretches agree."""
+    """Solve for the frame of upright rows from their colours in the photos.
+
+    Raises SceneError if too few stretches agree.
+    """
     orders = _possible_orders(len(inputs.gaussians), inputs.cameras) if len(inputs.images) else ()
     for pixels, stretches in orders:
         frame = _solve_agreed_frame(inputs, *_match_stretches(inputs, stretches, pixels), rotation)
@@ -137,7 +140,7 @@ def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
 def _match_stretches(
     inputs: AlignmentInput, stretches: Sequence[_Stretch], pixels: np.ndarray
 ) -> tuple[Correspondences, np.ndarray]:
-    """Search for stretches in the photos; return a sample of the rows of those that match, and the stretch of each row.
+    """Search for stretches in the photos; return sampled rows of stretches that match, and the stretch of each row.
 
     A stretch matches if only one place in its photo has nearly the colours of its rows. The t rows are returned with
     their pixels. The stretch of a row is its number among the stretches that match.

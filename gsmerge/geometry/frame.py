@@ -95,7 +95,7 @@ def scene_depth(scene: Scene) -> float:
 
 
 def sample_rows(scene: Scene) -> slice:
-    """Choose evenly spread rows of a scene; ValueError if it has none."""
+    """Choose evenly spread rows of a scene. Raises ValueError if the scene has no Gaussians."""
     count = len(scene.gaussians)
     if count == 0:
         raise ValueError("expected at least one Gaussian, got none")

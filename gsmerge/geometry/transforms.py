@@ -194,7 +194,7 @@ def middle_depth(means: np.ndarray, camera: Cameras) -> float:
 
 
 def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; ``[1]`` if there are none."""
+    """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; a single 1.0 for no points."""
     depth_sample = 50_000  # points; the median depth in a view is measured on about so many
     points = means[:: max(1, len(means) // depth_sample)]
     (pixels,), (depths,) = project(points, camera)
@@ -260,13 +260,13 @@ def find_nearest(points: np.ndarray, count: int, rows: np.ndarray | None = None)
 
 
 def nearest_views(centres: np.ndarray, view: int) -> np.ndarray:
-    """Return the other views ``[v-1]`` of cameras with ``centres [v,3]``; those nearest to ``view`` come first."""
+    """Return the other views ``[v-1]`` of cameras with ``centres [v,3]``, ordered by their distance from ``view``."""
     order = np.argsort(((centres - centres[view]) ** 2).sum(1), kind="stable")
     return order[order != view]
 
 
 def camera_distances(cameras: Cameras) -> np.ndarray:
-    """Return distances ``[v,v]`` of cameras, each the distance of the centres plus that of the unit directions."""
+    """Return distances ``[v,v]`` of cameras. Each is the distance of centres plus the distance of unit directions."""
     viewmats = cameras.viewmats.astype(np.float64)
     centres_and_directions = (camera_centres(viewmats), viewmats[:, 2, :3])
     differences = [vectors[:, None] - vectors[None] for vectors in centres_and_directions]
@@ -511,7 +511,7 @@ def lies_inside(region: Region, points: np.ndarray) -> np.ndarray:
 
 
 def clamp_inside(region: Region, points: np.ndarray) -> np.ndarray:
-    """Move those of ``points [n,3]`` that are outside a region to its border; return all points in float64."""
+    """Return ``points [n,3]`` in float64, where points outside a region are moved to its border."""
     local = matmul(points - region.middle, region.axes.T)
     # a little smaller, so that points are still inside after they are rounded
     half = np.maximum(region.half - region.rounding, region.half / 2)

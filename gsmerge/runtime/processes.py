@@ -31,7 +31,7 @@ class ProcessPool(WorkerPool):
         self.calls: dict[Future[Any], tuple[Call, ProcessPoolExecutor]] = {}  # running calls, each with its executor
 
     def has_room(self, call: Call) -> bool:
-        """Return true if a call fits into the memory beside those that run, or if none runs."""
+        """Return true if a call fits into the memory beside the calls that run, or if none runs."""
         needed = call.memory + sum(running.memory for running, _ in self.calls.values())
         return not self.calls or needed <= self.memory
 

@@ -138,7 +138,7 @@ def _write_to(record: Record) -> Iterator[Record]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Report the progress of a stage, and record the seconds of its block; also a decorator of functions.
+    """Report the progress of a stage, and record the seconds of the block, or of the decorated function.
 
     Within another stage this does nothing, because the time counts for the outer stage. If ``name`` is not one of
     ``STAGES``, the number of finished stages is reported in place of its index.

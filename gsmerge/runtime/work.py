@@ -63,7 +63,7 @@ class WorkerPool(ABC):
             yield from ended
 
     def has_room(self, call: Call) -> bool:
-        """Return true if a call may start beside those that run. If none runs, the answer must be true."""
+        """Return true if a call may start beside the calls that run. If none runs, the answer must be true."""
         return True
 
     @abstractmethod
@@ -229,7 +229,7 @@ def _call_in_folder(folder: str, function: Callable[..., T], *arguments: Any) ->
 
 
 def require_ray() -> ModuleType:
-    """Import Ray; UsageError if it is not installed."""
+    """Import Ray. Raises UsageError if it is not installed."""
     try:
         import ray
     except ImportError as error:

@@ -59,7 +59,7 @@ def list_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
 
 
 def doubt_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
-    """Return one doubt about a result if files of its scene have changed since they were read; otherwise none."""
+    """Return a list with a doubt about a result, if files of its scene have changed since they were read."""
     changed = list_changed(stats)
     more = f" and {count_words(len(changed) - 1, 'other file')}" if len(changed) > 1 else ""
     problem = "changed during the run; the result is of what was read before"
@@ -103,7 +103,10 @@ def scene_name(scene: Path) -> str:
 
 
 def fill_template(template: str | None, scene: Path) -> Path | None:
-    """Fill ``{scene}``, ``{parent}`` (its folder) and ``{stem}`` (its name) into a path; UsageError on other fields."""
+    """Fill ``{scene}``, ``{parent}`` (its folder) and ``{stem}`` (its name) into a path.
+
+    Raises UsageError if the path has other fields.
+    """
     if template is None:
         return None
     parent = scene if scene.is_dir() else scene.parent

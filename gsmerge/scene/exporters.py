@@ -22,7 +22,7 @@ NO_HINTS = ReadHints()
 
 
 def make_hints(values: dict[str, Any]) -> ReadHints:
-    """Make hints from keyword arguments; ValueError if a name or a value is unknown."""
+    """Make hints from keyword arguments. Raises ValueError if a name or a value is unknown."""
     names = {field.name for field in fields(ReadHints)}
     unknown = sorted(values.keys() - names)
     if unknown:

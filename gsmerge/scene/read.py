@@ -324,7 +324,7 @@ def _add_photos(
 def _add_proposed_photos(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
 ) -> Loaded | SceneError:
-    """Combine Gaussians and cameras with all proposed photos, or only with those of the most frequent aspect ratio.
+    """Combine Gaussians and cameras with all proposed photos, or only with photos of the most frequent aspect ratio.
 
     If neither can be used, all photos are left out; see :func:`_leave_out_photos`.
     """
@@ -358,40 +358,40 @@ def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Pro
         bare = _read_or_error(make_without_photos)
         if isinstance(bare, Loaded) and (parts := choose_part(bare.scene, proposal, camera_file)) is not None:
             return _assign_photos(make_scene, camera_file, parts)
-    # 2. The scene with the proposed photos, or without photos
+    # 2. The base: the scene with the proposed photos, or without photos
     proposed: Loaded | SceneError | None = None  # None if no photos are proposed
     if not cameras_are_estimated and any(proposal.choice):
         proposed, proposal = _make_with_proposed_photos(make_scene, camera_file, proposal)
-    first = proposed if isinstance(proposed, Loaded) else _read_or_error(make_without_photos)
-    if isinstance(first, SceneError):
-        return proposed or first
+    base = proposed if isinstance(proposed, Loaded) else _read_or_error(make_without_photos)
+    if isinstance(base, SceneError):
+        return proposed or base
     # 3. The photo of each view, whole or in part
-    fit = fit_to_grid(first.scene, proposal) if cameras_are_estimated and proposal.pool else None
-    guessed = list_guessed(first.scene, camera_file)
+    fit = fit_to_grid(base.scene, proposal) if cameras_are_estimated and proposal.pool else None
+    guessed = list_guessed(base.scene, camera_file)
     proposal = proposal.without_views(guessed)
-    chosen, explain_most = assign_to_views(first.scene, proposal, read=first is proposed, guessed=guessed, fit=fit)
-    may_be_parts = proposal.fit == WHOLE_FIT and not shapes_differ and (not explain_most or has_bars(first.scene))
-    if may_be_parts and (parts := choose_part(first.scene, proposal, camera_file, fit)) is not None:
+    chosen, explain_most = assign_to_views(base.scene, proposal, read=base is proposed, guessed=guessed, fit=fit)
+    may_be_parts = proposal.fit == WHOLE_FIT and not shapes_differ and (not explain_most or has_bars(base.scene))
+    if may_be_parts and (parts := choose_part(base.scene, proposal, camera_file, fit)) is not None:
         return _assign_photos(make_scene, camera_file, parts)
     if not any(chosen) or (shapes_differ and not explain_most):
         # an error of photos of another shape says nothing, unless lenses may have changed the shape
         if isinstance(proposed, SceneError) and (not shapes_differ or any(camera_file.lenses)):
             return proposed
         return explain_mismatch(proposal, camera_file)
-    # 4. The scene with the photos of its views
-    named_cameras = name_by_photos(camera_file, proposal, chosen, fit)
-    is_as_proposed = first is proposed and chosen == proposal.choice
-    load = first if is_as_proposed else _make_with_photos(make_scene, named_cameras, proposal, chosen)
+    # 4. The scene with the photos of its views, unless these were proposed
+    load: Loaded | SceneError = base
+    if base is not proposed or chosen != proposal.choice:
+        load = _make_with_photos(make_scene, name_by_photos(camera_file, proposal, chosen, fit), proposal, chosen)
     if isinstance(load, SceneError):
         return load
-    described = describe_assignment(proposal, chosen, camera_file, are_pixels=first.scene.has_own_pixels)
+    described = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
     return replace(load, notes=(*proposal.notes, *load.notes, *described), photos_explain=explain_most)
 
 
 def _make_with_proposed_photos(
     make_scene: MakeScene, camera_file: CameraFile, proposal: Proposal
 ) -> tuple[Loaded | SceneError, Proposal]:
-    """Make a scene with the proposed photos, or without those that are broken; also return the proposal then used."""
+    """Make a scene with all proposed photos, or with those that are not broken; also return the proposal then used."""
     load = _make_with_photos(make_scene, camera_file, proposal, proposal.choice)
     unbroken = proposal.without_broken() if isinstance(load, SceneError) else None
     if unbroken is None:
@@ -443,7 +443,7 @@ def _is_fault_of_named(files: SceneFiles, cause: SceneError) -> bool:
 def _make_scene_with_views(
     ply: GaussianFile, files: SceneFiles, hints: ReadHints, camera_file: CameraFile, photos: ScenePhotos
 ) -> Loaded:
-    """Combine Gaussians, cameras and their photos; SceneError if any of them cannot be used."""
+    """Combine Gaussians, cameras and their photos. Raises SceneError if any of them cannot be used."""
     order = _choose_row_order(ply, camera_file, hints)
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
@@ -466,7 +466,7 @@ def _make_scene_with_views(
     if mask_options and not size:
         text = f"the pictures of --{' and --'.join(mask_options)} are not used, since there are no photos"
         notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
-    views = camera_file, photos, size, result.transform, result.cameras
+    views = camera_file, photos, size, result.transform, result.cameras  # arguments of find_larger_and_masks
     larger_and_masks = _read_or_error(lambda: find_larger_and_masks(files, *views))
     if isinstance(larger_and_masks, SceneError):
         error = larger_and_masks

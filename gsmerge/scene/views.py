@@ -116,7 +116,7 @@ def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cam
 
     The other parameters are those of :func:`find_larger_and_masks`.
     """
-    # x and y of all values
+    # all arrays hold x and y
     to_grid = transform or resize_to(size, size)
     scale = np.array([to_grid.scale_x, to_grid.scale_y]) * size / np.array(stored)  # from pixels of the file to a grid
     corner, grid_size = np.array([to_grid.left, to_grid.top]), np.array([to_grid.width, to_grid.height])

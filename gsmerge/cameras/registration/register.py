@@ -62,7 +62,7 @@ class Registration:
 
 
 def register(scenes: Sequence[Scene]) -> Registration:
-    """Find the similarities that map scenes into one frame, that of the first connected scene.
+    """Find the similarities that map scenes into the frame of the first connected scene.
 
     Scenes are connected if enough keypoints of their photos match. If they form several connected sets, the largest is
     used. All scenes have pixels, and grids of one size.
@@ -119,7 +119,7 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
 
 
 def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
-    """Fit similarities to random triples of matches; return those with which the points of most matches agree."""
+    """Fit similarities to random triples of matches; return the similarities that agree with most matches."""
     rng = np.random.default_rng(0)
     p, q = (side.points for side in matches.sides)
     first_depths, second_depths = (camera_depths(side.points, side.viewmats) for side in matches.sides)
@@ -162,7 +162,7 @@ def _one_way_residuals(
     """Compute the errors between projected points of one side and the keypoints of the other.
 
     ``similarity`` maps from the frame of ``side`` to the frame of ``other``. The errors are in standard deviations.
-    ``pixels`` is the standard deviation of a keypoint, and ``spread`` that of the logarithm of a depth.
+    A keypoint has the standard deviation ``pixels``, and the logarithm of a depth has ``spread``.
     """
     rotmats = other.viewmats[:, :3, :3]
     moved = similarity.move_points(side.points)
@@ -236,12 +236,12 @@ def _chain_largest_set(links: Sequence[tuple[Similarity, KeypointMatches]], coun
     Scenes are placed one after the other, along the links with most matches. The result has None for all other scenes.
     ``count`` is the number of all scenes.
     """
-    strength = [0] * count
+    num_matches = [0] * count
     for _, pair in links:
         for scene in pair.scenes:
-            strength[scene] += len(pair)
+            num_matches[scene] += len(pair)
     best: Similarities = []
-    for start in sorted(range(count), key=lambda scene: -strength[scene]):
+    for start in sorted(range(count), key=lambda scene: -num_matches[scene]):
         similarities = _chain_from_scene(start, links, count)
         if _count_placed(similarities) > _count_placed(best):
             best = similarities
@@ -346,6 +346,7 @@ def _normal_equations(
             source_jacobian = _differentiate_by_step(residuals.slopes, pair.sides[source].points, similarity)
             target_jacobian = -_differentiate_by_step(residuals.slopes, residuals.moved, IDENTITY)
             jacobians = {pair.scenes[source]: source_jacobian, pair.scenes[1 - source]: target_jacobian}
+            # scenes that are not free stay where they are
             jacobians = {scene: jacobian for scene, jacobian in jacobians.items() if scene in columns}
             for scene, jacobian in jacobians.items():
                 weighted = (weights[:, None, None] * jacobian).reshape(-1, NUM_PARAMETERS).T
@@ -371,7 +372,10 @@ def _differentiate_by_step(slopes: np.ndarray, points: np.ndarray, similarity: S
 
 
 def _choose_shift_unit(photos: Sequence[Sequence[PhotoKeypoints]], similarities: Similarities) -> float:
-    """Return the unit in which shifts are rounded: the power of two above the first placed scene's median depth."""
+    """Return the unit in which shifts are rounded. It is the power of two above the first placed scene's median depth.
+
+    Without keypoints in this scene the unit is 1.
+    """
     first = next(scene_photos for scene_photos, each in zip(photos, similarities, strict=True) if each is not None)
     depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
     return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0
