@@ -1,13 +1,13 @@
 """Align rows with cameras: find the pixel of each row, and the cameras that show the Gaussians in place.
 
-``rows_first`` tries three answers in turn. First, rows in plain order are the pixels of their cameras. ``poses`` helps
-there: it reads poses in other conventions and moves inexact cameras. Second, rows are in the order of the pixels, but
-some pixels have no row. ``dropped_rows`` follows such rows through the pixels, in each frame that exporters use
-(``frames``). Third, rows without pixels get cameras alone. ``unaligned`` chooses them by the colours of the photos, and
-``upright`` solves for them if no file stores the frame of the rows.
+``rows_first`` tries three cases, one after the other. First, rows in plain order may be the pixels of their cameras. To
+find out, ``poses`` reads poses in other conventions and moves inexact cameras. Second, rows may be in the order of the
+pixels, while some pixels have no row. ``dropped_rows`` follows such rows through the pixels, in each frame that
+exporters use (``frames``). Third, rows may have no pixels. Then ``unaligned`` chooses cameras by the colours of the
+photos, and ``upright`` solves for cameras if no file stores the frame of the rows.
 
 ``grids`` has the sizes that cameras and photos can have. ``estimate`` solves for the cameras if no file gives them, and
-``explain`` reports why rows do not fit. The modules are private. Those that few files need are loaded at first use.
+``explain`` reports why rows do not fit. The modules are private. Modules that few files need are loaded at first use.
 """
 
 # ruff: noqa: F401  names for other packages

@@ -1,6 +1,6 @@
 """Calibrate cameras from points and their pixels: poses, and intrinsics for each view or common to all.
 
-Intrinsics are as simple as the points allow: of several models, the one with the smallest Bayesian information
+Intrinsics are as simple as the points allow. Of several models, the one with the smallest Bayesian information
 criterion is chosen (Schwarz 1978).
 """
 
@@ -31,7 +31,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
 _FREE_INTRINSICS = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
-# A point is far from its pixel if its distance is above this multiple of the median, and above this number of pixels
+# A point is far from its pixel if its distance is above _FAR times the median distance, and above _FAR_PX pixels
 _FAR, _FAR_PX = 3.0, 1.0
 
 
@@ -45,7 +45,7 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Cameras of v views with a number of free intrinsics, and their residuals."""
+    """Cameras of v views, solved for with a number of free intrinsics, and their errors."""
 
     Ks: np.ndarray  # [v,3,3]
     poses: np.ndarray  # [v,4,4] world to camera
@@ -54,7 +54,7 @@ class _Model:
 
     @property
     def worst_px(self) -> float:
-        """Largest median distance of a view, pixels."""
+        """Largest median distance of a view's points from their pixels, in pixels."""
         worst = max(float(np.median(errors)) for errors in self.errors)
         return worst if math.isfinite(worst) else math.inf
 
@@ -80,11 +80,11 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
     middle = np.median(pairs.points, 0)
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
     points, pixels = [(view.points - middle) / unit for view in views], [view.pixels for view in views]
-    limit, bound = pixel_limit(width, height), max(map(projective_error, points, pixels), default=math.inf)
-    model = _choose_model(points, pixels, (width, height), bound) if bound <= limit else None
-    if model is None or model.worst_px > limit:
+    limit_px, projective_px = pixel_limit(width, height), max(map(projective_error, points, pixels), default=math.inf)
+    model = _choose_model(points, pixels, (width, height), projective_px) if projective_px <= limit_px else None
+    if model is None or model.worst_px > limit_px:
         return None
-    # Relative uncertainty of the focal length. It is larger where points are nearly a plane in front of the camera
+    # relative uncertainty of the focal length; it is larger if points nearly lie in a plane in front of the camera
     max_uncertainty = 0.05
     if focal_uncertainty(points, pixels, model.Ks, model.poses) > max_uncertainty:
         return None
@@ -96,26 +96,26 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
 
 
 def _choose_model(
-    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, projective_px: float
 ) -> _Model | None:
     """Choose the simplest intrinsics that explain the pixels; None if the points determine no model.
 
-    ``bound`` is the error of projective cameras, pixels.
+    ``projective_px`` is the error of the best projective cameras, in pixels.
     """
     models: list[_Model] = []
     with suppress(np.linalg.LinAlgError):  # raised at the first model that the points do not determine
-        models.extend(_solve_models(points, pixels, size, bound))
-    far = max(_FAR_PX, _FAR * min((model.worst_px for model in models), default=math.inf))
-    return min(models, key=lambda model: model.criterion(far), default=None)
+        models.extend(_solve_models(points, pixels, size, projective_px))
+    far_px = max(_FAR_PX, _FAR * min((model.worst_px for model in models), default=math.inf))
+    return min(models, key=lambda model: model.criterion(far_px), default=None)
 
 
 def _solve_models(
-    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, projective_px: float
 ) -> Iterator[_Model]:
     """Yield models from simple to complex: with intrinsics common to all views, then with intrinsics for each view.
 
-    Models with intrinsics for each view are left out if common intrinsics are as near to the pixels as projective
-    cameras.
+    Models with intrinsics for each view are left out if the error of common intrinsics is as small as the error of the
+    best projective cameras, which is ``projective_px``.
     """
     one_focal_models = []
     first_focals = (1.2, 4.8)  # focal lengths, in longer sides of the picture, at which the search begins
@@ -129,10 +129,12 @@ def _solve_models(
         start = _Model(np.tile(K, (len(starts), 1, 1)), poses, 0, ())
         for free in _FREE_INTRINSICS:
             model = _fit_model(points, pixels, start, free)
-            one_focal_models += [model] if free == ONE_FOCAL else []
-            start = start if free == ONE_FOCAL else model
+            if free == ONE_FOCAL:
+                one_focal_models.append(model)
+            else:
+                start = model
             yield model
-        if is_as_near(model.worst_px, bound):  # more intrinsics cannot be nearer
+        if is_as_near(model.worst_px, projective_px):  # more intrinsics cannot be nearer
             return
     model = min(one_focal_models, key=lambda model: model.worst_px)
     for free in _FREE_INTRINSICS if len(points) > 1 else ():

@@ -1,8 +1,8 @@
 """Find the pixels of rows from the rows alone if some pixels have no row; rows are view by view and line by line.
 
-Some lines are complete, for example in the middle of views without borders and far pixels. Between complete lines, the
-long step back to the left edge repeats once per line. A projective camera is solved from a few such lines. It then
-shows the lines before and after them in their pixels, also the incomplete ones, up to the end of the view.
+Some lines are complete, for example in the middle of views without borders and far pixels. Where lines are complete,
+the long step back to the left edge repeats once per line. A projective camera is solved from a few such lines. It shows
+the pixels of the lines before and after them, up to the end of the view, even if these lines are incomplete.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.reproject import follow_pixels
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # fewest and most pixels of a line
-# A length of lines is tried if at least this share of the sampled rows shows it; and the number of lengths tried
+# A length of lines is tried if at least _MIN_SHARE of the sampled rows show it. At most _MAX_LENGTHS are tried
 _MIN_SHARE, _MAX_LENGTHS = 0.02, 2
-# Least step back to the left, divided by the usual step; and largest step down to the next line, divided by the step
-# back
+# The step back to the left edge is at least _WRAP times the usual step. The step from the first point of a line to the
+# first point of the next line is at most _BELOW times the step back
 _WRAP, _BELOW = 8.0, 0.25
 _MIN_LINES = 6  # fewest complete lines in a series
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # largest median distance of a view's rows from their pixels
-# A camera is used for some lines beyond those from which it was solved: this share of their number, at least _MIN_AHEAD
+# If a camera was solved from n lines, it is used for the next _AHEAD * n lines, or for _MIN_AHEAD if that is more
 _AHEAD, _MIN_AHEAD = 0.3, 2
 _MIN_PLACED = 0.9  # share of the rows that must have a pixel
 
@@ -80,7 +80,7 @@ def _find_line_lengths(points: np.ndarray) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class _GridView:
-    """Consecutive rows of one view, with their pixels; the origin of the pixels is arbitrary."""
+    """Consecutive rows of one view, with their pixels. Columns and lines are counted from an arbitrary first one."""
 
     rows: np.ndarray  # ``[p]`` in order
     x: np.ndarray  # ``[p]`` columns of the pixels
@@ -92,22 +92,23 @@ class _GridView:
 def _find_views(points: np.ndarray, length: int) -> list[_GridView]:
     """Find the views whose lines have ``length`` rows, in the order of their rows.
 
-    Each view grows from a series of complete lines. Series that fit a camera worse than the best one are left out.
+    Each view is extended from a series of complete lines. Series that fit a camera worse than the best series does are
+    left out.
     """
-    num_first, max_series = 12, 200  # number of series among which the best one is looked for, and in all
+    num_first, max_series = 12, 200  # the best of the first series counts; at most max_series are used
     series = _find_lines(points, length)[:max_series]
-    seeds = [_solve_lines(points, starts) for starts in series[:num_first]]
-    nearest = min((seed.px for seed in seeds if seed is not None), default=None)
-    if nearest is None:
+    first_views = [_solve_lines(points, starts) for starts in series[:num_first]]
+    best_px = min((view.px for view in first_views if view is not None), default=None)
+    if best_px is None:
         return []
     views = list[_GridView]()
     free = np.ones(len(points), bool)
     for i, starts in enumerate(series):
         if not free[starts[0] : starts[-1]].all():
             continue
-        seed = seeds[i] if i < len(seeds) else _solve_lines(points, starts)
-        if seed is not None and is_as_near(seed.px, nearest):
-            view = _extend_view(points, free, seed, length)
+        small_view = first_views[i] if i < len(first_views) else _solve_lines(points, starts)
+        if small_view is not None and is_as_near(small_view.px, best_px):
+            view = _extend_view(points, free, small_view, length)
             free[view.rows[0] : view.rows[-1] + 1] = False
             views.append(_drop_rare_columns(view))
     return sorted(views, key=lambda view: int(view.rows[0]))
@@ -119,10 +120,10 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
     The first row of a line follows a long step back to the left, and lies near the first row of the line before.
     """
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    count = len(steps) // length * length
-    usual = np.median(steps[:count].reshape(-1, length), 1).repeat(length)
-    usual = np.pad(usual, (0, len(steps) - count), mode="edge")
-    rows = np.flatnonzero(steps > _WRAP * usual) + 1
+    in_whole_lines = len(steps) // length * length
+    usual_steps = np.median(steps[:in_whole_lines].reshape(-1, length), 1).repeat(length)
+    usual_steps = np.pad(usual_steps, (0, len(steps) - in_whole_lines), mode="edge")
+    rows = np.flatnonzero(steps > _WRAP * usual_steps) + 1
     max_jumps = 100  # long steps per line; with more, rows are in no order
     if len(rows) * length > max_jumps * len(points):
         return []
@@ -130,10 +131,10 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
 
 
 def _link_lines(rows: np.ndarray, points: np.ndarray, limits: np.ndarray, length: int) -> np.ndarray:
-    """Return for each of ``rows [r]``, which may begin lines, the index ``[r]`` of the line before; -1 if none is.
+    """Return for each of ``rows [r]``, which may begin lines, the index ``[r]`` of the line before it; -1 for none.
 
-    The line before begins ``length`` rows earlier. Its first point is the nearest of ``points [r,3]``, within
-    ``limits [r]``.
+    The line before begins ``length`` rows earlier. The distance between the first points of both lines, among
+    ``points [r,3]``, is less than ``limits [r]``.
     """
     before, least = np.full(len(rows), -1), limits
     for back in range(1, len(rows)):
@@ -151,8 +152,8 @@ def _link_lines(rows: np.ndarray, points: np.ndarray, limits: np.ndarray, length
 def _collect_series(rows: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
     """Collect series of lines that follow each other, the longest series first; no two series share a line.
 
-    ``rows [r]`` begin the lines, and ``before [r]`` is the index of the line before, or -1. A series is the rows that
-    begin its lines.
+    ``rows [r]`` begin the lines, and ``before [r]`` is the index of the line before, or -1. A series is returned as the
+    rows that begin its lines.
     """
     num_before = np.zeros(len(rows), np.int64)  # number of lines before each line in its series
     for i, previous in enumerate(before.tolist()):
@@ -189,7 +190,7 @@ def _drop_rare_columns(view: _GridView) -> _GridView:
 
 
 def _shift_columns(view: _GridView, columns: int) -> _GridView:
-    """Add a number to the columns of a view's pixels, and shift its camera alike."""
+    """Add a number of columns to the pixels of a view, and change its camera so that it projects there."""
     camera = view.camera.copy()
     camera[0] += columns * camera[2]
     return replace(view, x=view.x + columns, camera=camera)
@@ -198,28 +199,28 @@ def _shift_columns(view: _GridView, columns: int) -> _GridView:
 def _extend_view(points: np.ndarray, free: np.ndarray, view: _GridView, width: int) -> _GridView:
     """Extend a view over rows before and after it, as long as its camera shows these in the order of pixels.
 
-    ``free [n]`` marks the rows of no other view, and ``width`` is the length of a line in rows.
+    ``free [n]`` is True for rows that no other view has. ``width`` is the length of a line in rows.
     """
     first, last = view.rows[[0, -1]]
     before, after = np.flatnonzero(~free[:first]), np.flatnonzero(~free[last:])
+    # the free rows around the view
     low, high = int(before[-1]) + 1 if len(before) else 0, int(last + after[0]) if len(after) else len(free)
     max_lost = 16  # after more consecutive rows without a pixel, another view begins
     while True:
-        top, lines = int(view.y.min()), int(np.ptp(view.y)) + 1
-        reach = max(_MIN_AHEAD, int(_AHEAD * lines))
-        first, last = max(low, view.rows[0] - reach * width), min(high, view.rows[-1] + 1 + reach * width)
-        shift = np.array([[1.0, 0, 0], [0, 1, reach - top], [0, 0, 1]])
+        top, num_lines = int(view.y.min()), int(np.ptp(view.y)) + 1
+        ahead = max(_MIN_AHEAD, int(_AHEAD * num_lines))  # lines that are tried on both sides
+        first, last = max(low, view.rows[0] - ahead * width), min(high, view.rows[-1] + 1 + ahead * width)
+        count_from_first_line = np.array([[1.0, 0, 0], [0, 1, ahead - top], [0, 0, 1]])
         viewmat = np.concatenate([view.camera, [[0, 0, 0, 1]]])
-        followed = np.ascontiguousarray(points[first:last], np.float32)
-        pixels = follow_rows(followed, viewmat[None], shift[None], width, lines + 2 * reach)
+        tried = np.ascontiguousarray(points[first:last], np.float32)
+        pixels = follow_rows(tried, viewmat[None], count_from_first_line[None], width, num_lines + 2 * ahead)
         rows = np.flatnonzero(pixels >= 0)
-        stretches = np.split(rows, np.flatnonzero(np.diff(rows) > max_lost) + 1)
-        rows = max(stretches, key=len)
+        rows = max(np.split(rows, np.flatnonzero(np.diff(rows) > max_lost) + 1), key=len)
         y, x = np.divmod(pixels[rows], width)
-        grown = _solve_camera(points, _GridView(first + rows, x, y + top - reach, view.camera)) if len(rows) else view
-        if grown.px > _MAX_PX or len(grown.rows) <= len(view.rows):
+        larger = _solve_camera(points, _GridView(first + rows, x, y + top - ahead, view.camera)) if len(rows) else view
+        if larger.px > _MAX_PX or len(larger.rows) <= len(view.rows):
             return view
-        view = grown
+        view = larger
 
 
 def follow_rows(
@@ -227,32 +228,35 @@ def follow_rows(
 ) -> np.ndarray:
     """Find pixels ``[n]`` of rows at ``points [n,3]`` float32 so that most rows are in the order of pixels.
 
-    Rows out of order get -1. The order is view by view and line by line. If ``mixed``, it is line by line, and the
-    views of a pixel follow each other.
+    Rows out of order get -1. The order is view by view and line by line. If ``mixed`` is True, it is line by line, and
+    the rows of one pixel in all views follow each other.
     """
     count, views = len(points), len(viewmats)
-    shapes = ((count, np.int64), (count, np.int64), (count, np.int32), (count * views, np.int32))
-    ids, *scratch = (np.empty(size, dtype) for size, dtype in (*shapes, (views, np.int64), (views, np.int32)))
+    ids = np.empty(count, np.int64)
+    scratch_of_rows = np.empty(count, np.int64), np.empty(count, np.int32), np.empty(count * views, np.int32)
+    scratch = *scratch_of_rows, np.empty(views, np.int64), np.empty(views, np.int32)
     follow_pixels(points, viewmats, Ks, ids, *scratch, width, height, int(mixed))
     return ids
 
 
 def _solve_camera(points: np.ndarray, view: _GridView) -> _GridView:
-    """Return a view with the camera that is solved for from its rows and pixels, and the distance between these."""
+    """Return a view with the camera that shows its rows nearest to their pixels, and with their median distance."""
     sample = np.linspace(0, len(view.rows) - 1, min(_SOLVED_FROM, len(view.rows))).astype(int)
     pixels = np.stack([view.x[sample], view.y[sample]], 1) + 0.5
     camera, px = projective_camera(points[view.rows[sample]], pixels)
     depths = matmul(points[view.rows[sample]], camera[2, :3]) + camera[2, 3]
-    return replace(view, camera=camera * np.copysign(1.0, np.median(depths)), px=px)
+    sign = np.copysign(1.0, np.median(depths))  # with which the points are in front of the camera
+    return replace(view, camera=camera * sign, px=px)
 
 
 def _make_layout(rows: np.ndarray, views: list[_GridView], count: int) -> Layout:
     """Lay out views on grids of one size, so that all have about the same principal point.
 
-    The layout has ``count`` rows. The rows of a view are indices of ``rows [m]``, the finite ones of these.
+    The layout has ``count`` rows, of which ``rows [m]`` are finite. The rows of a view are numbered among the finite
+    rows.
     """
-    lefts, width = _choose_shifts([(view.x, _principal_coordinate(view, 0)) for view in views])
-    tops, height = _choose_shifts([(view.y, _principal_coordinate(view, 1)) for view in views])
+    lefts, width = _choose_shifts([view.x for view in views], [_principal_coordinate(view, 0) for view in views])
+    tops, height = _choose_shifts([view.y for view in views], [_principal_coordinate(view, 1) for view in views])
     pixels = tuple((view.y + top) * width + view.x + left for view, top, left in zip(views, tops, lefts, strict=True))
     ids = np.full(count, -1)
     for number, (view, view_pixels) in enumerate(zip(views, pixels, strict=True)):
@@ -260,14 +264,15 @@ def _make_layout(rows: np.ndarray, views: list[_GridView], count: int) -> Layout
     return Layout(len(views), width, height, ids=ids)
 
 
-def _choose_shifts(views: Sequence[tuple[np.ndarray, float]]) -> tuple[list[int], int]:
+def _choose_shifts(coordinates: Sequence[np.ndarray], middles: Sequence[float]) -> tuple[list[int], int]:
     """Choose the shift of each view along an axis, and the size of the grid along this axis; all in pixels.
 
-    ``views`` are pairs: the pixels of a view along the axis, and the coordinate of its principal point.
+    ``coordinates`` has the coordinates of each view's pixels along the axis. ``middles`` has the coordinates of the
+    views' principal points.
     """
-    firsts, middles = np.array([pixels.min() for pixels, _ in views]), np.array([middle for _, middle in views])
-    sizes = np.array([pixels.max() for pixels, _ in views]) - firsts + 1
-    starts = firsts - middles
+    firsts = np.array([pixels.min() for pixels in coordinates])
+    sizes = np.array([pixels.max() for pixels in coordinates]) - firsts + 1
+    starts = firsts - np.array(middles)
     corners = np.rint(starts - np.median(starts[sizes == sizes.max()])).astype(int)  # relative to the largest view
     inside = corners.clip(0, sizes.max() - sizes)
     tolerance = 2  # difference of principal points, pixels, up to which views stay within the largest view

@@ -17,15 +17,15 @@ from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, m
 def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> CameraFile | None:
     """Estimate the cameras of rows ``means [n,3]`` that are the pixels of a grid; None for other rows.
 
-    The rows have one of two orders. They are view by view, where some pixels may have no row, or the rows of one pixel
-    in all views follow each other. ``valid [n]`` bool marks the finite rows, and ``path`` is for messages.
+    The rows are view by view, or the rows of one pixel in all views follow each other. In both orders some pixels may
+    have no row. ``valid [n]`` bool marks the finite rows, and ``path`` is for messages.
     """
     rows, step = np.arange(len(means)), _find_pixel_step(means)
     orders = (rows, rows.reshape(-1, step).T.reshape(-1)) if step > 1 and len(rows) % step == 0 else (rows,)
-    # a row that is not finite may take the place of a pixel, or belong to none; both are tried
-    filled = np.stack([np.interp(rows, rows[valid], values) for values in means[valid].T], 1).astype(np.float32)
-    possible = [(means, valid)] if valid.all() else [(means, valid), (filled, np.ones_like(valid))]
-    for order, (points, used) in product(orders, possible):
+    # a row that is not finite may have a pixel, so that it is interpolated, or no pixel; both are tried
+    interpolated = np.stack([np.interp(rows, rows[valid], values) for values in means[valid].T], 1).astype(np.float32)
+    point_sets = [(means, valid)] if valid.all() else [(means, valid), (interpolated, np.ones_like(valid))]
+    for order, (points, used) in product(orders, point_sets):
         grid = find_dropped_grid(points[order], used[order])
         if grid is not None:
             layout, calibration = grid
@@ -41,9 +41,10 @@ def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> Camera
 
 
 def _find_pixel_step(means: np.ndarray) -> int:
-    """Find the step in rows from one pixel to the next; it is the number of views whose rows follow each other.
+    """Find the step in rows from a pixel to the next pixel of the same view.
 
-    Points ``means [n,3]`` that are this step apart are nearest to each other. The step is 1 if the rows are few.
+    Points ``means [n,3]`` that are this step apart are nearest to each other. The step is the number of views if the
+    rows of one pixel in all views follow each other. It is 1 for other rows, and for few rows.
     """
     most_views = 64  # largest step that is tried
     min_pixels = 256  # fewest pixels of a view

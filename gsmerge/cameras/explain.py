@@ -14,7 +14,7 @@ from gsmerge.types import Cameras, Gaussians
 
 
 def no_pixels_error(ply: FileInfo, cameras: Cameras) -> SceneError:
-    """Make the SceneError for rows that are not the pixels of the cameras, with both numbers."""
+    """Make the SceneError for rows that are not the pixels of the cameras; it states the numbers of both."""
     views, width, height = len(cameras), cameras.width, cameras.height
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
     actual = f"{ply.count} in no known order" if ply.count == views * height * width else str(ply.count)
@@ -23,7 +23,7 @@ def no_pixels_error(ply: FileInfo, cameras: Cameras) -> SceneError:
 
 
 def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> None:
-    """Raise SceneError if the rows are pixels in order, but of other cameras than most of the file's cameras.
+    """Raise SceneError if the rows are all pixels in order, but not the pixels of most of the file's cameras.
 
     If the photos have the colours of the rows, no error is raised, because the views may just be in another order.
     """
@@ -42,7 +42,7 @@ def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> Non
 
 
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
-    """Make the SceneError for rows that are as many as the pixels, but do not lie in them.
+    """Make the SceneError for rows that do not lie in the pixels, although there are as many rows as pixels.
 
     ``reason`` names another order that fits, see :func:`explain_misalignment`; None if no order does.
     """
@@ -57,7 +57,7 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
 
 
 def explain_misalignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> str | None:
-    """Describe another order in which the rows are the pixels of the cameras; None if there is no such order."""
+    """Describe another order, in which the rows would be the pixels of the cameras; None if there is none."""
     views, width, height = len(cameras), cameras.width, cameras.height
     rows = np.arange(len(gaussians))
     orders = {

@@ -30,13 +30,13 @@ from gsmerge.values.arrays import distinct
 
 _ROUNDS = 4  # number of rounds of reweighted least squares
 _HALF = np.sqrt(0.5)
-# Rotation of the world by the pixelSplat family: axes swapped, then an eighth of a turn about the last axis
+# Rotation of the world by the pixelSplat family. It swaps axes, and then turns by 45 degrees about the last axis
 UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
 _VIEWER = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # rotation of the world by Splatter Image's demo
 
 
 def scale_by(scale: float, note: str = "") -> Similarity:
-    """Return the similarity that only scales; ``note`` is added to its description."""
+    """Return a similarity that only scales. ``note`` is added to its description."""
     text = f"positions scaled by {scale:.4g}{note}"
     return Similarity(np.eye(3), scale, np.zeros(3), text)
 
@@ -66,7 +66,7 @@ def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Simila
 def fit_frame(cameras: Cameras, poses: np.ndarray, scale: float | None) -> Similarity:
     """Fit the similarity that moves cameras to ``poses [c,4,4]``, with a description in words.
 
-    ``scale`` (None: 1) is used if all cameras stand in one place, because they do not determine it then.
+    If all cameras stand in one place, they do not determine the scale. Then ``scale`` is used, or 1 if it is None.
     """
     frame = fit_similarity(cameras.viewmats, poses, scale or 1.0)
     angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
@@ -93,9 +93,10 @@ def solve_frame(
     :func:`ray_directions`. Returns None if the scale would not be positive.
     """
     rays, centres = (matmul(vectors, rotation.T) for vectors in rays_and_centres)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    columns = [transform(across, centres)[:, :, None], across]
-    A, b = np.concatenate(columns, 2), transform(across, points)
+    # Linear equations of scale and shift: points and centres have the same projections onto the plane across each ray
+    projections = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    columns = [transform(projections, centres)[:, :, None], projections]
+    A, b = np.concatenate(columns, 2), transform(projections, points)
     weights, solution = np.ones(len(points)), np.zeros(A.shape[2])
     for _ in range(_ROUNDS):
         weighted = (A * weights[:, None, None]).reshape(-1, A.shape[2])
@@ -104,12 +105,12 @@ def solve_frame(
         solution = solve_symmetric(normal / np.outer(unit, unit), target / unit) / unit
         if not np.isfinite(solution).all() or solution[0] <= 0:
             return None
-        shift = solution[1:]
-        from_centres = points - solution[0] * centres - shift
+        scale, shift = solution[0], solution[1:]
+        from_centres = points - scale * centres - shift
         depth = np.abs((from_centres * rays).sum(1)) + 1e-12
-        angle = np.linalg.norm(transform(across, from_centres), axis=1) / depth
+        angle = np.linalg.norm(transform(projections, from_centres), axis=1) / depth
         weights = robust_weights(angle, 3, 1e-12, depth)
-    return Similarity(rotation, float(solution[0]), shift)
+    return Similarity(rotation, float(scale), shift)
 
 
 def solve_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Bring cameras and photos to one size: that of the photos or of the cameras, of which one is the size of the grid."""
+"""Bring cameras and photos to the size of the pixel grid, which is the size of the photos or of the cameras."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ class Grid:
     transform: PhotoTransform | None  # applied to the photos; None: nothing
     notes: tuple[str, ...]  # notes for the user, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
-    # ``[c,4,4]`` the poses as read if photos confirm them, so that the Gaussians have to move there; None otherwise
+    # ``[c,4,4]`` poses as read, to which the Gaussians have to move, because photos confirm these poses; otherwise None
     confirmed_viewmats: np.ndarray | None = None
 
     @property
     def size(self) -> Size:
-        """(width, height) of the grid, pixels."""
+        """Width and height of the grid, in pixels."""
         return self.cameras.width, self.cameras.height
 
 
 @dataclass(frozen=True)
 class PlacedGrid:
-    """Cameras that show Gaussians in place: those of a grid, and the frame of the Gaussians into which they move."""
+    """The cameras of a grid, moved into the frame of the Gaussians."""
 
     grid: Grid
-    frame: Similarity
+    frame: Similarity  # from the cameras' own world to the frame of the Gaussians
     shown_by: str = ""  # evidence for the frame, in words; empty for a frame that a file gives
 
     @property
@@ -50,7 +50,7 @@ class PlacedGrid:
         return self.grid.cameras if self.frame is IDENTITY else self.frame.move_cameras(self.grid.cameras)
 
     def notes(self, usual: Convention) -> list[str]:
-        """List notes on what was adapted; ``usual`` is the convention that the format of the poses has."""
+        """List notes on what was adapted. ``usual`` is the pose convention of the file's format."""
         notes, convention = [*self.grid.notes], self.grid.camera_file.convention
         if convention != usual:
             fits = f"the poses fit when read as {describe_convention(convention)}"
@@ -62,7 +62,7 @@ class PlacedGrid:
 
 
 def with_poses(grid: Grid, poses: PosesInConvention) -> Grid:
-    """Return a grid whose cameras have ``poses``, which are read in another convention."""
+    """Return a grid whose cameras have the ``poses`` as read in another convention."""
     file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
     return replace(grid, camera_file=file, cameras=replace(grid.cameras, viewmats=poses.viewmats))
 
@@ -70,7 +70,8 @@ def with_poses(grid: Grid, poses: PosesInConvention) -> Grid:
 def with_photo_size(camera_file: CameraFile, size: Size | None) -> CameraFile:
     """Return cameras with the ``size`` of the photos if the cameras' own size differs from it by one pixel.
 
-    Such a size may have been computed as twice the principal point. Other cameras are returned as they are.
+    A file may not state the size, so that it was computed as twice the principal point, which is not exact. Other
+    cameras are returned as they are.
     """
     stored = sizes_of(camera_file)
     if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= 1:
@@ -86,7 +87,7 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
     """
     if size is None:
         return Grid(camera_file, to_cameras(camera_file), None, ())
-    if camera_file.photo_map is not None:
+    if camera_file.photo_map is not None:  # the size of photos, and how they are resized and cropped to the grid
         return _mapped_grid(camera_file, size, *camera_file.photo_map)
     width, height = size
     for w, h in sizes_of(camera_file):
@@ -103,26 +104,26 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
 
 
 def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, file_transform: PhotoTransform) -> Grid:
-    """Return the grid of photos that a known transform resizes or crops.
+    """Return the grid to which a known transform resizes or crops photos.
 
-    ``file_transform`` is the transform of photos of ``file_size``. The photos in memory have ``size``, which may be
-    smaller.
+    ``file_transform`` transforms photos of ``file_size``. The photos in memory have ``size``, which may be smaller.
     """
-    across, down = (file_side / side for file_side, side in zip(file_size, size, strict=True))
-    transform = replace(file_transform, scale_x=across * file_transform.scale_x, scale_y=down * file_transform.scale_y)
+    ratio_x, ratio_y = (file_side / side for file_side, side in zip(file_size, size, strict=True))
+    scale_x, scale_y = ratio_x * file_transform.scale_x, ratio_y * file_transform.scale_y
+    transform = replace(file_transform, scale_x=scale_x, scale_y=scale_y)
     note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
     max_difference = 0.1  # few models resize width and height by factors with a larger relative difference
-    if camera_file.source == ESTIMATED and abs(transform.scale_x / transform.scale_y - 1) > max_difference:
+    if camera_file.source == ESTIMATED and abs(scale_x / scale_y - 1) > max_difference:
         note += "; if the model did not squeeze them, rows were left out of the file: name its cameras with --cameras"
     is_same = file_size == (transform.width, transform.height)
     return Grid(camera_file, to_cameras(camera_file), transform, () if is_same else (note,))
 
 
 def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
-    """List the grid at the size of the cameras, to which photos are resized, if that is another size than ``size``.
+    """Return a list with the grid at the size of the cameras, if the photos have another ``size``.
 
-    ``size`` is the size of the photos. If shapes differ, cameras are cropped to the photos instead. The list is empty
-    without photos, if sizes are equal, and if the photos would be enlarged too much.
+    Photos are resized to this grid. But if shapes differ, cameras are cropped to the photos. The list is empty without
+    photos, if sizes are equal, and if photos would be enlarged too much.
     """
     sizes = sizes_of(camera_file)
     if size is None or len(sizes) != 1 or sizes[0] == size or camera_file.photo_map is not None:

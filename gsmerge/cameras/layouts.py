@@ -1,4 +1,4 @@
-"""Lay out rows as pixels of views: all pixels in order, or pixels of which some have no row."""
+"""Lay out rows as pixels of views. Rows are all pixels in order, or some pixels have no row."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Layout:
         if self.ids is not None:
             return self.ids
         count = self.views * self.width * self.height
-        # there may be hundreds of millions of rows
+        # int32 saves memory, as there may be hundreds of millions of rows
         return np.arange(count, dtype=np.int32 if count <= np.iinfo(np.int32).max else np.int64)
 
     def sample(self, per_view: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """Read poses in another convention, and move inexact cameras.
 
 Models that predict poses write Gaussians that lie a little beside the pixels of their cameras. The pixels of a view and
-their Gaussians determine its pose. Here the cameras are moved to these poses. If the photos agree better from the poses
-as read, the Gaussians are wrong, and the result says so. Views whose photos disagree are moved later
+their Gaussians determine its pose, and the cameras are moved to these poses. If photos agree better with the poses as
+read, the Gaussians are wrong. Then the result is marked as ``confirmed``. Views whose photos disagree are moved later
 (``gsmerge/facts/move_poses.py``).
 """
 
@@ -39,10 +39,10 @@ from gsmerge.types import Cameras
 
 @dataclass(frozen=True, eq=False)
 class PosesInConvention:
-    """Poses as they are when read in one convention: ``viewmats [c,4,4]`` float64, world to camera."""
+    """The poses of a file, read in one convention."""
 
     convention: Convention
-    viewmats: np.ndarray
+    viewmats: np.ndarray  # ``[c,4,4]`` float64, world to camera
 
     @property
     def description(self) -> str:
@@ -56,9 +56,9 @@ def describe_convention(convention: Convention) -> str:
 
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[PosesInConvention]:
-    """List what poses ``viewmats [c,4,4]``, read in ``convention``, become in each other convention.
+    """List the poses that a file has if it is read in each other convention than ``convention``.
 
-    Poses that are equal in two conventions are listed once.
+    In ``convention`` it has the poses ``viewmats [c,4,4]``. Poses that are equal in two conventions are listed once.
     """
     stored, all_poses = from_viewmats(viewmats, convention), [PosesInConvention(convention, viewmats)]
     tolerance = 1e-6  # tolerance for equal poses, relative to the largest number in them
@@ -85,14 +85,15 @@ class MovedCameras:
         if not self.moves:
             x, y = (self.cameras.Ks[:, :2, 2] - (self.cameras.width / 2, self.cameras.height / 2)).mean(0)
             return f"principal points lie ({x:.1f}, {y:.1f}) px from the middle, as the Gaussians' pixels show"
-        text = (
-            f"the cameras are off by a median of up to {self.worst_px:.1f} px: each was moved to where its Gaussians"
-            " lie in their pixels"
-        )
         if self.confirmed:
             text = (
                 f"the Gaussians are off their pixels by a median of up to {self.worst_px:.1f} px: the Gaussians of each"
                 " view were moved to its camera, since the photos agree better from there"
+            )
+        else:
+            text = (
+                f"the cameras are off by a median of up to {self.worst_px:.1f} px: each was moved to where its"
+                " Gaussians lie in their pixels"
             )
         return f"{text}, {describe_moves(self.moves)}"
 
@@ -102,15 +103,15 @@ def move_cameras(
 ) -> MovedCameras | None:
     """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far off.
 
-    ``images [c,h,w,3]`` are photos, which may confirm the poses as read, or none.
-
     If changed intrinsics fit as well as moved poses, the intrinsics are changed instead. Only principal points in the
     middle of the image may change, because these were probably just assumed. Any other change raises SceneError, which
-    names ``source``. ``names`` are those of the views.
+    names ``source``. ``names`` are the names of the views. ``images [c,h,w,3]`` are photos, which may confirm the poses
+    as read. They may be empty.
     """
     before = check_pairs(pairs, cameras)
     if not before.worst_px <= max_correctable_px(cameras.width, cameras.height):
         return None
+    # each camera that is off is moved to its own Gaussians
     viewmats, errors = cameras.viewmats.astype(np.float64), pixel_errors(pairs, cameras)
     near_px = 0.5  # cameras with smaller errors are not moved
     for view in np.unique(pairs.views):
@@ -123,6 +124,7 @@ def move_cameras(
     after = check_pairs(pairs, moved)
     if not after.ok:
         return None
+    # the poses may be right, and the intrinsics wrong
     refitted = _fit_intrinsics(pairs, cameras, after.worst_px)
     if refitted is not None:
         _check_assumed(cameras, refitted, before.worst_px, source)
@@ -133,10 +135,10 @@ def move_cameras(
 
 
 def _photos_confirm(pairs: Correspondences, images: np.ndarray, cameras: Cameras, moved: Cameras) -> bool:
-    """Return True if photos agree better from the poses of ``cameras`` than from the ``moved`` poses.
+    """Return True if photos of the same Gaussians agree better with ``cameras`` than with the ``moved`` cameras.
 
-    The Gaussians lie where the moved cameras show them. For the poses of ``cameras``, the Gaussians of each view are
-    moved back with its camera.
+    The Gaussians lie where the moved cameras show them. To compare, the Gaussians of each view are moved back with its
+    camera.
     """
     motions = matmul(invert(cameras.viewmats), moved.viewmats)[pairs.views]
     points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
@@ -148,7 +150,8 @@ def _photos_confirm(pairs: Correspondences, images: np.ndarray, cameras: Cameras
 def _measure_disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
     """Measure the median difference in colour between photos of the same points; inf if no point is in two photos.
 
-    A point's own colour is that of its pixel in ``pairs``. Other views show it where ``points [t,3]`` project.
+    The first colour of a point is the colour of its pixel in ``pairs``. Other views show the point where it projects
+    from its position in ``points [t,3]``.
     """
     x, y = pairs.pixels.astype(np.int64).T
     own_colors, errors = photo_colors(images, pairs.views, y, x), []
@@ -163,9 +166,9 @@ def _measure_disagreement(points: np.ndarray, pairs: Correspondences, images: np
 
 
 def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit ``y = slope * x + height`` to each column of ``x [n,d]`` and ``y [n,d]`` by reweighted least squares.
+    """Fit ``y = slope * x + offset`` to each column of ``x [n,d]`` and ``y [n,d]`` by reweighted least squares.
 
-    Returns slopes ``[d]``, heights ``[d]`` and the distances ``[n]`` of the points from the lines.
+    Returns slopes ``[d]``, offsets ``[d]`` and the distances ``[n]`` of the points from the lines.
     """
     x, y = (np.ascontiguousarray(values.T) for values in (x, y))
     weights = np.ones(x.shape[1])
@@ -175,16 +178,16 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
             mean_x, mean_y = ((weights * values).sum(1, keepdims=True) / weights.sum() for values in (x, y))
             dx, dy = x - mean_x, y - mean_y
             slopes = (weights * dx * dy).sum(1, keepdims=True) / (weights * dx**2).sum(1, keepdims=True)
-            heights = mean_y - slopes * mean_x
-            errors = np.sqrt(((y - slopes * x - heights) ** 2).sum(0))
+            offsets = mean_y - slopes * mean_x
+            errors = np.sqrt(((y - slopes * x - offsets) ** 2).sum(0))
             weights = robust_weights(errors, 3, 1e-9)
-    return slopes[:, 0], heights[:, 0], errors
+    return slopes[:, 0], offsets[:, 0], errors
 
 
 def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -> Cameras | None:
-    """Scale and shift the intrinsics of all views alike; None if they then fit worse than moved poses.
+    """Scale and shift the intrinsics of all views by the same amounts; None if moved poses fit better.
 
-    ``moved_px`` is the largest median error of a view with moved poses, pixels.
+    ``moved_px`` is the largest median error of a view with moved poses, in pixels.
     """
     if len(np.unique(pairs.views)) < 2:  # in a single view a shift of the picture looks like a rotation
         return None
@@ -192,9 +195,9 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
         xy, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
     in_front = (depth[:, 0] > 0) & np.isfinite(xy[:, 0]).all(1)
     projected, pixels = xy[in_front, 0], pairs.pixels[in_front]
-    # x and y are fitted one by one, so that each axis has its own weights
-    lines = [fit_lines(projected[:, [axis]], pixels[:, [axis]])[:2] for axis in range(2)]
-    factors, shifts = np.array(lines)[:, :, 0].T
+    # x and y are fitted separately, because a point may fit in x but not in y
+    slopes_and_offsets = [fit_lines(projected[:, [axis]], pixels[:, [axis]])[:2] for axis in range(2)]
+    factors, shifts = np.array(slopes_and_offsets)[:, :, 0].T
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]
     Ks[:, :2, 2] += shifts
     refitted = replace(cameras, Ks=Ks)
@@ -203,10 +206,10 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
 
 
 def _check_assumed(cameras: Cameras, refitted: Cameras, before_px: float, source: str) -> None:
-    """Raise SceneError if ``refitted`` intrinsics change more than the assumed principal points of ``cameras``.
+    """Raise SceneError unless ``refitted`` differs from ``cameras`` only in principal points that were just assumed.
 
     Principal points count as assumed if all are in the middle of the image. ``before_px`` is the median error of
-    ``cameras``, pixels.
+    ``cameras``, in pixels.
     """
     factors = refitted.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
     middle = cameras.width / 2, cameras.height / 2

@@ -12,8 +12,8 @@ from gsmerge.geometry.transforms import Damping, descend, median, medians, motio
 from gsmerge.kernels import reproject
 from gsmerge.kernels.matrices import eigh, matmul, solve
 
-POSE_DAMPING = Damping(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
-# Numbers of intrinsics that are solved for: one for fx = fy, two for fx and fy, four for fx, fy, cx and cy
+POSE_DAMPING = Damping(steps=30, first=1e-3, decrease=0.1, increase=10.0, largest=1e8, min_gain=1e-10)
+# Numbers of intrinsics that are solved for: fx = fy; or fx and fy; or fx, fy, cx and cy
 ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4
 # Intrinsics, poses, and their curvature, slope and squared error; see _linearise
 _PoseFit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]
@@ -44,9 +44,9 @@ def refine_poses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
 
-    ``free`` is the number of intrinsics, common to all views, that are solved for as well: 0, ONE_FOCAL, TWO_FOCALS or
-    ALL_INTRINSICS. Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the points do
-    not determine them.
+    ``free`` is the number of intrinsics that are also solved for: 0, ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS. They are
+    common to all views. Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the
+    points do not determine them.
     """
 
     def linearise(new_K: np.ndarray, new_poses: np.ndarray) -> _PoseFit:
@@ -59,7 +59,7 @@ def refine_poses(
             change, motions = _solve_normal_equations(curvature, slope, damping)
             return linearise(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
 
-    K, poses, _ = descend(linearise(K, poses), lambda state: state[2][2], step, POSE_DAMPING)
+    K, poses, _ = descend(linearise(K, poses), lambda fit: fit[2][2], step, POSE_DAMPING)  # [2][2]: the squared error
     return K, poses
 
 
@@ -68,15 +68,15 @@ def _linearise(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return Gauss-Newton's curvature ``[v,6+f,6+f]`` and slope ``[v,6+f]`` of the squared error, and this error.
 
-    The 6 parameters of a view are rotation and shift of its camera. The f = ``free`` other ones are logarithms of focal
-    lengths, and then the principal point.
+    The first 6 parameters are rotation and shift of a view's camera. The f = ``free`` parameters after them are
+    logarithms of focal lengths, and then the principal point.
     """
     size = 6 + free
     curvature, slope, error = np.empty((len(poses), size, size)), np.empty((len(poses), size)), 0.0
     for view, pose in enumerate(poses):
         jacobian, residual = np.empty((2 * len(points[view]), size)), np.empty(2 * len(points[view]))
-        values = (np.ascontiguousarray(array, np.float64) for array in (points[view], pixels[view], K, pose))
-        reproject.linearise(*values, jacobian, residual)
+        inputs = (np.ascontiguousarray(array, np.float64) for array in (points[view], pixels[view], K, pose))
+        reproject.linearise(*inputs, jacobian, residual)  # fills `jacobian` and `residual`
         with np.errstate(all="ignore"):  # points in the plane of the camera overflow
             curvature[view], slope[view] = matmul(jacobian.T, jacobian), matmul(jacobian.T, residual)
             error += float((residual * residual).sum())
@@ -92,8 +92,8 @@ def _solve_normal_equations(curvature: np.ndarray, slope: np.ndarray, damping: f
         return np.empty(0), -solve(damped, pose_slope)[..., 0]
     # the Schur complement eliminates the poses
     solved = solve(damped[:, :6, :6], np.concatenate([pose_slope, mixed], 2))
-    whole = np.concatenate([slope[:, 6:, None], damped[:, 6:, 6:]], 2)
-    reduced = (whole - matmul(mixed.swapaxes(1, 2), solved)).sum(0)
+    of_intrinsics = np.concatenate([slope[:, 6:, None], damped[:, 6:, 6:]], 2)
+    reduced = (of_intrinsics - matmul(mixed.swapaxes(1, 2), solved)).sum(0)
     change = -solve(reduced[:, 1:], reduced[:, 0])
     max_stretch = 0.5  # largest relative change of a focal length in one step
     change[:TWO_FOCALS] = change[:TWO_FOCALS].clip(-max_stretch, max_stretch)
@@ -104,7 +104,7 @@ def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return intrinsics changed by the parameters ``change [f]`` of :func:`_linearise`."""
     K = K.copy()
     if len(change):
-        K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]
+        K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]  # a single change counts for both focal lengths
         K[:2, 2] += change[TWO_FOCALS:] if len(change) == ALL_INTRINSICS else 0
     return K
 
@@ -116,15 +116,15 @@ def focal_uncertainty(
 
     Each view has ``points [n,3]`` and their ``pixels [n,2]``. The result is inf for points in a plane.
     """
-    weight = 0.0  # inverse of the squared error
+    information = 0.0  # inverse of the squared error
     for view_points, view_pixels, K, pose in zip(points, pixels, Ks, poses, strict=True):
         (curvature,), _, _ = _linearise([view_points], [view_pixels], K, pose[None], ONE_FOCAL)
-        try:
-            explained = matmul(curvature[6, :6], solve(curvature[:6, :6], curvature[:6, 6]))
+        try:  # parameters 0 to 5 are the pose, and parameter 6 is the focal length
+            explained_by_pose = matmul(curvature[6, :6], solve(curvature[:6, :6], curvature[:6, 6]))
         except np.linalg.LinAlgError:  # all points coincide
             continue
-        weight += float(curvature[6, 6] - explained)
-    return 1 / math.sqrt(weight) if weight > 0 else math.inf
+        information += float(curvature[6, 6] - explained_by_pose)
+    return 1 / math.sqrt(information) if information > 0 else math.inf
 
 
 def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
@@ -148,15 +148,15 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     centre, size = pixels.mean(0), float(pixels.std()) or 1.0
     targets = (pixels - centre) / size
     zero = np.zeros_like(local)
-    # equations of the camera's entries that are 0 if a point projects to the column, and the row, of its pixel
-    across = np.concatenate([local, zero, -targets[:, :1] * local], 1)
-    down = np.concatenate([zero, local, -targets[:, 1:] * local], 1)
+    # two linear equations of the camera for each point; they hold if the point projects to x, and to y, of its pixel
+    of_x = np.concatenate([local, zero, -targets[:, :1] * local], 1)
+    of_y = np.concatenate([zero, local, -targets[:, 1:] * local], 1)
     weights = np.ones(len(points))
     camera, error = np.zeros((3, local.shape[1])), np.full(len(points), np.inf)
     projective_rounds = 8  # number of rounds of reweighted least squares
     smallest_error = 1e-6  # added to errors and depths; unit: standard deviation of the pixels
     for _ in range(projective_rounds):
-        equations = np.concatenate([across * weights[:, None], down * weights[:, None]])
+        equations = np.concatenate([of_x * weights[:, None], of_y * weights[:, None]])
         camera = eigh(matmul(equations.T, equations))[1][:, 0].reshape(3, -1)
         projected = matmul(local, camera.T)
         with np.errstate(all="ignore"):
@@ -179,7 +179,7 @@ def _whiten(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
     homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
     values, axes = eigh(matmul(homogeneous.T, homogeneous))
-    # Second moment of an axis, divided by the largest one; below this, points lie in a plane across the axis
+    # if the second moment along an axis is below this share of the largest, the points lie in a plane across the axis
     flatness = 1e-10
     used = values > flatness * values[-1]  # points in a plane or on a line do not determine the other axes
     basis = axes[:, used] / np.sqrt(values[used])

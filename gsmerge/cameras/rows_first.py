@@ -2,7 +2,7 @@
 
 Rows in plain order determine the pose of each view. They are recognised if one similarity moves the file's cameras to
 these poses. If some pixels may have no row, the rows are followed through the pixels, in each frame that exporters use.
-Rows that are in neither order get cameras alone, which are chosen by the colours of the photos.
+Other rows have no pixels, and only their cameras are chosen, by the colours of the photos.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class RowSource:
 
     @property
     def size(self) -> Size | None:
-        """(width, height) of the photos; None without any."""
+        """Width and height of the photos; None without photos."""
         return photo_size(self.photos)
 
     @cached_property
@@ -68,11 +68,11 @@ class RowSource:
 
     @cached_property
     def own_cameras(self) -> CameraFile | None:
-        """Cameras that are estimated from the rows alone; None if the rows are no grid."""
+        """Cameras that are estimated from the rows alone; None if the rows do not form a grid."""
         return estimate_cameras(Path(self.ply.info.path), self.ply.gaussians.means, self.ply.valid)
 
     def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
-        """Return rows, cameras and photos at the size of a grid; without ``photos`` if only positions matter."""
+        """Return rows, cameras and photos at the size of a grid. If ``photos`` is False, photos are left out."""
         images = NO_IMAGES
         if photos:
             images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
@@ -101,9 +101,9 @@ class Recovery:
 
 @dataclass(frozen=True, eq=False)
 class AlignmentResult:
-    """Result of :func:`align`: the pixel of every row, or for rows without pixels the cameras that see them."""
+    """Result of :func:`align`: the pixel of every row if rows have pixels, and the cameras that see them."""
 
-    # ``[n]`` int64, the pixel ``(view·H + y)·W + x`` of each row, -1: none; None if the rows belong to no pixels
+    # ``[n]`` int64, the pixel ``(view·H + y)·W + x`` of each row, -1 for a row without a pixel; None if no row has one
     pixel_ids: np.ndarray | None
     cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
     images: np.ndarray  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32; [0,...] without any
@@ -112,10 +112,11 @@ class AlignmentResult:
     transform: PhotoTransform | None = None  # applied to the photos
     recovery: Recovery | None = None  # where the pixels of the rows lie; None without pixels
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
-    # ``[c,4,4]`` poses that photos confirm, to which views are to be moved with their Gaussians; None without any
+    # ``[c,4,4]`` poses as read, to which views have to move with their Gaussians, because photos confirm these poses;
+    # otherwise None
     confirmed_viewmats: np.ndarray | None = None
-    problem: str | None = None  # why the rows belong to no pixels; None if they do
-    # If rows are no pixels of these cameras, but are a grid by themselves: the number of its views; otherwise 0
+    problem: str | None = None  # why the rows have no pixels; None if they have
+    # Number of views of the grid that the rows form alone, if the rows are not the pixels of these cameras; otherwise 0
     own_views: int = 0
 
 
@@ -167,7 +168,7 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     if source.order == "none":
         return None
     count, num_pixels = len(source.ply.gaussians), len(grid.cameras) * math.prod(grid.size)
-    layout, layers = Layout(len(grid.cameras), *grid.size), count // num_pixels
+    layout, layers = Layout(len(grid.cameras), *grid.size), count // num_pixels  # layers: whole rows per pixel
     if source.camera_file.pixel_ids is not None:
         layouts = [replace(layout, ids=source.camera_file.pixel_ids)]
     elif count != layers * num_pixels or source.order == "view-fastest":  # some pixels may have no row
@@ -180,7 +181,7 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     else:  # several Gaussians of a pixel follow each other, or there are several layers of all pixels
         rows = np.arange(count)
         layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
-    # finite rows that are needed: this number or this share of all rows, whichever is smaller
+    # at least min_rows have to be finite, or min_share of all rows if that is less
     min_rows, min_share = 24, 0.05
     if int(source.ply.valid.sum()) < min(min_rows, min_share * count):
         return None
@@ -190,26 +191,30 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
 def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | None:
     """Find cameras under which rows lie in the pixels of a layout; None if there are none.
 
-    The cameras of the grid are tried as stored, then in another frame or convention, and last each moved to its rows.
+    The cameras of the grid are tried as stored, and then in another frame or convention. At last each camera is moved
+    to its rows.
     """
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(layout)
     shuffled = replace(pairs, pixels=np.random.default_rng(0).permutation(pairs.pixels))
 
     def accept(grid: Grid, frame: Similarity, limit: float) -> Recovery | None:
-        """Return the result for a frame; None if a view's median distance from the pixels is above ``limit`` pixels."""
+        """Return the result for a frame; None if rows do not lie in their pixels.
+
+        ``limit`` is the largest median distance of a view's rows from their pixels.
+        """
         cameras = frame.move_cameras(grid.cameras)
         alignment = check_pairs(pairs, cameras)
         far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
         is_near = pixel_errors(pairs, cameras) <= max_correctable_px(*grid.size)
         min_share = 0.75  # least share of rows near their pixels; with less, one of two layers belongs to other views
-        is_right = (
+        rows_lie_in_pixels = (
             alignment.ok
             and alignment.worst_px <= limit
             and median(pixel_errors(shuffled, cameras)) >= far_px
             and (layout.ids is None or float(is_near.mean()) >= min_share)
         )
-        return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if is_right else None
+        return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if rows_lie_in_pixels else None
 
     usual = exporter_frames(grid.cameras, source.scale)[0]
     if recovery := accept(grid, usual, _PLAIN_PX):
@@ -218,7 +223,7 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
     if len(solved) == len(grid.cameras):
         poses = np.stack([solved[view] for view in range(len(solved))])
         solved_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
-        rounding_px = 0.1  # the file's cameras may fit worse than solved poses by this, since files round numbers
+        rounding_px = 0.1  # cameras of the file may be worse than solved poses by this, since files round numbers
         limit = max(AS_NEAR * solved_px, solved_px + rounding_px)
         for other in _list_conventions(source, grid):
             frame = fit_frame(other.cameras, poses, source.scale)
@@ -228,16 +233,17 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
 
 
 def _list_conventions(source: RowSource, grid: Grid) -> Iterator[Grid]:
-    """Yield the grid with its poses as stored, then with its poses in each other convention."""
+    """Yield the grid with its poses as stored, and then with its poses as read in each other convention."""
     yield grid
     for poses in other_conventions(source.camera_file.viewmats, source.camera_file.convention):
         yield with_poses(grid, poses)
 
 
 def _move_to_rows(source: RowSource, grid: Grid, layout: Layout) -> Grid:
-    """Return a grid whose inexact cameras are moved to show rows in their pixels; the same grid if they are too far.
+    """Return a grid whose inexact cameras are moved to show rows in their pixels.
 
-    If photos confirm the poses as read, the new grid has these as ``confirmed_viewmats``.
+    If the cameras are too far off, the same grid is returned. If photos confirm the poses as read, the new grid has
+    these poses as ``confirmed_viewmats``.
     """
     inputs = source.inputs(grid, photos=False)
     moved_gaussians = 2000  # Gaussians of a view that its moved pose is solved from
@@ -255,9 +261,9 @@ def _move_to_rows(source: RowSource, grid: Grid, layout: Layout) -> Grid:
 
 
 def _follow_order(source: RowSource, grid: Grid, frames: Iterable[Similarity]) -> Recovery | None:
-    """Find the pixels of rows that are in the order of the pixels, where some pixels have no row; None if they are not.
+    """Find the pixels of rows in the order of the pixels, if some pixels have no row; None for rows in another order.
 
-    Each of ``frames`` is tried. Either the rows of a view follow each other, or the rows of one pixel in all views do.
+    Each of ``frames`` is tried, with both orders: view by view, and pixel by pixel with the rows of all views.
     """
     rows = np.flatnonzero(source.ply.valid)
     if len(rows) > len(grid.cameras) * math.prod(grid.size) or len(rows) * len(grid.cameras) > _MOST_PLACES:
@@ -278,7 +284,7 @@ def _follow_order(source: RowSource, grid: Grid, frames: Iterable[Similarity]) -
 
 
 def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
-    """Yield the frames of exporters, and the frame that moves cameras to where the rows alone show them."""
+    """Yield the frames of exporters, and then the frame in which the cameras fit cameras estimated from the rows."""
     yield from exporter_frames(grid.cameras, source.scale)
     if source.own_cameras is not None and len(source.own_cameras) == len(grid.cameras):
         yield fit_frame(grid.cameras, source.own_cameras.viewmats, source.scale)
@@ -287,7 +293,8 @@ def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
 def _follow_pixels(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
     """Find the pixels ``[n]`` of rows in the order of the pixels; None for rows in another order.
 
-    A few rows may have no pixel, -1. ``mixed``: the rows of one pixel in all views follow each other.
+    A few rows may have no pixel, which is -1. If ``mixed`` is True, the rows of one pixel in all views follow each
+    other.
     """
     matrices = np.ascontiguousarray(cameras.viewmats, np.float64), np.ascontiguousarray(cameras.Ks, np.float64)
     ids = None
@@ -316,10 +323,10 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     refuse_other_cameras(inputs, source.camera_file)
     if source.scale is not None:
         grid = replace(grid, cameras=scale_by(source.scale).move_cameras(grid.cameras))
-    no_pixels, more_notes = no_pixels_error(source.ply.info, grid.cameras), list[str]()
+    no_pixels, notes_on_choice = no_pixels_error(source.ply.info, grid.cameras), list[str]()
     rotation = upright_rotation(inputs)
     if rotation is None:
-        place, more_notes = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)
+        place, notes_on_choice = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)
     else:
         upright = solve_upright(inputs, rotation, source.ply.info.path)
         place = PlacedGrid(grid, upright, "photos' colours")
@@ -329,7 +336,7 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
         if recovery is not None:  # the rows alone did not show their scale, but the photos did
             return _make_result(source, recovery)
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
-    notes = (*place.notes(source.camera_file.convention), *more_notes)
+    notes = (*place.notes(source.camera_file.convention), *notes_on_choice)
     return AlignmentResult(
         pixel_ids=None,
         cameras=cameras,
@@ -344,12 +351,14 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
 
 def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
     """Make the result for rows that are pixels, with cameras and poses in the frame of the Gaussians."""
-    place, grid, usual = recovery.place, recovery.place.grid, source.camera_file
-    inputs, notes, confirmed = source.inputs(grid), place.notes(usual.convention), grid.confirmed_viewmats
+    place, grid, camera_file = recovery.place, recovery.place.grid, source.camera_file
+    inputs, notes, confirmed = source.inputs(grid), place.notes(camera_file.convention), grid.confirmed_viewmats
     free_pages(vars(inputs.gaussians).values())  # the search has read all rows
-    if usual.source == ESTIMATED:
-        separate = len(set(map(bytes, usual.Ks))) > 1
-        subject = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
+    if camera_file.source == ESTIMATED:
+        focals_differ = len(set(map(bytes, camera_file.Ks))) > 1
+        subject = (
+            "poses, and focal lengths that differ between the views," if focals_differ else "poses and focal length"
+        )
         notes.append(f"{NO_CAMERAS_USED}: {subject} are estimated from the Gaussians' own grid")
     return AlignmentResult(
         pixel_ids=recovery.layout.pixel_ids(),

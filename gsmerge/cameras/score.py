@@ -15,13 +15,13 @@ from gsmerge.runtime.memory import free_pages, gather
 from gsmerge.types import Cameras, Gaussians, Scene
 
 SHUFFLED_MARGIN = 5.0  # factor by which Gaussians must be nearer to their pixels than to shuffled pixels
-# Two medians of some 400 distances differ by chance. The standard error of a median distance in a plane is
-# 0.72 / sqrt(n) of the median, so a ratio of 1.15 is three standard errors. Files round the numbers of cameras, which
-# displaces projections by up to 0.02 pixels
+# Two medians of some 400 distances differ by chance. The median of n distances in a plane has a relative standard error
+# of 0.72 / sqrt(n), so the ratio of two medians has one of 5 %, and 1.15 is three standard errors. Files round the
+# numbers of cameras, which displaces projections by up to 0.02 pixels
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
 SCORED_GAUSSIANS, MIN_SCORED_GAUSSIANS = 6000, 60  # Gaussians of a score: in all views, and at least in each view
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
-# Largest error that moving a camera may correct: in pixels, and as a share of the side of small images
+# Moving a camera may correct an error of up to MAX_PX pixels, and of up to MAX_SHARE of the image's side
 MAX_PX, MAX_SHARE = 12.0, 0.05
 MAX_MEDIAN_PX = 1.5  # networks move a Gaussian within its pixel, and some of them a little beyond
 
@@ -42,8 +42,8 @@ class Correspondences:
 def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
     """Measure the distances ``[t]``, pixels, of projected Gaussians from their pixel centres; inf behind a camera."""
     errors = np.empty(len(pairs.views))
-    values = pairs.points, cameras.viewmats, cameras.Ks, pairs.pixels
-    points, viewmats, Ks, pixels = (np.ascontiguousarray(array, np.float64) for array in values)
+    inputs = pairs.points, cameras.viewmats, cameras.Ks, pairs.pixels
+    points, viewmats, Ks, pixels = (np.ascontiguousarray(array, np.float64) for array in inputs)
     reproject.pixel_errors(points, np.ascontiguousarray(pairs.views, np.int64), viewmats, Ks, pixels, errors)
     return errors
 
@@ -62,7 +62,7 @@ class AlignmentInput:
     def pairs(self, layout: Layout, per_view: int = 0) -> Correspondences:
         """Return about ``per_view`` valid rows of each view of a layout, with their pixels and views.
 
-        ``per_view`` 0: as many as a score needs.
+        If ``per_view`` is 0, as many rows are returned as a score needs.
         """
         per_view = per_view or max(MIN_SCORED_GAUSSIANS, SCORED_GAUSSIANS // layout.views)
         return find_correspondences(self.gaussians.means, self.valid, layout, per_view)
@@ -94,27 +94,27 @@ class Alignment:
 
     @property
     def middle_px(self) -> float:
-        """Median of the views' median distances, pixels."""
+        """Median over the views, of their median distances in pixels."""
         return float(lower_median(np.array([px for px in self.median_px if not math.isnan(px)] or [math.inf])))
 
     @property
     def worst_px(self) -> float:
-        """Largest of the views' median distances, pixels."""
+        """Largest median distance of a view, in pixels."""
         return max((px for px in self.median_px if not math.isnan(px)), default=math.nan)
 
 
 def is_as_near(px: float, least: float) -> bool:
-    """Return True if a median distance, pixels, equals the least distance up to chance and rounding."""
+    """Return True if a median distance is as small as the ``least`` one, apart from chance and rounding; in pixels."""
     return px <= max(AS_NEAR * least, least + AS_NEAR_PX)
 
 
 def pixel_limit(width: int, height: int) -> float:
-    """Return the largest median distance, pixels, at which Gaussians count as lying in their pixels."""
+    """Return the largest median distance, in pixels, at which Gaussians count as lying in their pixels."""
     return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
 
 
 def max_correctable_px(width: int, height: int) -> float:
-    """Return the largest median error, pixels, that moving a camera may correct."""
+    """Return the largest median error, in pixels, that moving a camera may correct."""
     return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
 
 

@@ -19,26 +19,28 @@ from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Cameras, Gaussians
 
-# Colour error, divided by the colour error of shuffled pixels. Above this share colours agree no better than at random
+# Colour error, divided by the colour error of shuffled pixels, above which colours agree no better than at random
 RANDOM_SHARE = 0.85
-# Least score of another convention, divided by that of the usual one: with colours in the score, and without
+# Least score of another convention, divided by the score of the usual one. _MARGIN is for scores without colours
 _COLOR_MARGIN, _MARGIN = 1.3, 2.0
 _FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the cameras as they are
-_SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to count those that cameras see
-# Gaussians compared in other conventions and frames. With so many, scores have an error of 0.4 %. Scores that matter
-# differ by 5 % or more
+_SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to estimate the share that cameras see
+# Gaussians that are compared in other conventions and frames. So many give scores an error of 0.4 %, while the scores
+# of two frames have to differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
 MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
-# Largest depth of a foremost Gaussian, divided by the least depth in its cell; and mean number of Gaussians per cell
+# A Gaussian is foremost up to _FRONT times the least depth in its cell. A cell has _PER_CELL Gaussians on average
 _FRONT, _PER_CELL = 1.05, 3
-# Scales of the cameras' positions, tried in turn; the units of programs differ by factors of up to 1000
+# Scales of the cameras' positions, all of which are tried. Programs that write cameras and Gaussians use units that
+# differ by factors of up to 1000
 _SCALES = np.geomspace(1 / 1300, 1300, 115)
-# Finer searches around the best scale: range (natural logarithm), steps, Gaussians
+# Finer searches around the best scale: largest change (natural logarithm), number of scales, and number of Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
-# Places in a picture at which the middle of the Gaussians is tried, to find a shift: x in widths, y in heights, and the
-# logarithm of the depth in radii of the scene. Steps are a tenth of a picture, over which colours still agree
+# Places in a picture at which the middle of the Gaussians is tried, to find a shift. A place is x in widths of the
+# picture, y in heights, and the logarithm of the depth in radii of the scene. Over a step of a tenth of a picture,
+# colours still agree
 _PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
-# Searches around the best places: number of Gaussians, number of places that are kept, and size of a step
+# Finer searches around the best places: number of Gaussians, number of places that are kept, and size of a step
 _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
 
 
@@ -56,7 +58,7 @@ class CameraCheck:
 
     @property
     def score(self) -> float:
-        """Score in [0, 1] to rank cameras: the share seen, times 1 minus the colour ratio if that is known."""
+        """Score in [0, 1] to rank cameras. It is the share seen; if colours are known, times 1 minus their ratio."""
         return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
 
     @property
@@ -84,7 +86,8 @@ def check_cameras(
     colours of hidden Gaussians do not count. ``hiding`` are further points ``[m,3]`` that hide Gaussians, but have no
     colours themselves.
     """
-    min_gaussians, max_projected = 200, 4_000_000  # least number of Gaussians, and largest product with the cameras
+    # fewer Gaussians are measured if there are so many cameras that more than max_projected points would be projected
+    min_gaussians, max_projected = 200, 4_000_000
     samples = min(samples, max(min_gaussians, max_projected // len(cameras)))
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
@@ -92,6 +95,7 @@ def check_cameras(
     if hiding is not None:
         points = np.concatenate([points, hiding[:: max(1, len(hiding) // samples)]])
     colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
+    # points that lie inside a view, and points whose colours are compared
     visible, compared = np.zeros((2, len(points)), bool)
     errors, shuffled_errors = list[np.ndarray](), list[np.ndarray]()
     rng = np.random.default_rng(0)
@@ -161,9 +165,11 @@ def choose_poses(
 ) -> tuple[PosesInConvention | None, CameraCheck, str | None]:
     """Choose the pose convention in which the cameras see most Gaussians and the colours fit best.
 
-    ``cameras`` are in the usual ``convention``; for the other arguments see :func:`check_cameras`. Returns three
-    results: the poses in another convention, or None if none is clearly better than the usual one; the check of the
-    chosen poses; and a note, if another convention fits the photos as well, or None.
+    ``cameras`` are in the usual ``convention``. The other arguments are those of :func:`check_cameras`. Returns:
+
+    - the poses in another convention; None if no other convention is clearly better than the usual one
+    - the check of the chosen poses
+    - a note that another convention fits the photos as well; None if no other convention does
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
@@ -190,17 +196,16 @@ def choose_cameras(
     """Choose the cameras that see the Gaussians: unchanged, in another frame, or in another convention.
 
     ``frames`` are the frames that a file gives, which are tried first. The usual frames of exporters are tried next.
-    Returns the grid with these cameras, and notes. The error ``no_pixels`` explains why the rows have no pixels. It is
-    raised, with what was tried, if no cameras see the Gaussians.
+    Returns the grid with these cameras, and notes. The error ``no_pixels`` explains why the rows have no pixels. If no
+    cameras see the Gaussians, it is raised, and also says what was tried.
     """
     rows, unchanged = (inputs.gaussians, inputs.valid), PlacedGrid(grid, IDENTITY)
     if frames:
-        checks = [
-            check_cameras(*rows, frame.move_cameras(inputs.cameras), inputs.images) for frame in (IDENTITY, *frames)
-        ]
-        best = int(np.argmax([check.score * check.ok for check in checks]))
-        if best > 0:
-            return replace(unchanged, frame=frames[best - 1]), []
+        tried = (IDENTITY, *frames)
+        checks = [check_cameras(*rows, frame.move_cameras(inputs.cameras), inputs.images) for frame in tried]
+        best = tried[int(np.argmax([check.score * check.ok for check in checks]))]
+        if best is not IDENTITY:
+            return replace(unchanged, frame=best), []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
     frame = _choose_frame(inputs, check)
     if frame is not None:
@@ -235,11 +240,11 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels
 
 
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
-    """Choose a frame in which the colours fit the photos clearly better than in the frame of the cameras; else None.
+    """Choose a frame in which the colours fit the photos clearly better than in the frame of the cameras.
 
-    The frames are those of exporters. ``usual`` is the check of the cameras as they are. Colours fit best at the true
-    scale, so the chosen frame must fit better than the same frame at nearby scales. If no frame does so at the scale of
-    the cameras, the scale is solved for.
+    Returns None if there is no such frame. The frames of exporters are tried. ``usual`` is the check of the cameras as
+    they are. Colours fit best at the true scale, so the chosen frame must fit better than the same frame at nearby
+    scales. If no frame does at the scale of the cameras, the scale is solved for.
     """
     if not len(inputs.images):
         return None
@@ -248,7 +253,7 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     stands_out = _stands_out(inputs, best, score)
     # views without a photo are black; a single photo fits somewhere in any scene
     if inputs.scale is None and not stands_out and inputs.images.any((1, 2, 3)).sum() > 1:
-        # rotated into the first camera, turned to y up, and moved into the first camera
+        # frames of `exporter_frames`: rotated into the first camera, turned to y up, and moved into the first camera
         solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
         best, score = _best_frame(inputs, [best, *solved, *([] if usual.ok else _solve_shift(inputs))])
         stands_out = _stands_out(inputs, best, score)
@@ -259,7 +264,7 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
 
 
 def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
-    """Return the score of the cameras in a frame, see :class:`CameraCheck`; 0 if the photos do not decide."""
+    """Return the score of the cameras in a frame, see :class:`CameraCheck`; 0 if colours cannot be compared."""
     # the first camera is left out, because it may see all Gaussians at any scale
     later = slice(1 if len(inputs.cameras) > 1 else 0, None)
     cameras = frame.move_cameras(inputs.cameras)[later]
@@ -270,7 +275,7 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMP
 def _best_frame(
     inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
 ) -> tuple[Similarity, float]:
-    """Return the frame with the highest score, the first one of equals, and its score."""
+    """Return the first frame with the highest score, and this score."""
     scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
     return max(scored, key=lambda frame_and_score: frame_and_score[1])
 
@@ -284,7 +289,7 @@ def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool
 
 
 def _scale_frame(frame: Similarity, factor: float) -> Similarity:
-    """Return a frame whose scale is ``factor`` times that of ``frame``, about the origin of the Gaussians."""
+    """Return a frame scaled by ``factor``, about the origin of the Gaussians."""
     scale = factor * frame.scale
     text = f"positions scaled by {scale:.4g} (--hint scene_scale={scale:.4g})"
     name = frame.description.partition("positions scaled")[0].removesuffix(", ")
@@ -293,31 +298,32 @@ def _scale_frame(frame: Similarity, factor: float) -> Similarity:
 
 
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
-    """Return a frame at the scale at which its colours fit the photos best; the steps of the search become smaller.
+    """Return a frame at the scale at which its colours fit the photos best.
 
-    The search begins where the score exceeds the scores two steps away most, not where it is highest. Far from the true
-    scale all cameras may be in one place, and scores there may be high, but equal.
+    All scales of _SCALES are tried. Finer searches begin where the score stands out most from the scores two steps
+    away. This need not be the highest score. Far from the true scale all cameras may be in one place, so that scores
+    are high, but equal.
     """
     scaled = [_scale_frame(frame, float(scale)) for scale in _SCALES]
     scale_gaussians = 2000  # Gaussians that the scales are tried on
     scores = np.array([_score_frame(inputs, candidate, scale_gaussians) for candidate in scaled])
-    best = scaled[2 + int(np.argmax(scores[2:-2] - np.maximum(scores[:-4], scores[4:])))]
-    for reach, steps, samples in _FINER:
-        factors = exp(np.linspace(-reach, reach, steps))
+    two_steps_away = np.maximum(scores[:-4], scores[4:])
+    best = scaled[2 + int(np.argmax(scores[2:-2] - two_steps_away))]
+    for max_change, num_scales, samples in _FINER:
+        factors = exp(np.linspace(-max_change, max_change, num_scales))
         best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
     return best
 
 
 def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
-    """Solve for a shift of the cameras at which the photos show the Gaussians; return a list with its frame.
+    """Solve for a shift of the cameras with which the photos show the Gaussians; return a list of one frame, or none.
 
-    The list is empty if there is no such shift. The middle of the Gaussians is looked for in the picture of the middle
-    camera, at many depths.
+    The middle of the Gaussians is searched in the picture of the middle camera, at many depths.
     """
-    # views that shifts are tried on; Gaussians of the first search, and places that it keeps
-    max_views, first_samples, first_places = 4, 300, 8
-    even = slice(None, None, -(-len(inputs.cameras) // max_views))
-    rows, cameras, images = (inputs.gaussians, inputs.valid), inputs.cameras[even], inputs.images[even]
+    max_views = 4  # views that shifts are tried on
+    first_samples, first_places = 300, 8  # number of Gaussians of the first search, and of places that it keeps
+    some_views = slice(None, None, -(-len(inputs.cameras) // max_views))
+    rows, cameras, images = (inputs.gaussians, inputs.valid), inputs.cameras[some_views], inputs.images[some_views]
     to_world = invert(cameras.viewmats)
     centres, points = to_world[:, :3, 3], inputs.gaussians.means[inputs.valid].astype(np.float64)
     view = int(np.argmin(np.linalg.norm(centres - np.median(centres, 0), axis=1)))
@@ -339,7 +345,7 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
     places = sorted(product(*_PLACES), key=lambda place: -score(place, first_samples))
     best: list[tuple[float, ...]] = places[:first_places]
     for samples, count, step in _SHIFT_STEPS:
-        # by a step in both directions of each axis of a place
+        # each place itself, and one step along each axis in both directions
         offsets = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
         around = {tuple((place + offset).tolist()) for place in best for offset in offsets}
         best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]

@@ -1,11 +1,11 @@
 """Solve for the frame of rows that an exporter of the pixelSplat family centred, rescaled and turned upright.
 
 The exporter subtracts the median, divides by the 95 % quantile of the widest axis and rotates the world upright from
-the first camera. It saves none of these. Often the rows do not determine their cameras, because views were fused
-(FreeSplat), because layers of a pixel have gaps, or because so many far pixels were cut that no lines repeat. But the
-file is recognised by its median and quantile, so the rotation is known. Scale and shift are solved for from rows whose
-pixels are found by colours. A stretch of rows without a gap has the colours of a stretch of pixels of a photo.
-Stretches that agree on one frame are right, and all other matches are wrong.
+the first camera. It saves none of these. Often the rows do not determine their cameras: views may be fused (FreeSplat),
+layers of a pixel may have gaps, or so many far pixels may be cut that no lines repeat. But the file is recognised by
+its median and quantile, so the rotation is known. Scale and shift are solved for from rows whose pixels are found by
+colours. A stretch of rows without a gap has the colours of a stretch of pixels of a photo. Stretches that agree on one
+frame are right, and all other matches are wrong.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class _Stretch:
     view: int
     start: int  # first row
     step: int  # from one row to the next
-    # its first row is searched at these places among the pixels of a photo
+    # the first row is searched among the pixels of a photo from index low to index high
     low: int
     high: int  # exclusive
 
@@ -44,7 +44,7 @@ class _Stretch:
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Return the rotation by which rows were turned upright from a camera; None if no camera explains them."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
-    # rows of a first check, and its tolerance while the rotation is still unknown
+    # a first check uses rough_rows, and allows rough_tolerance as long as the rotation is unknown
     rough_rows, rough_tolerance = 2000, 1.0
     sample = means[:: max(1, len(means) // rough_rows)]
     if not len(sample) or _measure_deviation(sample) > rough_tolerance:
@@ -62,15 +62,19 @@ def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
 
 
 def _measure_deviation(points: np.ndarray) -> float:
-    """Measure how far the median of points ``[n,3]`` is from 0, or their quantile from 1, whichever is farther."""
+    """Measure how far points ``[n,3]`` are from a median of 0 and a quantile of 1; return the larger difference."""
     widest_quantile = 0.95  # this quantile of the distances along the widest axis is 1 in these files
     quantile = float(np.quantile(np.abs(points), widest_quantile, axis=0).max())
     return max(float(np.abs(np.median(points, 0)).max()), abs(quantile - 1))
 
 
 def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Similarity:
-    """Solve for the frame of upright rows from their colours in the photos; SceneError if too few stretches agree."""
-    for pixels, stretches in _possible_orders(len(inputs.gaussians), inputs.cameras) if len(inputs.images) else ():
+    """Solve for the frame of upright rows from their colours in the photos.
+
+    Raises SceneError if too few stretches agree.
+    """
+    orders = _possible_orders(len(inputs.gaussians), inputs.cameras) if len(inputs.images) else ()
+    for pixels, stretches in orders:
         frame = _solve_agreed_frame(inputs, *_match_stretches(inputs, stretches, pixels), rotation)
         if frame is not None:
             return frame
@@ -85,8 +89,10 @@ def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Si
 def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Stretch]]]:
     """Yield the orders that ``count`` rows may have.
 
-    An order is a pair: the pixels ``[p]`` of a photo that have rows, and the stretches of rows to search among them.
+    Each order is given by the pixels ``[p]`` of a photo that have rows, and by the stretches of rows that are searched
+    among these pixels.
     """
+    # exporters of interleaved rows cut off a border
     grid, trim = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), TRIMS[0]
     trimmed, whole = grid[trim:-trim, trim:-trim].reshape(-1), grid.reshape(-1)
     per_pixel_counts = (1, 2, 3)  # possible numbers of Gaussians of a pixel
@@ -108,9 +114,12 @@ def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: i
     dropped = num_pixels * step - count
     if not (0 <= dropped < count and count >= _LENGTH * step):
         return []
-    starts = np.unique(np.linspace(0, count - _LENGTH * step, _STRETCHES).astype(int))
-    bounds = [(int(start), start // step - _SLACK, (start + dropped) // step + _SLACK) for start in starts]
-    return [_Stretch(view, start, step, low, high) for start, low, high in bounds for view in range(views)]
+    starts = np.unique(np.linspace(0, count - _LENGTH * step, _STRETCHES).astype(int)).tolist()
+    return [
+        _Stretch(view, start, step, start // step - _SLACK, (start + dropped) // step + _SLACK)
+        for start in starts
+        for view in range(views)
+    ]
 
 
 def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
@@ -122,29 +131,28 @@ def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
     if not num_parts * _LENGTH <= count < views * num_pixels:
         return []
     starts = np.unique(np.linspace(0, count // num_parts, _STRETCHES).astype(int)).tolist()
-    first_view = [_Stretch(0, start, 1, start - _SLACK, num_pixels) for start in starts]
-    last_view = [
-        _Stretch(views - 1, count - _LENGTH - start, 1, 0, num_pixels - start - _LENGTH + _SLACK) for start in starts
-    ]
+    first_view = [_Stretch(0, start, 1, low=start - _SLACK, high=num_pixels) for start in starts]
+    last_starts = [count - _LENGTH - start for start in starts]  # at the same distances from the last row
+    last_view = [_Stretch(views - 1, last, 1, low=0, high=last - count + num_pixels + _SLACK) for last in last_starts]
     return first_view + last_view
 
 
 def _match_stretches(
     inputs: AlignmentInput, stretches: Sequence[_Stretch], pixels: np.ndarray
 ) -> tuple[Correspondences, np.ndarray]:
-    """Search for stretches in the photos; return a sample of the rows of those that match, and the stretch of each row.
+    """Search for stretches in the photos; return sampled rows of stretches that match, and the stretch of each row.
 
-    A stretch matches if a single place of its photo has nearly the colours of its rows. The rows are returned with
-    their pixels. The stretches ``[t]`` are numbered among those that match.
+    A stretch matches if only one place in its photo has nearly the colours of its rows. The t rows are returned with
+    their pixels. The stretch of a row is its number among the stretches that match.
     """
     rows = np.array([stretch.start + stretch.step * np.arange(_LENGTH) for stretch in stretches])
-    places, sums, next_sums = _place_stretches(inputs, stretches, rows, pixels).T
+    places, costs, second_costs = _place_stretches(inputs, stretches, rows, pixels).T
     places = places.astype(int)
-    max_cost = 9.0  # largest distance of a stretch, divided by the lower quartile of all distances
-    min_cost = 1e-3  # distances below this count as equal
-    is_near = sums <= max_cost * max(min_cost, float(np.quantile(sums, 0.25)))
-    min_ratio = 1.2  # least distance of a stretch at its second-best place, divided by the distance at its best place
-    matched = np.flatnonzero(is_near & (next_sums > min_ratio * np.maximum(sums, min_cost)))
+    max_cost = 9.0  # largest cost of a stretch that matches, divided by the lower quartile of all costs
+    min_cost = 1e-3  # costs below this count as equal
+    is_near = costs <= max_cost * max(min_cost, float(np.quantile(costs, 0.25)))
+    min_ratio = 1.2  # least cost of a stretch at its second-best place, divided by the cost at its best place
+    matched = np.flatnonzero(is_near & (second_costs > min_ratio * np.maximum(costs, min_cost)))
     per_stretch = 12  # rows of each stretch that the frame is solved from
     sample = np.linspace(0, _LENGTH - 1, per_stretch).astype(int)
     ids = rows[matched][:, sample].reshape(-1)
@@ -160,25 +168,25 @@ def _match_stretches(
 def _place_stretches(
     inputs: AlignmentInput, stretches: Sequence[_Stretch], rows: np.ndarray, pixels: np.ndarray
 ) -> np.ndarray:
-    """Return for each stretch its place, its sum and its next sum ``[s,3]``.
+    """Return for each stretch its best place, the cost there, and the least cost elsewhere ``[s,3]``.
 
-    The place has the least sum of squared differences of colours. The next sum is the least sum at places more than two
-    pixels away. ``rows [s,l]`` are the rows of the stretches. They are searched among the ``pixels [p]`` of a photo.
+    A cost is the sum of squared differences of colours. Elsewhere means more than two pixels from the best place.
+    ``rows [s,l]`` are the rows of the stretches, which are searched among the ``pixels [p]`` of a photo.
     """
     with np.errstate(invalid="ignore"):
         colors = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1).astype(np.float32)
     places = []
-    no_place = 1e9  # distance of a stretch that cannot be in its photo
+    no_place = 1e9  # cost of a stretch that cannot be in its photo
     for stretch, stretch_rows in zip(stretches, rows, strict=True):
         low, high = max(0, stretch.low), min(len(pixels), stretch.high + _LENGTH)
         if high - low < _LENGTH:
             places.append((0, no_place, 0.0))
             continue
         shown = inputs.images[stretch.view].reshape(1, -1, 3)[:, pixels[low:high]]
-        sums = cv2.matchTemplate(shown, colors[stretch_rows][None], cv2.TM_SQDIFF)[0]
-        best = int(sums.argmin())
-        others = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
-        places.append((low + best, float(sums[best]), float(others.min(initial=no_place))))
+        costs = cv2.matchTemplate(shown, colors[stretch_rows][None], cv2.TM_SQDIFF)[0]
+        best = int(costs.argmin())
+        elsewhere = np.concatenate([costs[: max(0, best - 2)], costs[best + 3 :]])
+        places.append((low + best, float(costs[best]), float(elsewhere.min(initial=no_place))))
     return np.array(places)
 
 
@@ -191,7 +199,7 @@ def _solve_agreed_frame(
     """
     stretches = np.unique(parts)
     views = np.array([pairs.views[parts == stretch][0] for stretch in stretches])
-    # least number of views with agreeing stretches, of such stretches in each, and their share of all stretches
+    # at least min_views need min_stretches that agree, and min_agreeing is the least share of stretches that agree
     min_views, min_stretches, min_agreeing = 2, 3, 0.25
     if len(np.unique(views)) < min_views:
         return None

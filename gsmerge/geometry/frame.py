@@ -64,20 +64,21 @@ class Frame:
 def scene_frame(scene: Scene) -> Frame:
     """Choose the canonical frame by the median of the means and the median depth.
 
-    Raises ValueError without Gaussians or views.
+    The unit is the power of two that is nearest to the depth. Raises ValueError without Gaussians or views.
     """
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
     means = scene.gaussians.means[sample_rows(scene)].astype(np.float64)
     depth = scene_depth(scene)
-    mantissa, exponent = math.frexp(depth if depth > 0 and math.isfinite(depth) else 1.0)
-    return Frame(lower_median(means), math.ldexp(1.0, exponent - (mantissa < math.sqrt(0.5))))
+    mantissa, exponent = math.frexp(depth if depth > 0 and math.isfinite(depth) else 1.0)  # mantissa: 0.5 to 1
+    unit = math.ldexp(1.0, exponent if mantissa >= math.sqrt(0.5) else exponent - 1)
+    return Frame(lower_median(means), unit)
 
 
 def scene_depth(scene: Scene) -> float:
     """Measure the median depth of sampled Gaussians in their own views, or else in all views that see them.
 
-    Returns 0 if no view sees any.
+    Returns 0 if no view sees a Gaussian.
     """
     rows = sample_rows(scene)
     means = scene.gaussians.means[rows].astype(np.float64)
@@ -94,7 +95,7 @@ def scene_depth(scene: Scene) -> float:
 
 
 def sample_rows(scene: Scene) -> slice:
-    """Choose evenly spread rows of a scene; ValueError if it has none."""
+    """Choose evenly spread rows of a scene. Raises ValueError if the scene has no Gaussians."""
     count = len(scene.gaussians)
     if count == 0:
         raise ValueError("expected at least one Gaussian, got none")

@@ -46,35 +46,36 @@ def _as_float32(values: np.ndarray) -> np.ndarray:
 
 
 def scene_members(scene: Scene) -> Members:
-    """Return the Gaussians of a canonical scene as members; their footprints are sizes of pixels."""
+    """Return the Gaussians of a canonical scene as members, whose footprints are the widths of their pixels."""
     g, pixels = scene.gaussians, scene.get_pixels()
     return _make_members(g, measure_pixel_sizes(_as_float32(g.means), pixels.homes, scene.cameras), pixels)
 
 
 def measure_pixel_sizes(means: np.ndarray, homes: np.ndarray, cameras: Cameras) -> np.ndarray:
-    """Measure the width ``[n]`` of a pixel at each of ``means [n,3]``: the smallest detail that its photo shows.
+    """Measure the width ``[n]`` of a pixel at each of ``means [n,3]``, which is the smallest detail that a photo shows.
 
     ``homes [n]`` are the pixels of the means, numbered over all views; -1 for none. A width is in units of the world,
-    at the depth of the mean in the view of its pixel. For a mean without a pixel it is the smallest width of all views,
-    at its distances from their centres.
+    at the depth of the mean in the view of its pixel. For a mean without a pixel, it is the smallest of the widths in
+    all views, at the distance of the mean from the camera.
     """
-    footprints, viewmats, Ks = np.empty(len(means), np.float32), cameras.viewmats.astype(np.float32), cameras.Ks
-    focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in Ks])
+    widths, viewmats = np.empty(len(means), np.float32), cameras.viewmats.astype(np.float32)
+    focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in cameras.Ks])
 
-    def measure_footprints(start: int) -> None:
+    def measure_widths(start: int) -> None:
+        """Measure the width of a pixel at some of the means, as if all had a pixel."""
         rows = slice(start, start + FOOTPRINT_ROWS)
         views = homes[rows] // (cameras.height * cameras.width)
         depths = np.abs(camera_depths(means[rows], viewmats, views))
-        footprints[rows] = np.maximum(depths, np.float32(1e-6)) / focals.astype(np.float32)[views]
+        widths[rows] = np.maximum(depths, np.float32(1e-6)) / focals.astype(np.float32)[views]
 
-    parallel_map(measure_footprints, range(0, len(means), FOOTPRINT_ROWS))
+    parallel_map(measure_widths, range(0, len(means), FOOTPRINT_ROWS))
     without_pixel = np.flatnonzero(homes < 0)
     if len(without_pixel):
         smallest = np.full(len(without_pixel), np.inf)
         for centre, focal in zip(cameras.centres.astype(np.float64), focals, strict=True):
             np.minimum(smallest, np.linalg.norm(means[without_pixel] - centre, axis=1) / focal, out=smallest)
-        footprints[without_pixel] = np.maximum(smallest, 1e-6)
-    return footprints
+        widths[without_pixel] = np.maximum(smallest, 1e-6)
+    return widths
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray) -> Members:
@@ -107,19 +108,19 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
 
     ``ids [m]`` int32 are rows of ``members``, group after group. ``starts [g+1]`` int64 are the starts of the groups in
     ``ids``. The ``rule`` ``"depth"`` adds the members' own covariances to the covariance of their means, and sums their
-    integrated optical depths. ``"paper"`` is the paper's moment matching (eq. teacher_mean, teacher_cov). The paper
-    states no opacity, so the mean opacity of the members is used.
+    integrated optical depths. The rule ``"paper"`` is the paper's moment matching (eq. teacher_mean, teacher_cov). The
+    paper states no opacity, so the mean opacity of the members is used.
     """
     num_groups = len(starts) - 1
     pooled = np.zeros((num_groups, POOLED_COLUMNS))
     sh = np.zeros((num_groups, 1 + members.shN.shape[1], 3), np.float32)
 
     def pool_groups(begin: int) -> None:
+        """Pool some of the groups into the arrays ``pooled`` and ``sh``."""
         end = min(begin + ROWS_PER_TASK, num_groups)
-        m = members
         pool(
-            starts[begin : end + 1], ids, m.means, m.quats, m.scales, m.opacities, m.sh0, m.shN, m.footprints,
-            rule == "depth", pooled[begin:end], sh[begin:end],
+            starts[begin : end + 1], ids, members.means, members.quats, members.scales, members.opacities,
+            members.sh0, members.shN, members.footprints, rule == "depth", pooled[begin:end], sh[begin:end],
         )  # fmt: skip
 
     parallel_map(pool_groups, range(0, num_groups, ROWS_PER_TASK))

@@ -22,8 +22,8 @@ from gsmerge.values.arrays import Array
 
 DescentState = TypeVar("DescentState")  # state that a descent changes
 SH_DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
-# The median of more than FEW_VALUES values is taken only of values near it. These lie between the two quantiles
-# AROUND_MEDIAN of a sample of about SAMPLE_VALUES values. The median is practically always between these quantiles
+# To find the median of more than FEW_VALUES values, only the values between two quantiles of a sample are ordered.
+# AROUND_MEDIAN are these quantiles, and SAMPLE_VALUES is about the size of the sample
 FEW_VALUES, SAMPLE_VALUES, AROUND_MEDIAN = 1 << 17, 1 << 14, (0.47, 0.53)
 NORMAL_SPREAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
 NEAREST_ROWS = 1 << 14  # points per task of a search for the nearest ones
@@ -90,7 +90,7 @@ def project(means: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray
     Returns positions ``[c,n,2]`` in pixels, with pixel centres at +0.5, and depths ``[c,n]`` along z. Positions of
     points with a depth of 0 or less are meaningless.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):  # behind or on the plane of a camera
+    with np.errstate(divide="ignore", invalid="ignore"):  # some points have a depth of 0
         return project_points(*(array.astype(np.float64) for array in (means, cameras.viewmats, cameras.Ks)))
 
 
@@ -129,6 +129,7 @@ def motion_matrices(vectors: np.ndarray) -> np.ndarray:
     """
     vectors = vectors.astype(np.float64)
     angles = vector_lengths(vectors[:, :3])
+    # sin(angle / 2) / angle, which tends to 0.5 for small angles
     factors = np.where(angles > 0, sin(angles / 2) / np.where(angles > 0, angles, 1), 0.5)
     motions = np.tile(np.eye(4), (len(vectors), 1, 1))
     motions[:, :3, :3] = quat_to_rotmat(np.concatenate([cos(angles / 2), factors * vectors[:, :3]], 1))
@@ -148,14 +149,15 @@ def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     quats = rotmat_to_quat(motions[:, :3, :3])
     quats *= np.where(quats[:, :1] < 0, -1, 1)  # the angle is at most half a turn
     sines = vector_lengths(quats[:, 1:])
-    stretch = np.where(sines > 0, 2 * arctan2(sines, quats[:, :1]) / np.where(sines > 0, sines, 1), 2)
-    return np.concatenate([stretch * quats[:, 1:], motions[:, :3, 3]], 1)
+    # angle / sin(angle / 2), which tends to 2 for small angles
+    factors = np.where(sines > 0, 2 * arctan2(sines, quats[:, :1]) / np.where(sines > 0, sines, 1), 2)
+    return np.concatenate([factors * quats[:, 1:], motions[:, :3, 3]], 1)
 
 
 def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[..., np.ndarray]) -> np.ndarray:
-    """Return the viewmats ``end [v,4,4]`` without the part that all motions from ``start`` have in common.
+    """Return the viewmats ``end [v,4,4]`` without the common part of all motions from ``start``.
 
-    ``middle`` computes the common part: ``np.mean`` or ``np.median``.
+    The common part is the ``middle`` of the motions, which is ``np.mean`` or ``np.median``.
     """
     common = middle(motion_vectors(start, end), axis=0)
     return matmul(end, invert(motion_matrices(common[None])))
@@ -192,7 +194,7 @@ def middle_depth(means: np.ndarray, camera: Cameras) -> float:
 
 
 def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; ``[1]`` if there are none."""
+    """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; a single 1.0 for no points."""
     depth_sample = 50_000  # points; the median depth in a view is measured on about so many
     points = means[:: max(1, len(means) // depth_sample)]
     (pixels,), (depths,) = project(points, camera)
@@ -219,50 +221,52 @@ def step_outside(
 
 def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Measure how far cameras moved between viewmats ``[v,4,4]``: angles ``[v]`` in degrees, and distances ``[v]``."""
-    # sines of half the angles
-    chords = (np.linalg.norm(end[:, :3, :3] - start[:, :3, :3], axis=(1, 2)) / np.sqrt(8)).clip(0, 1)
+    # the difference of two rotation matrices has the norm sqrt(8) * sin(angle / 2)
+    sines = (np.linalg.norm(end[:, :3, :3] - start[:, :3, :3], axis=(1, 2)) / np.sqrt(8)).clip(0, 1)
     distances = vector_lengths(camera_centres(end) - camera_centres(start))[:, 0]
-    return np.degrees(2 * arctan2(chords, np.sqrt((1 - chords) * (1 + chords)))), distances
+    return np.degrees(2 * arctan2(sines, np.sqrt((1 - sines) * (1 + sines)))), distances
 
 
 def vector_lengths(vectors: np.ndarray) -> np.ndarray:
-    """Return the lengths ``[...,1]`` of vectors ``[...,d]``; summing column by column is faster for short rows."""
-    columns = np.moveaxis(vectors * vectors, -1, 0)
+    """Return the lengths ``[...,1]`` of vectors ``[...,d]``."""
+    columns = np.moveaxis(vectors * vectors, -1, 0)  # summing column by column is faster for short vectors
     return np.asarray(np.sqrt(sum(columns, vectors.dtype.type(0))))[..., None]
 
 
 def find_nearest(points: np.ndarray, count: int, rows: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Find the ``count`` nearest other points of each of ``rows [m]``; return their rows and distances ``[m,count]``.
 
-    The nearest point comes first. There must be more than ``count`` points ``[n,3]``, all finite. ``rows`` None: all.
+    The nearest point comes first. There must be more than ``count`` points ``[n,3]``, all finite. If ``rows`` is None,
+    neighbours of all points are found.
     """
     rows = np.arange(len(points)) if rows is None else rows
     others = np.ones(len(points), bool)
     others[rows] = False
-    order = np.concatenate([rows, np.flatnonzero(others)])
-    points, ids = points[order].astype(np.float64), np.empty((len(points), count), np.int64)
+    order = np.concatenate([rows, np.flatnonzero(others)])  # the given rows come first
+    points, neighbours = points[order].astype(np.float64), np.empty((len(points), count), np.int64)
     tree, axes, splits = make_tree(points)
-    views = np.full(len(points), -1)  # -1: each point has a view of its own, so all others may be neighbours
+    no_view = np.full(len(points), -1)  # all points may be neighbours of points without a view
     distances = np.empty((len(rows), count))
 
-    def measure(start: int) -> None:
-        span = slice(start, min(start + NEAREST_ROWS, len(rows)))
-        nearest_of_others(points, views, tree, axes, splits, span.start, span.stop, len(points), ids)
-        distances[span] = np.sqrt(((points[ids[span]] - points[span, None]) ** 2).sum(2))
+    def search(start: int) -> None:
+        """Find the neighbours of a part of the given rows, and their distances."""
+        part = slice(start, min(start + NEAREST_ROWS, len(rows)))
+        nearest_of_others(points, no_view, tree, axes, splits, part.start, part.stop, len(points), neighbours)
+        distances[part] = np.sqrt(((points[neighbours[part]] - points[part, None]) ** 2).sum(2))
 
     with use_threads():
-        parallel_map(measure, range(0, len(rows), NEAREST_ROWS))
-    return order[ids[: len(rows)]], distances
+        parallel_map(search, range(0, len(rows), NEAREST_ROWS))
+    return order[neighbours[: len(rows)]], distances
 
 
 def nearest_views(centres: np.ndarray, view: int) -> np.ndarray:
-    """Return the other views ``[v-1]`` of cameras with ``centres [v,3]``; those nearest to ``view`` come first."""
+    """Return the other views ``[v-1]`` of cameras with ``centres [v,3]``, ordered by their distance from ``view``."""
     order = np.argsort(((centres - centres[view]) ** 2).sum(1), kind="stable")
     return order[order != view]
 
 
 def camera_distances(cameras: Cameras) -> np.ndarray:
-    """Return distances ``[v,v]`` of cameras: of their centres, in canonical units, plus of their directions."""
+    """Return distances ``[v,v]`` of cameras. Each is the distance of centres plus the distance of unit directions."""
     viewmats = cameras.viewmats.astype(np.float64)
     centres_and_directions = (camera_centres(viewmats), viewmats[:, 2, :3])
     differences = [vectors[:, None] - vectors[None] for vectors in centres_and_directions]
@@ -277,17 +281,17 @@ def order_others(distances: np.ndarray) -> np.ndarray:
 
 
 def median(values: np.ndarray) -> float:
-    """Return the median of all ``values``; NaN without any, or if one is NaN.
+    """Return the median of all ``values``; NaN if there are none, or if one is NaN.
 
     ``np.median`` is several times as slow.
     """
     values = values.reshape(-1)
-    if len(values) > FEW_VALUES and not np.isnan(values.min()):  # only values near the median of a sample are ordered
-        middle, sample = len(values) // 2, np.sort(values[:: len(values) // SAMPLE_VALUES])
+    if len(values) > FEW_VALUES and not np.isnan(values.min()):
+        sample = np.sort(values[:: len(values) // SAMPLE_VALUES])
         low, high = sample[[int(share * (len(sample) - 1)) for share in AROUND_MEDIAN]]
-        num_lower, near = int(np.count_nonzero(values < low)), values[(values >= low) & (values <= high)]
-        if num_lower < middle < num_lower + len(near):
-            middle -= num_lower
+        near, num_lower = values[(values >= low) & (values <= high)], int(np.count_nonzero(values < low))
+        middle = len(values) // 2 - num_lower  # index of the median in the ordered values of `near`
+        if 0 < middle < len(near):
             ordered = np.partition(near, (middle - 1, middle))
             return float(ordered[middle] if len(values) % 2 else (ordered[middle - 1] + ordered[middle]) / 2)
     return float(medians(values)) if len(values) else math.nan
@@ -312,6 +316,7 @@ def quantiles(values: np.ndarray, shares: Sequence[float]) -> np.ndarray:
     ordered = np.partition(values, [*before, *after], axis=0)
     low, high = ordered[before], ordered[after]
     steps = (places - before).reshape(-1, *[1] * (values.ndim - 1))
+    # np.quantile starts from the nearer value, which decides how results are rounded
     return np.where(steps < 0.5, low + (high - low) * steps, high - (high - low) * (1 - steps))
 
 
@@ -367,7 +372,10 @@ def apply_harmonics_rotation(shN: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def evaluate_harmonics(directions: np.ndarray, num: int) -> np.ndarray:
-    """Evaluate the higher harmonics in directions ``[d,3]``; return ``[d,num]`` float64."""
+    """Evaluate the higher harmonics in directions ``[d,3]``; return ``[d,num]`` float64.
+
+    A harmonic is the change of the colour that the kernel for drawing gives a Gaussian in this direction.
+    """
     means = directions.astype(np.float32)
     count = len(means)
     sh0 = np.full((count, 1, 3), BRIGHT_SH0)
@@ -395,23 +403,24 @@ def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
     return (rgb - 0.5) / SH_C0
 
 
-def robust_weights(errors: np.ndarray, doubt: float, least: float, sizes: np.ndarray | float = 1.0) -> np.ndarray:
+def robust_weights(errors: np.ndarray, multiple: float, least: float, units: np.ndarray | float = 1.0) -> np.ndarray:
     """Return Cauchy's weights ``[n]`` for reweighted least squares, which are small for errors far above the median.
 
-    The weights are 1 / (sizes^2 (1 + (errors / (doubt * median + least))^2)).
+    The weights are ``1 / (units^2 (1 + (errors / limit)^2))`` with ``limit = multiple * median + least``. ``units`` are
+    the units of the residuals to which the weights apply.
     """
-    return np.asarray(1 / (sizes**2 * (1 + (errors / (doubt * median(errors) + least)) ** 2)))
+    return np.asarray(1 / (units**2 * (1 + (errors / (multiple * median(errors) + least)) ** 2)))
 
 
 @dataclass(frozen=True)
 class Damping:
-    """Limits of the steps of :func:`descend`, and changes of their damping."""
+    """Limits of the steps of :func:`descend`, and how their damping changes."""
 
     steps: int  # Largest number of steps
     first: float  # Damping of the first step, a share of the curvature
-    ease: float  # Factor on the damping after a step that lowers the error
-    brake: float  # Factor on the damping after a step that does not lower the error
-    most: float  # Largest damping; no step is tried beyond it
+    decrease: float  # Factor on the damping after a step that lowers the error
+    increase: float  # Factor on the damping after a step that does not lower the error
+    largest: float  # Largest damping; no step is tried beyond it
     min_gain: float  # Share of the error that a step must remove for another step to follow
 
 
@@ -423,7 +432,7 @@ def descend(
 ) -> DescentState:
     """Take damped steps that each lower the error, by Levenberg and Marquardt's rule, and return the last state.
 
-    ``step`` takes a state and its damping, and returns the next state, or None if there is none.
+    ``step`` takes a state and the amount of damping, and returns the next state, or None if there is none.
     """
     state, amount = start, damping.first
     least_error = error(state)
@@ -433,21 +442,21 @@ def descend(
             break
         trial_error = error(trial)
         if not trial_error < least_error:
-            amount *= damping.brake
-            if amount > damping.most:
+            amount *= damping.increase
+            if amount > damping.largest:
                 break
             continue
         gain = 1 - trial_error / least_error
         state, least_error = trial, trial_error
         if gain < damping.min_gain:
             break
-        amount *= damping.ease
+        amount *= damping.decrease
     return state
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """A map from the frame of cameras to that of Gaussians: ``x_gaussians = scale * rotation @ x_cameras + shift``."""
+    """A map from a frame of cameras to a frame of Gaussians: ``x_gaussians = scale * rotation @ x_cameras + shift``."""
 
     rotation: np.ndarray  # [3,3]
     scale: float  # Positive
@@ -485,24 +494,26 @@ IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
 
 
 def move_region(region: Region, origin: np.ndarray, unit: float) -> Region:
-    """Return a region in a frame with another origin and unit, where positions are float32 and so are rounded more."""
+    """Return a region in a frame with another origin and unit, whose positions are stored in float32."""
     middle, half = (region.middle - origin) / unit, region.half / unit
-    rounding = float(np.finfo(np.float32).eps) * float(np.abs(middle).max() + half.max())  # of float32
-    return replace(region, middle=middle, half=half, rounding=region.rounding / unit + rounding)
+    float32_rounding = float(np.finfo(np.float32).eps) * float(np.abs(middle).max() + half.max())
+    return replace(region, middle=middle, half=half, rounding=region.rounding / unit + float32_rounding)
 
 
 def lies_inside(region: Region, points: np.ndarray) -> np.ndarray:
     """Return a mask ``[n]`` of the ``points [n,3]`` inside a region, border included."""
     local = matmul(points - region.middle, region.axes.T)
-    slack = 4 * float(np.finfo(np.float64).eps) * (np.abs(region.middle).max() + region.half.max())
+    # by which rounding may move points on the border
+    tolerance = 4 * float(np.finfo(np.float64).eps) * (np.abs(region.middle).max() + region.half.max())
     if region.is_sphere:
-        return np.asarray(np.square(local).sum(1) <= (region.half[0] + slack) ** 2)
-    return np.asarray((np.abs(local) <= region.half + slack).all(1))
+        return np.asarray(np.square(local).sum(1) <= (region.half[0] + tolerance) ** 2)
+    return np.asarray((np.abs(local) <= region.half + tolerance).all(1))
 
 
 def clamp_inside(region: Region, points: np.ndarray) -> np.ndarray:
-    """Move ``points [n,3]`` outside a region to the nearest points inside it; return all in float64."""
+    """Return ``points [n,3]`` in float64, where points outside a region are moved to its border."""
     local = matmul(points - region.middle, region.axes.T)
+    # a little smaller, so that points are still inside after they are rounded
     half = np.maximum(region.half - region.rounding, region.half / 2)
     if region.is_sphere:
         lengths = np.sqrt(np.square(local).sum(1, keepdims=True))
@@ -528,10 +539,10 @@ def fit_similarity(start: np.ndarray, end: np.ndarray, scale: float = 1.0) -> Si
 
 def mean_pose_frame(viewmats: np.ndarray) -> Similarity:
     """Return the similarity into the mean pose of cameras ``[c,4,4]``, with all centres within +-1, as in Long-LRM."""
-    rotation, centres = np.empty((3, 3)), camera_centres(viewmats)
-    rotation[2], down = normalize(viewmats[:, 2, :3].mean(0)), viewmats[:, 1, :3].mean(0)
-    rotation[1] = normalize(down - (down * rotation[2]).sum() * rotation[2])
-    rotation[0] = np.cross(rotation[1], rotation[2])
+    down, forward = viewmats[:, 1, :3].mean(0), normalize(viewmats[:, 2, :3].mean(0)).astype(np.float64)
+    down = normalize(down - (down * forward).sum() * forward)  # now perpendicular to `forward`
+    rotation = np.stack([np.cross(down, forward), down, forward])
+    centres = camera_centres(viewmats)
     shift = -matmul(rotation, centres.mean(0))
     farthest = float(np.abs(matmul(centres, rotation.T) + shift).max())
     scale = 1 / farthest if farthest > 0 else 1.0

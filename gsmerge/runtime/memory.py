@@ -19,7 +19,7 @@ import numpy as np
 LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 # Parameters of glibc with their values, see mallopt(3). An array of 32 MiB or more gets separate pages, which return to
 # the system when it is deleted. The process keeps up to 256 MiB of other freed memory for further arrays. With the
-# default values, the system cleared new pages for each array, a tenth of the time in which `gsmerge view` makes a page
+# default values, each array gets new pages that the system has to clear, which takes a tenth of the time of `view`
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
 # Bytes of memory that a run needs
@@ -27,8 +27,8 @@ BYTES_FIXED = 250_000_000  # for the interpreter and the libraries
 BYTES_PER_GAUSSIAN = 150  # for each Gaussian of the scene, without higher harmonics
 BYTES_PER_VALUE = 4.5  # for each value of higher harmonics, in the scene and in some of its groups
 BYTES_PER_PIXEL = 90  # for the photo as floats, and arrays of segmentation and rendering
-# Bytes that a conversion needs for each Gaussian, and for each value of higher harmonics. These are those of a .sog or
-# .glb, which need most; a .ply takes a third
+# Bytes that a conversion needs for each Gaussian, and for each value of higher harmonics. A .sog or .glb needs so many,
+# and a .ply needs a third
 BYTES_CONVERTED, BYTES_CONVERTED_VALUE = 330, 6
 BYTES_ELSEWHERE = 40  # for each Gaussian outside of the block that is in memory
 FEWER_PIXELS = (
@@ -40,7 +40,7 @@ _own_pages: WeakSet[mmap.mmap] = WeakSet()  # maps that this module has made; on
 def peak_memory() -> int:
     """Return the peak resident memory of this process in bytes."""
     if sys.platform == "win32":
-        counters = (ctypes.c_uint64 * 9)(72)  # PROCESS_MEMORY_COUNTERS begins with its size
+        counters = (ctypes.c_uint64 * 9)(72)  # PROCESS_MEMORY_COUNTERS; it begins with its size, and the peak follows
         ctypes.windll.kernel32.K32GetProcessMemoryInfo(ctypes.c_void_p(-1), counters, 72)
         return counters[1]
     import resource
@@ -49,7 +49,7 @@ def peak_memory() -> int:
 
 
 def machine_memory() -> int | None:
-    """Return the memory of this machine in bytes, or the lower limit of its control group; None if unknown."""
+    """Return the memory of this machine, or the limit of its control group if that is lower; bytes, None if unknown."""
     if sys.platform == "win32":
         return _memory_status()[1]
     limits = []
@@ -72,7 +72,7 @@ def free_memory() -> int | None:
 
 
 def _memory_status() -> list[int]:
-    """Return the numbers of the struct MEMORYSTATUSEX of Windows; the second is the total memory, the third is free."""
+    """Return the struct MEMORYSTATUSEX of Windows as numbers; the second is all memory, the third is free memory."""
     status = (ctypes.c_uint64 * 8)(64)  # the structure begins with its size
     if sys.platform == "win32":
         ctypes.windll.kernel32.GlobalMemoryStatusEx(status)
@@ -103,18 +103,21 @@ def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
 
 
 def keep_memory() -> None:
-    """Let new arrays reuse the memory of deleted ones, if the C library can; for processes with a single job."""
+    """Let new arrays reuse the memory of deleted arrays, if the C library can.
+
+    Processes that do a single job call it, because the process then keeps more memory than it uses.
+    """
     with suppress(AttributeError, OSError, TypeError):  # not glibc
         mallopt = ctypes.CDLL(None).mallopt
-        for parameter in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
-            mallopt(*parameter)
+        for parameter, value in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
+            mallopt(parameter, value)
 
 
 def release_memory() -> None:
     """Return freed memory to the operating system.
 
-    glibc keeps memory that a thread has freed for this thread. If stages use different threads, this is up to a tenth
-    of the peak. Does nothing on systems other than Linux.
+    The C library glibc keeps memory that a thread has freed for this thread. If stages use different threads, the kept
+    memory is up to a tenth of the peak. The function does nothing on systems other than Linux.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
@@ -124,9 +127,9 @@ def release_memory() -> None:
 def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: int | None = None) -> np.ndarray:
     """Return an uninitialised array. A large array is mapped from an unnamed temporary file, if the disk has room.
 
-    An array is large from ``mapped_bytes`` bytes on, by default and at most ``MAPPED_BYTES``. A mapped array takes
-    memory only for the pages in use, and none after :func:`free_pages`. Its file is in the system's temporary folder
-    (``TMPDIR``) and is removed with the array.
+    A large array has at least ``mapped_bytes`` bytes, or ``MAPPED_BYTES`` if that is less or ``mapped_bytes`` is None.
+    A mapped array takes memory only for the pages in use, and none after :func:`free_pages`. Its file is in the
+    system's temporary folder (``TMPDIR``) and is removed with the array.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size >= min(MAPPED_BYTES, mapped_bytes or MAPPED_BYTES) and hasattr(os, "posix_fallocate"):
@@ -141,7 +144,7 @@ def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: in
 def free_pages(arrays: Iterable[np.ndarray]) -> None:
     """Release the memory of arrays that :func:`make_array` mapped from files; the files keep their values."""
     for array in arrays:
-        base = array
+        base = array  # a view of a mapped array refers to it by `base`, which in the end refers to the mapped file
         while isinstance(base, np.ndarray) and base.base is not None:
             base = base.base
         pages = base.obj if isinstance(base, memoryview) else base

@@ -18,7 +18,7 @@ COMMANDS, METHODS = "gsmerge.commands", "gsmerge.methods"  # groups of the entry
 
 @dataclass(frozen=True)
 class LazyFunction:
-    """A function whose module is imported at the first call, so that tables of formats cost nothing."""
+    """A function whose module is imported at the first call, so that tables of functions import nothing."""
 
     module: str
     name: str
@@ -33,13 +33,13 @@ class LazyFunction:
 
 
 def lazy_functions(package: str) -> Callable[[str], LazyFunction]:
-    """Return a function that takes a text "module.name" and returns the :class:`LazyFunction` of this package."""
+    """Return a function that makes a :class:`LazyFunction` of ``package`` from a text "module.name"."""
     return lambda place: LazyFunction(f"{package}.{place.split('.')[0]}", place.split(".")[1])
 
 
 @cache
 def find_plugins(group: str) -> dict[str, EntryPoint]:
-    """Return the entry points of a group by name, sorted, without importing any; of equal names the first counts."""
+    """Return the entry points of a group, sorted by name, without importing them. Of equal names the first is used."""
     from importlib.metadata import entry_points  # takes 8 ms, and most commands do not need it
 
     plugins: dict[str, EntryPoint] = {}
@@ -49,7 +49,7 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
 
 
 def load_plugin(group: str, name: str) -> Any:
-    """Import and return the object of an entry point; UsageError with the name of its package if that fails."""
+    """Import and return the object of an entry point. If that fails, raise UsageError with the name of its package."""
     entry = find_plugins(group)[name]
     try:
         return entry.load()

@@ -1,4 +1,4 @@
-"""Make calls in a pool of processes on this machine, each of which makes one call after the other."""
+"""Make calls in a pool of processes on this machine. Each process makes one call after the other."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LOST, FEWER = "its process was killed or ended unexpectedly", "perhaps out of me
 
 
 class ProcessPool(WorkerPool):
-    """A pool of up to ``jobs`` processes. Each is an executor of its own, so a process that dies loses only its call.
+    """A pool of up to ``jobs`` processes. Each has an executor of its own, so a process that dies loses only its call.
 
     The calls that run at the same time may need ``memory`` bytes together. A call that needs more runs alone.
     """
@@ -31,7 +31,7 @@ class ProcessPool(WorkerPool):
         self.calls: dict[Future[Any], tuple[Call, ProcessPoolExecutor]] = {}  # running calls, each with its executor
 
     def has_room(self, call: Call) -> bool:
-        """Return true if a call fits into the memory beside those that run, or if none runs."""
+        """Return true if a call fits into the memory beside the calls that run, or if none runs."""
         needed = call.memory + sum(running.memory for running, _ in self.calls.values())
         return not self.calls or needed <= self.memory
 
@@ -44,7 +44,7 @@ class ProcessPool(WorkerPool):
             self.calls[executor.submit(function, *call.arguments)] = call, executor
 
     def wait(self) -> list[tuple[Any, Any]]:
-        """Wait until a call ends; return key and result of each ended call."""
+        """Wait until a call ends; return the keys and results of all calls that have ended."""
         ended = []
         for future in wait(self.calls, return_when=FIRST_COMPLETED).done:
             call, executor = self.calls.pop(future)
@@ -56,11 +56,12 @@ class ProcessPool(WorkerPool):
         return ended
 
     def close(self) -> None:
-        """End all processes; those that make a call are killed."""
-        for _, executor in self.calls.values():
-            for process in [*executor._processes.values()]:  # before Python 3.14 no other way ends a running call
+        """End all processes. Processes that make a call are killed."""
+        busy = [executor for _, executor in self.calls.values()]
+        for executor in busy:
+            for process in [*executor._processes.values()]:  # before Python 3.14 no public method ends a running call
                 process.kill()
-        for executor in [*self.idle, *(executor for _, executor in self.calls.values())]:
+        for executor in [*self.idle, *busy]:
             executor.shutdown(cancel_futures=True)
 
 

@@ -17,22 +17,22 @@ from typing import Any, NamedTuple
 
 from gsmerge.runtime.memory import release_memory
 
-Progress = Callable[[str, int, int], None]  # takes the name of the stage, the number of steps done, and that of all
+Progress = Callable[[str, int, int], None]  # takes the name of the stage, the number of steps done, and of all steps
 STAGES = (
     "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
     "cover", "decode", "join", "fit", "prune", "fill", "score", "input",
 )  # fmt: skip
 FIT_STEP = "fit: "  # the texts that report steps of a fit begin with this
-BEFORE_FIT = 0.8  # share of the seconds of all other stages that pass before the fits
-# Memory is released after these stages, because their threads have freed much that other threads cannot use
+BEFORE_FIT = 0.8  # share of the seconds of stages without fits that pass before the fits
+# Memory is released after these stages. Their threads have freed much of it, but other threads cannot use it
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 
 class RunPart(NamedTuple):
-    """Expected seconds of a part of a run, in its fits and in all other stages; only their ratios matter."""
+    """Expected seconds of a part of a run. Only the ratios of these seconds matter."""
 
-    stages: float
-    fits: float = 0.0
+    stages: float  # seconds in stages without fits
+    fits: float = 0.0  # seconds in fits
     num_fits: int = 1
 
     @property
@@ -45,15 +45,15 @@ class RunPart(NamedTuple):
 class Forecast:
     """Estimates the share of a run that is done, by the expected seconds of its parts and the steps of its fits."""
 
-    parts: list[RunPart] = field(default_factory=list)  # The present part, if one has begun, and those after it
+    parts: list[RunPart] = field(default_factory=list)  # The present part, if one has begun, and the parts after it
     spent: float = 0.0  # Expected seconds of the parts that have ended
     has_begun: bool = False  # True from the first call of `begin` on
     fit: int = 0  # Number of the present fit within the present part, from 0
     step: int = 0  # Last step of this fit
-    part_spent: float = 0.0  # Expected seconds of what is done of the present part
+    part_spent: float = 0.0  # Expected seconds of the finished share of the present part
 
     def begin(self) -> None:
-        """End the present part, if there is one, and begin the next."""
+        """End the present part of the run, if there is one, and begin the next part."""
         if self.has_begun:
             self.spent += self.parts.pop(0).seconds
         if not self.parts:  # more parts than were expected
@@ -61,16 +61,16 @@ class Forecast:
         self.has_begun, self.fit, self.step, self.part_spent = True, 0, 0, 0.0
 
     def expect(self, parts: Iterable[RunPart]) -> None:
-        """Replace the parts that are expected after the present one."""
+        """Replace the parts that are expected after the present part."""
         self.parts[self.has_begun :] = parts
 
     def take_step(self, step: int, num_steps: int) -> None:
-        """Note that a fit has reached a step; a lower number than before means that the next fit has begun."""
-        self.fit += step < self.step
+        """Update the estimate when a fit has reached a step of ``num_steps``."""
+        self.fit += step < self.step  # a lower step than before belongs to the next fit
         self.step = step
         if self.has_begun:
-            share = min(1.0, (self.fit + step / max(num_steps, 1)) / self.parts[0].num_fits)
-            self.part_spent = BEFORE_FIT * self.parts[0].stages + share * self.parts[0].fits
+            share_of_fits = min(1.0, (self.fit + step / max(num_steps, 1)) / self.parts[0].num_fits)
+            self.part_spent = BEFORE_FIT * self.parts[0].stages + share_of_fits * self.parts[0].fits
 
     @property
     def share(self) -> float | None:
@@ -81,7 +81,7 @@ class Forecast:
 
 @dataclass
 class Record:
-    """What a run has recorded so far."""
+    """What a run, or a part of it, has recorded so far."""
 
     progress: Progress | None = None  # Called at every report of progress
     seconds: dict[str, float] = field(default_factory=dict)  # Wall time of each stage
@@ -96,7 +96,7 @@ _current: ContextVar[Record | None] = ContextVar("record", default=None)
 
 @contextmanager
 def record_run(progress: Progress | None = None) -> Iterator[Record]:
-    """Start a record to which all code in the block writes; at its end, ``progress`` is called with "done"."""
+    """Start a record to which all code in the block writes. After the block, ``progress`` is called with "done"."""
     with _write_to(Record(progress)) as record:
         yield record
         report_progress("done", len(STAGES), len(STAGES))
@@ -111,8 +111,8 @@ def current_record() -> Record:
 def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[Record]:
     """Start a separate record for a part of the current run, to which all code in the block writes.
 
-    If ``silent`` is true, the progress of the part is not reported. With a ``title``, its progress is reported as that
-    of a stage of this name, of which the stages of the part are steps.
+    If ``silent`` is true, the progress of the part is not reported. A ``title`` is put before the names of the part's
+    stages in reports of progress, as if they were steps of one stage.
     """
     progress = None if silent else current_record().progress
     if progress is not None and title is not None:
@@ -138,10 +138,10 @@ def _write_to(record: Record) -> Iterator[Record]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Report the progress of a stage, and record the seconds of its block; also a decorator of functions.
+    """Report the progress of a stage, and record the seconds of the block, or of the decorated function.
 
-    Within another stage this does nothing, because the time counts for the outer stage. A ``name`` that is not one of
-    ``STAGES`` is reported as the stage after those that are done.
+    Within another stage this does nothing, because the time counts for the outer stage. If ``name`` is not one of
+    ``STAGES``, the number of finished stages is reported in place of its index.
     """
     record = _current.get()
     if record is None or record.running is not None:
@@ -160,7 +160,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 def list_some(items: Sequence[str], separator: str = ", ") -> str:
-    """Return the first items as a text for a note, with the number of those that are left out."""
+    """Return the first items as a text for a note, and the number of items that are left out."""
     max_named = 4  # largest number of items that a note lists
     rest = f" and {len(items) - max_named} more" if len(items) > max_named else ""
     return separator.join(items[:max_named]) + rest
@@ -199,14 +199,14 @@ def expect_parts(parts: Iterable[RunPart]) -> None:
 
 
 def begin_part() -> None:
-    """Note that the current run begins the next part that it expects."""
+    """Begin the next part in the forecast of the current run."""
     current_record().forecast.begin()
 
 
 def report_progress(text: str, done: int, total: int) -> None:
     """Report to the caller of the current run that ``done`` of ``total`` steps are done.
 
-    ``text`` is the name of the stage, or ``"stage: detail"`` for a step within a stage.
+    ``text`` is the name of a stage. For a step within a stage, it is ``"stage: detail"``.
     """
     record = current_record()
     if text.startswith(FIT_STEP):

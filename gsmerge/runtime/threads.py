@@ -1,10 +1,10 @@
 """Compute many items in parallel, on one pool of threads for the whole package.
 
 A kernel runs on one thread and releases the GIL, so several threads can run kernels at once, each on another view or on
-another band of an image. So threads wait for each other once for each pass over the views, not in each loop, and
-none is busy while it waits. A result cannot depend on the number of threads, because every item is computed by itself
-and results are returned in order. While a pool is in use, OpenCV and torch may use one thread each, so that they do not
-compete with the pool for cores. Torch is limited only if other code has imported it.
+another band of an image. Threads wait for each other only at the end of a pass over all views, and they sleep while
+they wait. A result cannot depend on the number of threads, because every item is computed by itself and results are
+returned in order. While a pool is in use, OpenCV and torch may use one thread each, so that they do not compete with
+the pool for cores. Torch is limited only if other code has imported it.
 """
 
 from __future__ import annotations
@@ -106,9 +106,9 @@ _local, _libraries = _Local(), _Libraries()
 
 
 def available_threads() -> int:
-    """Return the number in the variable ``GSMERGE_THREADS``, or else that of processors that this process may use.
+    """Return the number in the variable ``GSMERGE_THREADS``, or the number of processors that this process may use.
 
-    UsageError if the variable is not a number from 1 to ``MOST_THREADS``.
+    Raises UsageError if the variable is not a number from 1 to ``MOST_THREADS``.
     """
     text = os.environ.get(THREADS)
     if text:  # an empty variable counts as not set
@@ -186,8 +186,8 @@ def _release_libraries() -> None:
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """Return ``[function(item) for item in items]``, computed on the pool, in the order of the items.
 
-    Outside of :func:`use_threads`, a pool with all processors is made for the call. A call within a computed item
-    computes its own items one by one. The calling thread computes items as well.
+    Outside of :func:`use_threads`, a pool with all processors is made for the call. If ``function`` calls it again, the
+    inner call computes its items one by one. The calling thread computes items as well.
     """
     items = list(items)
     with use_threads() as count:
@@ -199,7 +199,7 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """Yield the results of :func:`parallel_map` in order, with at most ``AT_ONCE`` of them in memory at a time.
 
-    For large results of views that are only summed up, so that memory does not grow with the number of views.
+    Callers use it for large results of views, so that memory does not grow with the number of views.
     """
     items = list(items)
     for start in range(0, len(items), AT_ONCE):
@@ -209,15 +209,16 @@ def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 def _compute_on_pool(pool: _Pool, function: Callable[[T], R], items: list[T], num_helpers: int) -> list[R]:
     """Compute the items on this thread and on ``num_helpers`` threads of the pool; a free thread takes the next item.
 
-    The call does not wait for threads that took no item. After an error, a thread takes further items without computing
-    them. If several items fail, the error of the first of them is raised, whichever thread was quicker.
+    Threads that took no item are not waited for. After an error, a thread takes further items without computing them.
+    If several items fail, the error of the first failed item is raised, even if another thread failed earlier.
     """
     results: list[R] = [None] * len(items)  # type: ignore[list-item]
     indices = itertools.count()  # its next() is atomic
-    errors: dict[int, BaseException] = {}  # by index; all items before a failed item have been started
+    errors: dict[int, BaseException] = {}  # by index of the item
     counts: SimpleQueue[int] = SimpleQueue()  # number of items that each thread took
 
     def work() -> None:
+        """Take items and compute them until none is left, and then report how many were taken."""
         num_taken, has_failed = 0, False
         for index in indices:
             if index >= len(items):

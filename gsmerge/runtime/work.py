@@ -51,7 +51,7 @@ class WorkerPool(ABC):
         Yields the key and the result of each call as soon as it ends. If the process died, the result is a
         :class:`LostProcess`. Raises the exception of a failed call.
         """
-        waiting, num_running, call = iter(calls), 0, None
+        waiting, num_running, call = iter(calls), 0, None  # `call` is the next call, if it still waits for memory
         while True:
             while num_running < self.capacity and (call := call or next(waiting, None)) and self.has_room(call):
                 self.submit(function, call)
@@ -63,7 +63,7 @@ class WorkerPool(ABC):
             yield from ended
 
     def has_room(self, call: Call) -> bool:
-        """Return true if a call may start beside those that run. If none runs, the answer must be true."""
+        """Return true if a call may start beside the calls that run. If none runs, the answer must be true."""
         return True
 
     @abstractmethod
@@ -72,7 +72,7 @@ class WorkerPool(ABC):
 
     @abstractmethod
     def wait(self) -> list[tuple[Any, Any]]:
-        """Wait until a call ends; return key and result of each ended call."""
+        """Wait until a call ends; return the keys and results of all calls that have ended."""
 
     @abstractmethod
     def close(self) -> None:
@@ -106,8 +106,8 @@ class Cluster:
     def needs(self, threads: int, memory: int) -> dict[str, float]:
         """Return the resources that a task with ``threads`` and ``memory`` bytes requests from Ray.
 
-        They are limited to those of the largest node, because a task that requests more would wait forever. UsageError
-        if no node has processors.
+        They are limited to the resources of the largest node, because a task that requests more would wait forever.
+        Raises UsageError if no node has processors.
         """
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
         if not nodes:
@@ -137,7 +137,7 @@ class Work:
     ) -> Iterator[tuple[T, Record]]:
         """Make ``count`` calls of a picklable function; yield the result and the record of each call, in order.
 
-        A cluster makes as many calls at once as its processors allow. This process makes one after the other.
+        A cluster makes as many calls at once as its processors allow. This process makes one call after the other.
         """
         if self.cluster is not None:
             yield from self._run_on_cluster(self.cluster, title, function, count, calls)
@@ -153,9 +153,10 @@ class Work:
     def _run_on_cluster(
         self, cluster: Cluster, title: str, function: Callable[..., T], count: int, calls: Iterable[tuple[Any, ...]]
     ) -> Iterator[tuple[T, Record]]:
-        """Make the calls of :meth:`run` on a cluster; yield the results after the last call has ended, in order."""
-        resources = cluster.needs(self.threads or max(1, cluster.processors // count), self.memory)
-        pool, results = RayPool(cluster, max(1, int(resources["num_cpus"]))), dict[int, Any]()
+        """Make the calls of :meth:`run` on a cluster. Results are yielded in order, after the last call has ended."""
+        even_share = max(1, cluster.processors // count)  # threads of each call, if all calls run at once
+        granted = cluster.needs(self.threads or even_share, self.memory)
+        pool, results = RayPool(cluster, max(1, int(granted["num_cpus"]))), dict[int, Any]()
 
         def make_calls() -> Iterator[Call]:
             for number, arguments in enumerate(calls):
@@ -171,14 +172,13 @@ class Work:
 
 
 def _call_in_part(threads: int, function: Callable[..., T], *arguments: Any) -> tuple[T, Record]:
-    """Make a call on ``threads`` threads; return its result, and a record that holds only what it recorded."""
+    """Make a call on ``threads`` threads; return its result, and a record of this call alone."""
     with use_threads(threads), record_part() as record:
-        value = function(*arguments)
-    return value, replace(record, progress=None)
+        return function(*arguments), replace(record, progress=None)
 
 
 class RayPool(WorkerPool):
-    """A pool of up to ``jobs`` calls on a Ray cluster; 0 stands for as many as the cluster has processors for."""
+    """A pool that makes up to ``jobs`` calls at once on a Ray cluster. If ``jobs`` is 0, all processors are used."""
 
     def __init__(self, cluster: Cluster, threads: int, *, jobs: int = 0) -> None:
         self.cluster, self.ray = cluster, cluster.ray
@@ -198,14 +198,14 @@ class RayPool(WorkerPool):
         self.keys[self.function.options(**needs).remote(os.getcwd(), function, *call.arguments)] = call.key
 
     def wait(self) -> list[tuple[Any, Any]]:
-        """Wait until a call ends; return key and result of each ended call."""
+        """Wait until a call ends; return the keys and results of all calls that have ended."""
         ready, pending = self.ray.wait(list(self.keys), num_returns=1, timeout=None)
         if pending:
             ready += self.ray.wait(pending, num_returns=len(pending), timeout=0)[0]
         return [(self.keys.pop(ref), self._result(ref)) for ref in ready]
 
     def _result(self, ref: Any) -> Any:
-        """Return the result of a call, or LostProcess; raise the exception of a failed call."""
+        """Return the result of a call, or a LostProcess if it was lost; raise the exception of a failed call."""
         try:
             return self.ray.get(ref)
         except self.ray.exceptions.RayTaskError as error:
@@ -229,7 +229,7 @@ def _call_in_folder(folder: str, function: Callable[..., T], *arguments: Any) ->
 
 
 def require_ray() -> ModuleType:
-    """Import Ray; UsageError if it is not installed."""
+    """Import Ray. Raises UsageError if it is not installed."""
     try:
         import ray
     except ImportError as error:
@@ -238,8 +238,11 @@ def require_ray() -> ModuleType:
 
 
 def _connect(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
-    """Connect to the Ray cluster at ``address``; if None, start one on this machine with ``store_bytes``."""
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    """Connect to the Ray cluster at ``address``. If it is None, start a cluster on this machine.
+
+    ``store_bytes`` is then the memory for shared objects.
+    """
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray would hide GPUs from calls
     os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # of tasks that Ray ends when memory runs out
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
     if ray.is_initialized():
@@ -252,8 +255,7 @@ def _connect(ray: ModuleType, address: str | None, store_bytes: int | None) -> N
         host, _, port = address.removeprefix("ray://").rpartition(":")
         if host and port.isdecimal():  # if nothing listens there, Ray itself would wait for minutes
             connect_timeout = 10.0  # seconds to reach a cluster
-            with closing(socket.create_connection((host.strip("[]"), int(port)), timeout=connect_timeout)):
-                pass
+            socket.create_connection((host.strip("[]"), int(port)), timeout=connect_timeout).close()
         ray.init(address=address, **quiet)
     except (OSError, ValueError, RuntimeError) as error:
         problem = f"no Ray cluster answers there ({' '.join(str(error).split())[:200]})"

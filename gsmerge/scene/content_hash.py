@@ -1,4 +1,4 @@
-"""Hash the files that a scene is read from, detect changes of them, and fill the names of scenes into paths."""
+"""Hash the files that a scene is read from, detect changes of these files, and fill the names of scenes into paths."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def content_hash(files: Sequence[Path]) -> str:
 
 
 def _walk(root: Path) -> list[Path]:
-    """List all files in a folder, sorted; of a file, only itself."""
+    """List all files in a folder, sorted; for a file, list only the file itself."""
     return sorted(path for path in walk_files(root) if path.is_file()) if root.is_dir() else [root]
 
 
@@ -59,15 +59,15 @@ def list_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
 
 
 def doubt_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
-    """Return one doubt about a result if files of its scene have changed since they were read; otherwise none."""
+    """Return a list with a doubt about a result, if files of its scene have changed since they were read."""
     changed = list_changed(stats)
     more = f" and {count_words(len(changed) - 1, 'other file')}" if len(changed) > 1 else ""
-    text = "changed during the run; the result is of what was read before"
-    return [Doubt(f"{changed[0]}{more} {text}")] if changed else []
+    problem = "changed during the run; the result is of what was read before"
+    return [Doubt(f"{changed[0]}{more} {problem}")] if changed else []
 
 
 def _read_stat(path: Path) -> tuple[int, ...] | None:
-    """Return size, time of the last change and inode of a file; None if it cannot be accessed."""
+    """Return the size, time of the last change and inode of a file; None if the file cannot be accessed."""
     with suppress(OSError):
         stat = path.stat()
         return stat.st_size, stat.st_mtime_ns, stat.st_ino
@@ -86,7 +86,7 @@ def list_files(files: SceneFiles) -> list[Path]:
 
 
 def list_photos(files: SceneFiles, cameras: Path) -> list[Path]:
-    """List the photos that may show the views of a camera file, and the masks that this file names."""
+    """List the photos that may show the views of a camera file, and the masks that the camera file names."""
     try:
         camera_file = read_cameras(cameras)
         proposal = propose_photos(files, camera_file)
@@ -103,7 +103,10 @@ def scene_name(scene: Path) -> str:
 
 
 def fill_template(template: str | None, scene: Path) -> Path | None:
-    """Fill ``{scene}``, ``{parent}`` (its folder) and ``{stem}`` (its name) into a path; UsageError on other fields."""
+    """Fill ``{scene}``, ``{parent}`` (its folder) and ``{stem}`` (its name) into a path.
+
+    Raises UsageError if the path has other fields.
+    """
     if template is None:
         return None
     parent = scene if scene.is_dir() else scene.parent

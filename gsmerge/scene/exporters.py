@@ -1,4 +1,4 @@
-"""Know the exporters of files of Gaussians by a table, and take the caller's hints on how to read a file.
+"""List the exporters that write files of Gaussians, recognise their files, and check hints on how to read a file.
 
 To add a model, add a :class:`Model` to the exporter whose columns, order and encodings it shares, or add an exporter.
 ``python tasks.py reference`` renews docs/reference/exporters.md.
@@ -22,7 +22,7 @@ NO_HINTS = ReadHints()
 
 
 def make_hints(values: dict[str, Any]) -> ReadHints:
-    """Make hints from keyword arguments; ValueError if a name or a value is unknown."""
+    """Make hints from keyword arguments. Raises ValueError if a name or a value is unknown."""
     names = {field.name for field in fields(ReadHints)}
     unknown = sorted(values.keys() - names)
     if unknown:
@@ -34,7 +34,7 @@ def make_hints(values: dict[str, Any]) -> ReadHints:
 
 @dataclass(frozen=True)
 class Model:
-    """A model or program whose files are known, because its code for saving was read."""
+    """A model or program whose files are known from its source code."""
 
     title: str  # the name that people use
     source: str  # repository and commit that were read; single files may have a later commit
@@ -77,12 +77,12 @@ class Exporter:
 
 
 _NORMALS = ("nx", "ny", "nz")
-# Values of ``Model.result``: what users have to add, or what is lost
+# Values of ``Model.result``
 _NAME_CAMERAS = "read right with cameras, or with those that its grid shows"
 _NO_PIXELS = "read without pixels"
 _IF_GRID_SHOWS = "read right where the rows show their grid, else without pixels"
 _WITH_CAMERAS = "read without pixels; photos are used where cameras are named"
-# ``place`` and ``camera_advice`` of a trained scene
+# ``Model.place`` and ``Model.camera_advice`` of programs that train scenes
 _TRAINED = "iteration_*/point_cloud.ply", "cameras.json of the run has the cameras: name its folder, or the file itself"
 
 _EXPORTERS = (
@@ -107,7 +107,7 @@ _EXPORTERS = (
         cameras=("DA3 npz", "COLMAP binary", "COLMAP text", ESTIMATED),
     ),
     # The family of pixelSplat shares code but differs in order, trimming and rotations. Its worlds are recentred on
-    # the median, divided by a quantile and rotated upright: a scale and a shift that are stored nowhere.
+    # the median, divided by a quantile and rotated upright. No file stores this scale and this shift.
     Exporter(
         "pixelsplat",
         (Model("pixelSplat", "dcharatan/pixelsplat 32b1b66", "`gaussians/RUN/STEP.ply`; no cameras", _NAME_CAMERAS),),
@@ -260,7 +260,7 @@ _EXPORTERS = (
         ),
         "raw", "none",
     ),
-    # Models of one image, or of a few of one object.
+    # Models that predict Gaussians from one image, or from a few images of one object.
     Exporter(
         "sharp",
         (
@@ -299,7 +299,7 @@ _EXPORTERS = (
         ),
         "logit", "view-major", normals=False,
     ),
-    # Normals as bytes, 45 harmonics whatever the degree, sorted by opacity once it prunes.
+    # Long-LRM writes normals as bytes, and 45 harmonics for every degree. If it prunes, it sorts rows by opacity.
     Exporter(
         "longlrm",
         (
@@ -390,9 +390,9 @@ def find_exporter(name: str) -> Exporter | None:
 def choose_exporters(name: str, info: FileInfo, order: str, cameras: str) -> tuple[Exporter, ...]:
     """Return the exporter with a name; for "auto", all exporters that may have written the file.
 
-    If the header has a mark, only exporters that leave a mark count. Of the exporters that count, those that write rows
-    in this ``order`` are returned; if there are none, those that leave a mark. ``order`` is "none" if rows belong to no
-    pixels. ``cameras`` is the format of the cameras, "" without any.
+    They write the columns of the file, the format of its ``cameras`` ("" without cameras), and its ``order`` of rows
+    ("none" if rows have no pixels). If exporters leave a mark in the file, only these are returned, with any order of
+    rows if none has this order.
     """
     exporter = find_exporter(name)
     if exporter is not None:
@@ -406,11 +406,16 @@ def choose_exporters(name: str, info: FileInfo, order: str, cameras: str) -> tup
 def find_cameras_of_model(info: FileInfo) -> str:
     """Describe how to get the cameras of a file from the model that wrote it; empty if the model is unknown.
 
-    A model is recognised by the path of the file, or by a mark of its exporter. All recognised models must agree.
+    A model is recognised by the path of the file, or by a mark of its exporter. Empty also if recognised models give
+    different advice.
     """
     path = Path(info.path).absolute()
-    exporters = [exporter for exporter in EXPORTERS.values() if exporter.writes_columns(info)]
-    models = [(model, exporter.is_marked) for exporter in exporters for model in exporter.models if model.camera_advice]
-    matching = [model for model, is_marked in models if (path.match(model.place) if model.place else is_marked)]
-    advice = {model.camera_advice for model in matching}
-    return f"{' or '.join(model.title for model in matching)}: {advice.pop()}" if len(advice) == 1 else ""
+    models = [
+        model
+        for exporter in EXPORTERS.values()
+        if exporter.writes_columns(info)
+        for model in exporter.models
+        if model.camera_advice and (path.match(model.place) if model.place else exporter.is_marked)
+    ]
+    advice = {model.camera_advice for model in models}
+    return f"{' or '.join(model.title for model in models)}: {advice.pop()}" if len(advice) == 1 else ""

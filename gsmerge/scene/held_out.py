@@ -1,4 +1,4 @@
-"""Read held-out photos, with which renders of a scene are compared, and their cameras in the frame of the scene."""
+"""Read held-out photos, which are compared with renders of a scene, and their cameras in the frame of the scene."""
 
 from __future__ import annotations
 
@@ -36,10 +36,11 @@ class HeldOutViews(Views):
 def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
     """Read held-out photos and their cameras, in any format that a scene may have.
 
-    Views from which the scene was made are left out. If the file has these views under the same names, their poses give
-    the map from the file's world to the world of the Gaussians. Otherwise the file is assumed to share the world of the
+    Views from which the scene was made are left out. If the file has these views under the same names, their poses show
+    how the file's world maps to the world of the Gaussians. Otherwise the file is assumed to share the world of the
     scene's own cameras. Poses are read in the convention in which the scene's cameras fit. ``images`` is the folder of
-    the photos; None: the camera file names them. SceneError if a file is missing or damaged, or if no view remains.
+    the photos. If it is None, the camera file names them. Raises SceneError if a file is missing or damaged, or if no
+    view remains.
     """
     path = Path(cameras)
     if not path.exists():
@@ -74,25 +75,25 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
 
 
 def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
-    """Read a camera file, and move its cameras into the frame of a scene's Gaussians; also map views to the scene's.
+    """Read a camera file, and move its cameras into the frame of a scene's Gaussians; also find the shared views.
 
-    The map has the indices of the views in the file that the scene also has, and their indices in the scene. The
-    convention and the frame are found as in :func:`read_held_out`.
+    Shared views are views of the file that the scene also has. They are returned as a map from their indices in the
+    file to their indices in the scene. Frame and convention are found as in :func:`read_held_out`.
     """
-    stored, cameras = read_cameras(path), load.cameras
-    candidates = [stored]
-    if cameras is not None and cameras.source == stored.source and cameras.convention != stored.convention:
-        candidates.insert(0, with_convention(stored, cameras.convention))  # in which the scene's own cameras fit
-    # a candidate with shared views is preferred
-    worlds = [(candidate, *_find_world(candidate, load)) for candidate in candidates]
-    camera_file, world, shared = next((entry for entry in worlds if entry[2]), worlds[0])
+    stored, own_cameras = read_cameras(path), load.cameras
+    conventions = [stored]  # the cameras of the file, read in each convention
+    if own_cameras is not None and own_cameras.source == stored.source and own_cameras.convention != stored.convention:
+        conventions.insert(0, with_convention(stored, own_cameras.convention))
+    worlds = [(camera_file, *_find_world(camera_file, load)) for camera_file in conventions]
+    with_shared_views = (entry for entry in worlds if entry[2])
+    camera_file, world, shared = next(with_shared_views, worlds[0])
     return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
 
 
 def _find_photo_folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
-    """Return the folder ``images``, or else the camera file if it has photos inside; None if they have to be searched.
+    """Return the folder ``images``, or the camera file if it has photos inside; None if photos have to be searched.
 
-    SceneError if ``images`` is no folder.
+    Raises SceneError if ``images`` is no folder.
     """
     if images is not None:
         if not Path(images).is_dir():
@@ -103,21 +104,24 @@ def _find_photo_folder(path: Path, cameras: CameraFile, images: StrPath | None) 
 
 
 def _match_by_name(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
-    """Map views of a file to views of the scene with the same name, by index; empty if stems are not unique."""
-    places, views = (
+    """Map views of a file to views of the scene with the same name, by index; empty if names are not unique.
+
+    Folders and endings of names are ignored.
+    """
+    file_views, scene_views = (
         {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(view_names)}
         for view_names in (camera_file.names, names)
     )
-    if len(places) < len(camera_file) or len(views) < len(names):
+    if len(file_views) < len(camera_file) or len(scene_views) < len(names):
         return {}
-    return {places[stem]: view for stem, view in views.items() if stem in places}
+    return {file_views[stem]: view for stem, view in scene_views.items() if stem in file_views}
 
 
 def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict[int, int]]:
     """Find the similarity from the file's world to the world of the Gaussians, and the views that the scene also has.
 
-    The latter maps views of the file to views of the scene with the same name, by index. It is empty if no similarity
-    brings their poses together.
+    The second result maps views of the file to views of the scene with the same name, by index. It is empty if no
+    similarity brings the poses of these views together.
     """
     stored, shared = _find_similarity(load), _match_by_name(camera_file, load.scene.names)
     if not shared:
@@ -125,7 +129,7 @@ def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict
     theirs = camera_file.viewmats[list(shared)]
     ours = load.scene.cameras.viewmats[list(shared.values())]
     min_shared = 3  # fewest views that determine the similarity between two worlds
-    frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(shared) >= min_shared)
+    frames = [stored, fit_similarity(theirs, ours, stored.scale)] if len(shared) >= min_shared else [stored]
     max_angle = 0.2  # degrees by which a view's two poses may differ in one frame
     max_shift = 0.005  # largest distance between a view's two poses, relative to the extent of all views
     for frame in frames:
@@ -142,8 +146,8 @@ def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict
 def _find_similarity(load: Loaded) -> Similarity:
     """Find the similarity from the world of a scene's own camera file to the world of its Gaussians.
 
-    Cameras of held-out photos are taken to be in the world of that file. Return the identity if there is no such file,
-    or if its poses cannot be compared with those of the scene.
+    A camera file of held-out photos is assumed to be in the same world. The result is the identity if the scene has no
+    camera file, or if the poses in it cannot be compared with the poses of the scene.
     """
     if load.recovery is not None:
         return load.recovery.frame
@@ -162,8 +166,8 @@ def _match_by_pose(viewmats: np.ndarray, scene: Scene) -> dict[int, int]:
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
-    # Equal poses may differ by this much in each element of their rotations, and in their centres by this share of the
-    # distance to the scene. A distance between views would not do, since there may be a single view
+    # Largest difference of equal poses: of elements of their rotations, and of their centres as a share of the distance
+    # from the scene. There may be a single view, so distances between views cannot be used
     same_pose = 1e-4
     limit = same_pose * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
     same_place = np.linalg.norm(camera_centres(viewmats)[:, None] - camera_centres(ours), axis=2) <= limit

@@ -30,7 +30,7 @@ def as_scene(scene: Scene | StrPath) -> Scene:
 
 
 def check_scene(scene: Scene) -> None:
-    """Raise SceneError for a scene with values of another convention, as callers may make it; readers do not."""
+    """Raise SceneError if the values of a scene have another convention. Scenes that callers make may have one."""
     gaussians, cameras = vars(scene.gaussians), scene.cameras
     arrays = {**gaussians, "viewmats": cameras.viewmats, "Ks": cameras.Ks, "images": scene.images}
     for name, values in arrays.items():
@@ -41,7 +41,7 @@ def check_scene(scene: Scene) -> None:
 
 
 def check_values(columns: Mapping[str, Array]) -> None:
-    """Raise SceneError if scales are logarithms or opacities are logits; rows with NaN or infinities do not count."""
+    """Raise SceneError if scales are logarithms or opacities are logits. Rows that are not finite are ignored."""
     scales, opacities = as_array(columns["scales"]), as_array(columns["opacities"])
     if len(scales) == 0 or (_lie_within(scales, 0, np.inf) and _lie_within(opacities, 0, 1)):
         return
@@ -60,12 +60,12 @@ def check_values(columns: Mapping[str, Array]) -> None:
 
 
 def _lie_within(values: np.ndarray, low: float, high: float) -> bool:
-    """Return whether all values lie between two limits; NaN does not count."""
+    """Return whether all values lie between two limits. NaN is ignored."""
     return bool(np.fmin.reduce(values, axis=None) >= low and np.fmax.reduce(values, axis=None) <= high)
 
 
 def check_poses(viewmats: np.ndarray, Ks: np.ndarray) -> None:
-    """Raise SceneError for impossible poses ``[c,4,4]`` or intrinsics ``[c,3,3]``."""
+    """Raise SceneError if poses ``[c,4,4]`` or intrinsics ``[c,3,3]`` are impossible, for example transposed."""
     for view, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
         if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-3:
             problem = f"view {view}: expected 0 0 0 1 as the last row, found another"

@@ -24,7 +24,7 @@ class Loaded:
     scene: Scene  # with pixels if the rows have them
     info: FileInfo  # header and encodings of the file of Gaussians
     files: SceneFiles  # the paths of all its files
-    # the cameras as stored in their file, in the order of the views; None without cameras, or if they do not fit
+    # the cameras as stored in their file, in the order of the views; None if there are none, or if they do not fit
     cameras: CameraFile | None
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
     notes: tuple[str, ...]  # adapted or unusual content and doubts, one sentence each, without a full stop
@@ -38,16 +38,16 @@ class Loaded:
     photos_explain: bool = False  # whether the photos that names propose explain what most views show
     stats: Mapping[Path, tuple[int, ...]] = field(default_factory=dict)  # states of the files before they were read
     sha256: str | None = None  # hash of the files of Gaussians, one after the other; None if it was not asked for
-    own_views: int = 0  # if rows have no pixels in these cameras: views of the grid that they form alone; 0 for none
+    own_views: int = 0  # number of views of the grid that the rows form, if they have no pixels in the cameras; else 0
 
     @property
     def doubts(self) -> list[str]:
-        """The notes that make results doubtful, such as those on cameras and photos that are left out."""
+        """The notes that make results doubtful, such as notes on cameras and photos that are left out."""
         return list_doubts(self.notes)
 
     @property
     def comments(self) -> tuple[str, ...]:
-        """Comments of the file's header that a result copies; without that on 2D Gaussians, since results are 3D."""
+        """Comments of the file's header that a result copies. The comment on 2D Gaussians is not, as results are 3D."""
         return tuple(comment for comment in kept_comments(self.info) if comment != FLAT_COMMENT)
 
     @property

@@ -1,6 +1,6 @@
-"""Read a scene from its files: Gaussians with the pixel of each if rows have pixels, cameras and photos.
+"""Read a scene from its files: its Gaussians, the pixels of their rows, its cameras and its photos.
 
-A function returns a :class:`SceneError`, rather than raising it, if its caller may read the scene in another way.
+A function returns a :class:`SceneError` instead of raising it if its caller can try to read the scene in another way.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.formats.arrays import MAX_STRAY, RESULT_COMMENT
-from gsmerge.io.formats.color_units import RGB_NOTE
 from gsmerge.io.formats.read import GaussianFile, file_notes, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
@@ -36,7 +35,6 @@ from gsmerge.photos.scene_photos import (
     describe_missing,
     explain_mismatch,
     fit_to_grid,
-    has_nearer_colors,
     has_other_shape,
     list_guessed,
     name_by_photos,
@@ -58,7 +56,7 @@ from gsmerge.scene.exporters import (
     make_hints,
 )
 from gsmerge.scene.loaded import Loaded
-from gsmerge.scene.rows import read_as_harmonics, read_as_rgb, read_rotations, take_gaussians
+from gsmerge.scene.rows import confirm_colors, read_rotations, take_gaussians
 from gsmerge.scene.views import find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, LargePhotos, Scene, StrPath
@@ -66,6 +64,7 @@ from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
 T = TypeVar("T")
+MakeScene = Callable[[CameraFile, ScenePhotos], Loaded]  # may raise SceneError
 SUMMED_FACTS = ("file_bytes", "num_nonfinite")  # facts about files that are added up if scenes are joined
 
 
@@ -138,16 +137,15 @@ def load_scene(
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> Loaded:
     """Read a scene as :func:`load_scene` does, from the files that :func:`find_scene_files` found."""
     with use_threads():
-        scenes = (replace(files, more=()), *files.more)
         loads = [
-            align_scene(read_gaussian_file(source, opacity=opacity, hints=hints), source, hints=hints)
-            for source in scenes
+            align_scene(read_gaussian_file(scene_files, opacity=opacity, hints=hints), scene_files, hints=hints)
+            for scene_files in (replace(files, more=()), *files.more)
         ]
     return loads[0] if len(loads) == 1 else _join_loads(loads, files)
 
 
 def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
-    """Join several scenes of the same place to one, which has the notes of all."""
+    """Join several scenes of the same place into one scene, which has the notes of all."""
     from gsmerge.cameras.registration.join import join_scenes
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
@@ -172,7 +170,7 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     If the hints name an exporter that writes logits, opacities are read as logits, unless ``opacity`` says otherwise.
     """
     exporter = find_exporter(hints.exporter)
-    # An exporter of raw opacities decides nothing: raw opacities are recognised, and some of its versions write logits
+    # If the exporter writes raw opacities, they are not assumed, since some of its versions write logits
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"
     encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales, "colors": hints.colors}
@@ -180,17 +178,17 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
 
 
 def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_HINTS, photos: bool = True) -> Loaded:
-    """Combine Gaussians, cameras and photos to a scene, with the pixel of every row if rows have pixels.
+    """Combine Gaussians, cameras and photos into a scene, with the pixel of every row if rows have pixels.
 
-    Cameras and photos that were found beside the scene and do not belong to it are left out, with a note. SceneError as
-    in :func:`read_scene`. ``photos=False``: search no photos.
+    Cameras and photos that were found beside the scene, but do not belong to it, are left out with a note. Raises
+    SceneError as :func:`read_scene` does. If ``photos`` is False, no photos are searched.
     """
     result = _choose_cameras(ply, files, hints, photos=photos)
-    lacks_views = isinstance(result, Loaded) and result.own_views > len(result.scene)
-    may_leave_out = lacks_views or (
+    lacks_views = isinstance(result, Loaded) and result.own_views > len(result.scene)  # the rows form a larger grid
+    cameras_may_be_wrong = lacks_views or (
         isinstance(result, SceneError) and "cameras" not in files.named and not _is_fault_of_named(files, result)
     )
-    if may_leave_out and files.cameras not in (None, files.ply):
+    if cameras_may_be_wrong and files.cameras not in (None, files.ply):
         result = _read_without_cameras(ply, files, hints, result, photos=photos)
     if isinstance(result, Loaded):
         return result
@@ -204,27 +202,30 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
 def _read_without_cameras(
     ply: GaussianFile, files: SceneFiles, hints: ReadHints, result: Loaded | SceneError, *, photos: bool
 ) -> Loaded | SceneError:
-    """Read a scene without its camera file, with a note; its views are those of the grid that its rows form.
+    """Read a scene without its camera file, and say so in a note; the rows then show the cameras themselves.
 
-    ``result`` is what reading with that file gave: a scene with fewer views than the grid, or an error. It is returned
-    if the scene cannot be read without the file, would lose photos that the caller named, or has no other views.
+    ``result`` is what reading with the camera file gave: a scene with fewer views than the rows form, or an error. This
+    result is returned if the scene cannot be read without the file, or if photos that the caller named are not used
+    then.
     """
-    fewer = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
-    load = _read_views(ply, fewer, hints, photos=photos)
+    remaining = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
+    load = _read_views(ply, remaining, hints, photos=photos)
     needs_photos = "images" in files.named and files.images is not None
     if isinstance(load, SceneError) or (needs_photos and load.scene.images is None):
         return result
     stored = _read_or_error(partial(read_scene_cameras, ply, files))
-    text = describe_missing(load.scene.names, stored, is_right=isinstance(result, Loaded))
-    if text is not None:
-        return replace(load, notes=(text, *(note for note in load.notes if not note.startswith(NO_CAMERAS_USED))))
+    missing_cameras = describe_missing(load.scene.names, stored, is_right=isinstance(result, Loaded))
+    if missing_cameras is not None:
+        return replace(
+            load, notes=(missing_cameras, *(note for note in load.notes if not note.startswith(NO_CAMERAS_USED)))
+        )
     return _note_left_out(load, files, [str(files.cameras)], result) if isinstance(result, SceneError) else result
 
 
 def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Read a scene with the first of its cameras that fit for certain, or else with the first that can be read.
+    """Read a scene with the first of its camera files that certainly fits, or else with the first that can be read.
 
-    A note says which cameras are read if there are others. Returns the first error if none can be read.
+    If there are several camera files, a note says which one is read. Returns the first error if none can be read.
     """
     loads, errors = list[Loaded](), list[SceneError]()
     for choice in files.choices:
@@ -233,37 +234,22 @@ def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, p
             errors.append(load)
             continue
         with_note = replace(load, notes=(*files.describe_choice(choice.cameras), *load.notes))
-        if _fit_for_certain(load, files):
+        if _cameras_certainly_fit(load, files):
             return with_note
         loads.append(load if choice.cameras == files.cameras else with_note)
     return loads[0] if loads else errors[0]
 
 
-def _fit_for_certain(load: Loaded, files: SceneFiles) -> bool:
-    """Return whether cameras fit for certain, so that no others have to be tried.
+def _cameras_certainly_fit(load: Loaded, files: SceneFiles) -> bool:
+    """Return whether the cameras of a scene certainly fit its Gaussians, so that no other cameras have to be tried.
 
-    With photos, they do if rows are their pixels, if the photos explain their views, or if there are no others. Without
-    photos, they do if rows are their pixels or nothing is doubtful, but never if they lie in a folder below the scene.
+    - With photos: if rows are pixels of the cameras, if the photos show the views, or if there are no other cameras.
+    - Without photos: if rows are pixels of the cameras, or if nothing is doubtful. But if the other cameras lie in
+      folders below the scene, only photos can show which cameras fit.
     """
     if load.scene.images is None:
         return not files.below and (load.scene.has_own_pixels or not load.doubts)
     return load.scene.has_own_pixels or load.photos_explain or not files.others
-
-
-def _confirm_colors(load: Loaded) -> Loaded:
-    """Decide by the photos whether colours are RGB or harmonics, if the file leaves that open; return the scene."""
-    info, units = load.info, load.info.open_units
-    if units is None or load.scene.images is None:
-        return load
-    tries_rgb = info.color_units is None  # otherwise the file was read as RGB, and harmonics are tried
-    other = (read_as_rgb if tries_rgb else read_as_harmonics)(load.scene, units)
-    if not has_nearer_colors(other, load.scene):
-        return load
-    note = RGB_NOTE.format(units.name, "photos show it") if tries_rgb else ""
-    notes = (*([note] if note else []), *(text for text in load.notes if text != info.color_note))
-    return replace(
-        load, scene=other, info=replace(info, color_units=units if tries_rgb else None, color_note=note), notes=notes
-    )
 
 
 def _read_or_error(read: Callable[[], T]) -> T | SceneError:
@@ -274,32 +260,35 @@ def _read_or_error(read: Callable[[], T]) -> T | SceneError:
         return type(error)(error.path, error.problem, error.remedy)  # a copy, as the traceback keeps arrays in memory
 
 
-def _note_left_out(load: Loaded, files: SceneFiles, names: list[str], cause: SceneError) -> Loaded:
-    """Return a scene with the doubt that some ``files`` are left out, which ``names`` describe.
+def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: SceneError) -> Loaded:
+    """Return a scene with a doubt which says what is left out, why, and what the user can do.
 
-    The text gives the ``cause`` and a remedy. It replaces notes on photos that could not be used without these files.
+    ``left_out`` describes files in words. If photos are not used without these files, the doubt also names the photos,
+    and replaces the notes on them.
     """
     photos = f"the photos in {files.images or files.ply.parent}"
-    replaced = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
-    names = [*names, *([photos] if replaced else [])]
-    is_known = cause.path in map(str, (files.ply, files.ply.parent, files.cameras, files.images))
-    damaged = "" if is_known else f"{cause.path}: "
-    option, value = ("cameras", "FILE") if names[0] == str(files.cameras) else ("images", "FOLDER")
+    photo_notes = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
+    left_out = [*left_out, *([photos] if photo_notes else [])]
+    known_paths = map(str, (files.ply, files.ply.parent, files.cameras, files.images))
+    damaged_file = "" if cause.path in known_paths else f"{cause.path}: "
+    option, value = ("cameras", "FILE") if left_out[0] == str(files.cameras) else ("images", "FOLDER")
     remedy = cause.remedy or f"pass --{option} {value}, or --{option} {NONE}"
-    verb = "is" if names == [str(files.cameras)] else "are"
-    doubt = Doubt(" ".join(f"{' and '.join(names)} {verb} left out: {damaged}{cause.problem}; {remedy}".split()))
-    return replace(load, notes=(doubt, *(text for text in load.notes if text not in replaced)))
+    verb = "is" if left_out == [str(files.cameras)] else "are"
+    doubt = f"{' and '.join(left_out)} {verb} left out: {damaged_file}{cause.problem}; {remedy}"
+    return replace(
+        load, notes=(Doubt(" ".join(doubt.split())), *(text for text in load.notes if text not in photo_notes))
+    )
 
 
 def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Combine a scene's Gaussians with its cameras, if it has any, and photos; return the error if they do not fit."""
+    """Combine a scene's Gaussians with its cameras and photos, if it has any; return the error if they do not fit."""
     camera_file = _read_or_error(partial(read_scene_cameras, ply, files))
     if camera_file is None:
         return _make_scene_without_views(ply, files, hints)
     if isinstance(camera_file, SceneError):
         return camera_file
     load = _add_photos(ply, files, camera_file, hints, photos=photos)
-    return _confirm_colors(load) if isinstance(load, Loaded) else load
+    return confirm_colors(load) if isinstance(load, Loaded) else load
 
 
 def _add_photos(
@@ -307,8 +296,9 @@ def _add_photos(
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras with their photos; return the error if the cameras do not see the Gaussians.
 
-    Photos that the caller did not name are left out, with a note, if they cannot be read or do not show the views; see
-    also :func:`_leave_out_photos`. ``photos=False``: leave all photos out.
+    Photos are files of their own, or all are inside one file. Photos that the caller did not name are left out, with a
+    note, if they cannot be read or do not show the views; see :func:`_leave_out_photos`. If ``photos`` is False, all
+    photos are left out.
     """
     proposal = _read_or_error(partial(propose_photos, files, camera_file)) if photos else None
     if isinstance(proposal, Proposal) and proposal.by_names:
@@ -319,90 +309,101 @@ def _add_photos(
         return error
     if isinstance(proposal, Proposal):
         return _add_proposed_photos(ply, files, camera_file, proposal, hints)
-    pictures = ScenePhotos(() if isinstance(inside, SceneError) else inside)
-    load = _read_or_error(partial(_make_scene_with_views, ply, files, camera_file, pictures, hints))
+    scene_photos = ScenePhotos(() if isinstance(inside, SceneError) else inside)
+    load = _read_or_error(partial(_make_scene_with_views, ply, files, hints, camera_file, scene_photos))
     if isinstance(load, SceneError):
         return load
     if error is not None:
         return _note_left_out(load, files, [f"the photos in {files.images}"], error)
     lacks_photos = photos and "images" not in files.named and load.scene.images is None
-    is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # then films beside it show it
-    films = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
-    return replace(load, notes=(*load.notes, *films))
+    is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside a result are of it
+    notes_on_films = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
+    return replace(load, notes=(*load.notes, *notes_on_films))
 
 
 def _add_proposed_photos(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
 ) -> Loaded | SceneError:
-    """Combine Gaussians and cameras with the photos of a proposal, or with those of the most frequent aspect ratio.
+    """Combine Gaussians and cameras with all proposed photos, or only with photos of the most frequent aspect ratio.
 
-    If both fail, the photos are left out; see :func:`_leave_out_photos`.
+    If neither can be used, all photos are left out; see :func:`_leave_out_photos`.
     """
-    load = _assign_photos(ply, files, camera_file, proposal, hints)
+    make_scene = partial(_make_scene_with_views, ply, files, hints)
+    load = _assign_photos(make_scene, camera_file, proposal)
     if isinstance(load, Loaded):
         return load
     if (one_shape := select_one_shape(camera_file, proposal)) is not None:
         remaining_cameras, remaining_photos, doubts = one_shape
-        fewer = _assign_photos(ply, files, remaining_cameras, remaining_photos, hints)
-        if isinstance(fewer, Loaded):
-            return replace(fewer, notes=(*fewer.notes, *doubts))
+        remaining_load = _assign_photos(make_scene, remaining_cameras, remaining_photos)
+        if isinstance(remaining_load, Loaded):
+            return replace(remaining_load, notes=(*remaining_load.notes, *doubts))
     return _leave_out_photos(ply, files, camera_file, proposal, hints, load)
 
 
-def _assign_photos(
-    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
-) -> Loaded | SceneError:
-    """Combine Gaussians and cameras with the photos that names propose, or with other photos that show the views.
+def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Proposal) -> Loaded | SceneError:
+    """Make a scene with the photos that names propose, or with other photos that show its views.
 
-    1. If photos have another shape than the cameras, a part of each may show its view. Then this part is used.
-    2. The scene is read with the proposed photos, without those that are broken, or else without photos.
-    3. This scene shows which photo belongs to which view. If a part of each photo fits better, this part is used.
+    1. If the photos have another shape than the cameras, parts of the photos may show the views, and are used then.
+    2. The scene is read with the proposed photos, or without photos if these cannot be used.
+    3. The views of this scene show which photo belongs to each. If parts of the photos fit better, the parts are used.
     4. The scene is read again if other photos belong to the views than were proposed.
 
     Notes name photos that cannot be read, and views without a photo. Returns the error if no photo shows any view.
     """
-
-    def read(cameras: CameraFile, chosen: Sequence[Assignment | None]) -> Loaded | SceneError:
-        """Read the scene with the chosen photo of each camera."""
-        return _read_or_error(
-            lambda: _make_scene_with_views(ply, files, cameras, read_photos(proposal, chosen, cameras), hints)
-        )
-
-    is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # photos may have any size
-    shapes_differ = not is_grid and has_other_shape(proposal, camera_file)
-    read_bare = partial(_make_scene_with_views, ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
+    cameras_are_estimated = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED
+    shapes_differ = not cameras_are_estimated and has_other_shape(proposal, camera_file)
+    make_without_photos = partial(make_scene, replace(camera_file, lenses=()), ScenePhotos())
+    # 1. Parts of photos of another shape
     if shapes_differ:
-        bare = _read_or_error(read_bare)
+        bare = _read_or_error(make_without_photos)
         if isinstance(bare, Loaded) and (parts := choose_part(bare.scene, proposal, camera_file)) is not None:
-            return _assign_photos(ply, files, camera_file, parts, hints)
-    proposed: Loaded | SceneError | None = None  # the scene with the proposed photos; None if none are proposed
-    if not is_grid and any(proposal.choice):
-        proposed = read(camera_file, proposal.choice)
-        unbroken = proposal.without_broken() if isinstance(proposed, SceneError) else None
-        if unbroken is not None:
-            proposal = unbroken
-            proposed = read(camera_file, proposal.choice)
-    base = proposed if isinstance(proposed, Loaded) else _read_or_error(read_bare)
+            return _assign_photos(make_scene, camera_file, parts)
+    # 2. The base: the scene with the proposed photos, or without photos
+    proposed: Loaded | SceneError | None = None  # None if no photos are proposed
+    if not cameras_are_estimated and any(proposal.choice):
+        proposed, proposal = _make_with_proposed_photos(make_scene, camera_file, proposal)
+    base = proposed if isinstance(proposed, Loaded) else _read_or_error(make_without_photos)
     if isinstance(base, SceneError):
-        return base if proposed is None else proposed
-    fit = fit_to_grid(base.scene, proposal) if is_grid and proposal.pool else None
+        return proposed or base
+    # 3. The photo of each view, whole or in part
+    fit = fit_to_grid(base.scene, proposal) if cameras_are_estimated and proposal.pool else None
     guessed = list_guessed(base.scene, camera_file)
     proposal = proposal.without_views(guessed)
     chosen, explain_most = assign_to_views(base.scene, proposal, read=base is proposed, guessed=guessed, fit=fit)
     may_be_parts = proposal.fit == WHOLE_FIT and not shapes_differ and (not explain_most or has_bars(base.scene))
     if may_be_parts and (parts := choose_part(base.scene, proposal, camera_file, fit)) is not None:
-        return _assign_photos(ply, files, camera_file, parts, hints)
+        return _assign_photos(make_scene, camera_file, parts)
     if not any(chosen) or (shapes_differ and not explain_most):
         # an error of photos of another shape says nothing, unless lenses may have changed the shape
         if isinstance(proposed, SceneError) and (not shapes_differ or any(camera_file.lenses)):
             return proposed
         return explain_mismatch(proposal, camera_file)
-    is_as_proposed = base is proposed and chosen == proposal.choice
-    load = base if is_as_proposed else read(name_by_photos(camera_file, proposal, chosen, fit), chosen)
+    # 4. The scene with the photos of its views, unless these were proposed
+    load: Loaded | SceneError = base
+    if base is not proposed or chosen != proposal.choice:
+        load = _make_with_photos(make_scene, name_by_photos(camera_file, proposal, chosen, fit), proposal, chosen)
     if isinstance(load, SceneError):
         return load
     described = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
     return replace(load, notes=(*proposal.notes, *load.notes, *described), photos_explain=explain_most)
+
+
+def _make_with_proposed_photos(
+    make_scene: MakeScene, camera_file: CameraFile, proposal: Proposal
+) -> tuple[Loaded | SceneError, Proposal]:
+    """Make a scene with all proposed photos, or with those that are not broken; also return the proposal then used."""
+    load = _make_with_photos(make_scene, camera_file, proposal, proposal.choice)
+    unbroken = proposal.without_broken() if isinstance(load, SceneError) else None
+    if unbroken is None:
+        return load, proposal
+    return _make_with_photos(make_scene, camera_file, unbroken, unbroken.choice), unbroken
+
+
+def _make_with_photos(
+    make_scene: MakeScene, camera_file: CameraFile, proposal: Proposal, chosen: Sequence[Assignment | None]
+) -> Loaded | SceneError:
+    """Make a scene with the chosen photo of each camera."""
+    return _read_or_error(lambda: make_scene(camera_file, read_photos(proposal, chosen, camera_file)))
 
 
 def _leave_out_photos(
@@ -415,25 +416,24 @@ def _leave_out_photos(
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras without their photos, with a note; return the error if photos must not be left out.
 
-    ``cause`` says why photos and cameras do not fit each other. Photos that the caller named are never left out. Others
-    are left out if the cameras are sure to be those of the scene: rows are their pixels, a photo is at fault, or photos
-    were found by the cameras' names. Otherwise the cameras may be those of another scene, which see these Gaussians as
-    well.
+    ``cause`` says why photos and cameras do not fit each other. Photos that the caller named are never left out. Other
+    photos are left out if it is certain that the cameras belong to the scene: if rows are their pixels, if the cause is
+    a photo, or if the photos were found by the cameras' names. Cameras of another scene may also see these Gaussians.
     """
     are_named = "images" in files.named
     if are_named and "cameras" not in files.named and cause.path == camera_file.path:
         return explain_mismatch(proposal, camera_file)  # it blames the named photos, not the cameras that were found
     if are_named or _is_fault_of_named(files, cause):
         return cause
-    bare = _read_or_error(partial(_make_scene_with_views, ply, files, camera_file, ScenePhotos(), hints))
-    are_at_fault = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(proposal.folder)
-    if isinstance(bare, SceneError) or not (bare.scene.has_own_pixels or are_at_fault or proposal.by_names):
+    bare = _read_or_error(partial(_make_scene_with_views, ply, files, hints, camera_file, ScenePhotos()))
+    photo_is_cause = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(proposal.folder)
+    if isinstance(bare, SceneError) or not (bare.scene.has_own_pixels or photo_is_cause or proposal.by_names):
         return cause
     return _note_left_out(bare, replace(files, images=proposal.folder), [f"the photos in {proposal.folder}"], cause)
 
 
 def _is_fault_of_named(files: SceneFiles, cause: SceneError) -> bool:
-    """Return whether an error is about a picture in a folder that the caller named, or about a camera's named mask."""
+    """Return whether an error is about a picture in a folder that the caller named, or about a mask of a camera."""
     folders = (getattr(files, name) for name in ("images", "masks", "protect") if name in files.named)
     return isinstance(cause, CameraMaskError) or any(
         folder is not None and Path(cause.path).is_relative_to(folder) for folder in folders
@@ -441,9 +441,9 @@ def _is_fault_of_named(files: SceneFiles, cause: SceneError) -> bool:
 
 
 def _make_scene_with_views(
-    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, photos: ScenePhotos, hints: ReadHints
+    ply: GaussianFile, files: SceneFiles, hints: ReadHints, camera_file: CameraFile, photos: ScenePhotos
 ) -> Loaded:
-    """Combine Gaussians, cameras and their photos; SceneError if any of them cannot be used."""
+    """Combine Gaussians, cameras and their photos. Raises SceneError if any of them cannot be used."""
     order = _choose_row_order(ply, camera_file, hints)
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
@@ -462,11 +462,11 @@ def _make_scene_with_views(
         result = replace(result, cameras=cameras, images=images)
         notes += size_notes
     size = photo_size(limited)
-    unused = [name for name in ("masks", "protect") if getattr(files, name) is not None]
-    if unused and not size:
-        kind = Doubt if files.named.intersection(unused) else str
-        notes.append(kind(f"the pictures of --{' and --'.join(unused)} are not used, since there are no photos"))
-    views = camera_file, photos, size, result.transform, result.cameras
+    mask_options = [name for name in ("masks", "protect") if getattr(files, name) is not None]
+    if mask_options and not size:
+        text = f"the pictures of --{' and --'.join(mask_options)} are not used, since there are no photos"
+        notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
+    views = camera_file, photos, size, result.transform, result.cameras  # arguments of find_larger_and_masks
     larger_and_masks = _read_or_error(lambda: find_larger_and_masks(files, *views))
     if isinstance(larger_and_masks, SceneError):
         error = larger_and_masks
@@ -480,29 +480,31 @@ def _make_scene_with_views(
 
 
 def _choose_row_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
-    """Choose the order of the rows: by the hints, by the named exporter, or by the format of the cameras."""
-    order = (find_exporter(hints.exporter) or camera_file).order
+    """Choose the order of the rows by the hints, by the named exporter, or by the format of the cameras."""
     if hints.order != "auto":
         return hints.order
+    order = (find_exporter(hints.exporter) or camera_file).order
     return "none" if order == "auto" and RESULT_COMMENT in ply.info.comments else order  # results have no pixels
 
 
 def _make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
-    """Make a scene that has no views; a run places views itself. A note says that photos are not used."""
+    """Make a scene without views, which a run places later. A note says that photos are not used."""
     advice = find_cameras_of_model(ply.info)
     notes = [advice] if advice else []
     _check_hints(ply, hints)
     if files.images is not None:
-        reason = "there are no cameras, such as a transforms.json or a COLMAP model; name them with --cameras"
-        if "cameras" in files.named:
-            reason = f"only cameras show which views they have, and --cameras {NONE} leaves cameras out"
+        reason = (
+            f"only cameras show which views they have, and --cameras {NONE} leaves cameras out"
+            if "cameras" in files.named
+            else "there are no cameras, such as a transforms.json or a COLMAP model; name them with --cameras"
+        )
         notes += [f"the photos in {files.images} are not used: {reason}"]
     problem = "expected one Gaussian per pixel, found no cameras"
     return _make_loaded(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
 
 
 def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
-    """Raise SceneError if a hint gives the order of the rows' pixels; only called if rows have no pixels."""
+    """Raise SceneError if a hint says that rows are pixels. Called for rows that have no pixels."""
     if hints.order not in ("auto", "none"):
         problem = f"expected rows that are pixels of views, as --hint order={hints.order} says, found others"
         raise SceneError(ply.info.path, problem, "leave the hint out, or name the cameras that fit with --cameras")
@@ -520,22 +522,21 @@ def _make_loaded(
 ) -> Loaded:
     """Make a scene of the visible Gaussians and all views, with all facts about how it was read.
 
-    ``result`` has the cameras, the photos, and the pixels of the rows. ``large`` and ``masks`` are those of the views.
-    ``absent`` has the indices of the cameras without a photo.
+    ``result`` has the cameras, the photos, and the pixels of the rows. ``large`` has the larger photos of the views,
+    and ``masks`` has their masks. ``absent`` lists the cameras without a photo.
     """
     camera_file, recovery = result.camera_file, result.recovery
     gaussians, pixels = take_gaussians(ply, result)
     num_faint = int(ply.valid.sum()) - len(gaussians)
-    faint = "fainter than 1/255, which nothing draws, set aside"
-    faint_notes = [count_words(num_faint, "Gaussian", faint)] if num_faint else []
+    faint = count_words(num_faint, "Gaussian", "fainter than 1/255, which nothing draws, set aside")
     masks, mask_notes = check_masks(masks, files, pixels)
     photos = result.images if len(result.images) else None
     names = () if camera_file is None else camera_file.names
     scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)
     last_rows = () if pixels is None else pixels.fronts.max((1, 2))  # -1 for a view without rows
-    empty = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
-    number = f"{len(empty)} of {len(scene)} views {'has' if len(empty) == 1 else 'have'}"
-    doubts = [Doubt(f"{number} no Gaussians: {list_some(empty)}")] if empty else []
+    empty_views = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
+    views_have = f"{len(empty_views)} of {len(scene)} views {'has' if len(empty_views) == 1 else 'have'}"
+    doubts = [Doubt(f"{views_have} no Gaussians: {list_some(empty_views)}")] if empty_views else []
     scene = read_rotations(scene, hints.quats)
     if recovery is not None and result.confirmed_viewmats is not None:
         scene = move_views(scene, result.confirmed_viewmats)
@@ -552,7 +553,7 @@ def _make_loaded(
         files=files,
         cameras=camera_file,
         exporters=choose_exporters(hints.exporter, ply.info, order, source),
-        notes=(*files.notes, *file_notes(ply.info), *doubts, *notes, *faint_notes, *mask_notes),
+        notes=(*files.notes, *file_notes(ply.info), *doubts, *notes, *([faint] if num_faint else []), *mask_notes),
         alignment=alignment,
         recovery=recovery,
         problem=result.problem,
@@ -564,8 +565,8 @@ def _make_loaded(
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Read a scene with its cameras moved into the frame of the Gaussians, if pixels or colours show that frame.
 
-    Otherwise the cameras stay as their file has them. With ``photos``, photos are read, and named photos that cannot be
-    read raise SceneError. Without, no photos are needed. SceneError if named cameras have no size.
+    Otherwise the cameras stay as stored in their file. If ``photos`` is False, no photos are needed. If it is True,
+    named photos that cannot be read raise SceneError. Named cameras without a size also do.
     """
     for with_photos in dict.fromkeys((True, photos)):  # photos help to find the frame even if they are not needed
         load = _choose_cameras(ply, files, hints, photos=with_photos)
@@ -582,9 +583,9 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
 def _keep_stored_cameras(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, *, photos: bool
 ) -> Loaded | None:
-    """Return the scene with its cameras as their file stores them, with a note that they do not fit.
+    """Return the scene with the cameras as stored in their file, and a doubt that they do not fit.
 
-    None if cameras that were not named do not see the Gaussians.
+    Returns None if the caller did not name these cameras, and they do not see the Gaussians.
     """
     from gsmerge.cameras import check_cameras  # few scenes need it
 
@@ -592,6 +593,6 @@ def _keep_stored_cameras(
     cameras = to_cameras(camera_file, photo_size(pictures))
     if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
         return None
-    note = Doubt("the cameras do not fit the Gaussians; they stay as stored in their file")
+    doubt = Doubt("the cameras do not fit the Gaussians; they stay as stored in their file")
     as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
-    return replace(_make_loaded(ply, files, hints, as_stored, [note]), cameras=None)
+    return replace(_make_loaded(ply, files, hints, as_stored, [doubt]), cameras=None)

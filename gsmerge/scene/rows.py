@@ -1,4 +1,4 @@
-"""Take the Gaussians of a scene from the rows of a file, with their pixels, and read columns in other conventions."""
+"""Take the Gaussians of a scene and their pixels from the rows of a file, and read columns in other conventions."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 
 from gsmerge.cameras import AlignmentResult
 from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0, sh0_to_rgb
-from gsmerge.io.formats.color_units import ColorUnits
+from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits
 from gsmerge.io.formats.read import GaussianFile
+from gsmerge.photos.scene_photos import has_nearer_colors
 from gsmerge.raster.photos import LEAST_OPACITY
+from gsmerge.scene.loaded import Loaded
 from gsmerge.settings.reading import QuatChoice
 from gsmerge.types import Gaussians, Pixels, Scene
 
@@ -19,28 +21,30 @@ _BLOCK = 1 << 20  # numbers that are compared at once
 
 
 def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussians, Pixels | None]:
-    """Take the rows of a file that are visible Gaussians; sort them by their pixels, and return these, if known.
+    """Return the visible Gaussians of a file, sorted by their pixels, and these pixels; None for unknown pixels.
 
-    If all Gaussians are too faint to be drawn, all valid rows are taken.
+    If all Gaussians are too faint to be drawn, all valid rows are returned.
     """
-    taken = ply.valid & (ply.gaussians.opacities >= LEAST_OPACITY)
-    taken = taken if taken.any() else ply.valid
-    grid, ids = (len(result.cameras), result.cameras.height, result.cameras.width), result.pixel_ids
-    if ids is None or (len(ids) == prod(grid) and _counts_up(ids)):
+    is_visible = ply.valid & (ply.gaussians.opacities >= LEAST_OPACITY)
+    taken = is_visible if is_visible.any() else ply.valid
+    grid, pixel_ids = (len(result.cameras), result.cameras.height, result.cameras.width), result.pixel_ids
+    # rows without pixels, or all pixels in order
+    if pixel_ids is None or (len(pixel_ids) == prod(grid) and _counts_up(pixel_ids)):
         gaussians = ply.gaussians if taken.all() else ply.gaussians[taken]
-        return gaussians, None if ids is None else Pixels.of_grid(taken.reshape(grid))
+        return gaussians, None if pixel_ids is None else Pixels.of_grid(taken.reshape(grid))
     rows = np.flatnonzero(taken)
-    row_pixels = ids[rows]  # -1 for rows without a pixel
-    is_sorted = _increases(row_pixels)  # each row has a pixel of its own, and rows are in the order of pixels
+    row_pixels = pixel_ids[rows]  # -1 for rows without a pixel
+    is_sorted = _increases(row_pixels)
     if not is_sorted:
         order = np.argsort(row_pixels, kind="stable")
         rows, row_pixels = rows[order], row_pixels[order]
     gaussians = ply.gaussians if is_sorted and len(rows) == len(taken) else ply.gaussians[rows]
+    # each row has a pixel of its own
     if row_pixels[0] >= 0 and (is_sorted or _increases(row_pixels)):
-        mask = np.zeros(prod(grid), bool)
-        mask[row_pixels] = True
-        return gaussians, Pixels.of_grid(mask.reshape(grid))
-    # several Gaussians share a pixel, or some have none
+        has_row = np.zeros(prod(grid), bool)
+        has_row[row_pixels] = True
+        return gaussians, Pixels.of_grid(has_row.reshape(grid))
+    # several Gaussians share a pixel, or some have no pixel
     with_pixel = np.flatnonzero(row_pixels >= 0)
     points, views = gaussians.means[with_pixel].astype(np.float64), row_pixels[with_pixel] // prod(grid[1:])
     depths = camera_depths(points, result.cameras.viewmats, views)
@@ -56,25 +60,40 @@ def _increases(ids: np.ndarray) -> bool:
 
 
 def _counts_up(ids: np.ndarray) -> bool:
-    """Return whether numbers are 0, 1, 2, ...; many millions are compared block by block, which takes less memory."""
+    """Return whether numbers are 0, 1, 2, ... They are compared block by block, which takes less memory."""
     blocks = ((first, ids[first : first + _BLOCK]) for first in range(0, len(ids), _BLOCK))
     return all(np.array_equal(block, np.arange(first, first + len(block), dtype=ids.dtype)) for first, block in blocks)
 
 
-def read_as_harmonics(scene: Scene, units: ColorUnits) -> Scene:
-    """Return a scene whose colours are harmonics, if its file was read as having RGB in ``units``."""
+def _read_as_harmonics(scene: Scene, units: ColorUnits) -> Scene:
+    """Return a scene with colours read as harmonics, from a scene whose colours were read as RGB in ``units``."""
     stored = units.black + (units.white - units.black) * sh0_to_rgb(scene.gaussians.sh0)
     return replace(scene, gaussians=replace(scene.gaussians, sh0=stored.astype(np.float32)))
 
 
-def read_as_rgb(scene: Scene, units: ColorUnits) -> Scene:
-    """Return a scene whose colours are RGB in ``units``, if its file was read as having harmonics."""
+def _read_as_rgb(scene: Scene, units: ColorUnits) -> Scene:
+    """Return a scene with colours read as RGB in ``units``, from a scene whose colours were read as harmonics."""
     sh0 = rgb_to_sh0(units.rgb(scene.gaussians.sh0))
     return replace(scene, gaussians=replace(scene.gaussians, sh0=sh0.astype(np.float32)))
 
 
+def confirm_colors(load: Loaded) -> Loaded:
+    """Read colours as RGB instead of harmonics, or the other way round, if the file allows both and photos show it."""
+    old_info, units = load.info, load.info.open_units
+    if units is None or load.scene.images is None:
+        return load
+    was_rgb = old_info.color_units is not None  # the colours were read as RGB, and harmonics are tried here
+    other = (_read_as_harmonics if was_rgb else _read_as_rgb)(load.scene, units)
+    if not has_nearer_colors(other, load.scene):
+        return load
+    new_notes = [] if was_rgb else [RGB_NOTE.format(units.name, "photos show it")]
+    notes = (*new_notes, *(text for text in load.notes if text != old_info.color_note))
+    info = replace(old_info, color_units=None if was_rgb else units, color_note="".join(new_notes))
+    return replace(load, scene=other, info=info, notes=notes)
+
+
 def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
-    """Return a scene whose file was read as having quaternions wxyz, with those in the order ``quats`` of its file."""
+    """Return a scene with quaternions read in the order ``quats``, from a scene whose quaternions were read as wxyz."""
     if quats == "wxyz":
         return scene
     return replace(scene, gaussians=replace(scene.gaussians, quats=np.roll(scene.gaussians.quats, 1, axis=1)))

@@ -1,4 +1,4 @@
-"""Read the cameras and photos of a scene at a size that memory has room for; find larger photos and masks."""
+"""Read the cameras of a scene, limit the size of its photos, and find its larger photos and its masks."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ _EDGE_ROUNDING = 1e-6  # pixels by which the edge of a window may be off
 
 
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
-    """Read a scene's cameras from their file or the ``.ply``, or estimate them from the rows; None if that fails too.
+    """Read a scene's cameras from their file or the ``.ply``, or estimate them from the rows; None if there are none.
 
-    SceneError for a file of poses alone, without a focal length. Repeated views are dropped, unless the number of rows
-    is a multiple of the number of views.
+    Repeated views are dropped, unless the number of rows is a multiple of the number of views. Raises SceneError if a
+    file has poses, but no focal length.
     """
     if files.cameras is not None:
         stored = read_cameras(files.cameras, folder=files.ply.parent)
         if not stored.has_intrinsics:
             raise missing_intrinsics(stored.path)
-        # if the number is a multiple, each view may have rows of its own
+        # if rows are a multiple of views, repeated views may also have rows of their own
         return drop_repeats(stored) if len(ply.gaussians) % len(stored) else stored
     if files.is_state:  # cameras of a state are in its own file, or there are none
         return None
@@ -59,9 +59,9 @@ def find_larger_and_masks(
     transform: PhotoTransform | None,
     cameras: Cameras,
 ) -> tuple[LargePhotos | None, Masks, list[str]]:
-    """Find the photos at the size of their files, if that is larger than the scene's, and masks of pixels that count.
+    """Find the photos at the size of their files, if this size is larger than the scene's, and the masks of photos.
 
-    A larger photo is read from its file when it is used; photos inside other files stay in memory. Masks come from
+    A larger photo is read from its file when it is used. Photos inside other files stay in memory. Masks come from
     files and from the photos' transparency.
 
     Args:
@@ -73,14 +73,13 @@ def find_larger_and_masks(
         cameras: The scene's cameras, in the order of the camera file.
 
     Returns:
-        The larger photos (None without any), the masks, and notes.
+        The larger photos (None if there are none), the masks, and notes.
     """
     stored = photos.file_size or photo_size(photos.pictures)
     if stored is None or size is None:
         return None, NO_MASKS, []
-    paths = photos.paths
     window = _file_window(stored, size, transform, cameras)
-    lenses = camera_file.lenses if paths else ()
+    lenses = camera_file.lenses if photos.paths else ()
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if lenses else None
 
     def cut(view: int, picture: np.ndarray) -> np.ndarray:
@@ -91,9 +90,9 @@ def find_larger_and_masks(
 
     def read(view: int) -> np.ndarray:
         """Return the larger photo of a view."""
-        if not paths:
+        if not photos.paths:
             return cut(view, photos.pictures[view])
-        return cut(view, decode_photos([paths[view]], [photos.turns[view]], stored, photos.part)[0])
+        return cut(view, decode_photos([photos.paths[view]], [photos.turns[view]], stored, photos.part)[0])
 
     large = None
     if window.is_larger:
@@ -113,20 +112,21 @@ class _Window:
 
 
 def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
-    """Find the part that the views show of files of the size ``stored``.
+    """Find the part of a photo's file that the view shows, for files of the size ``stored``.
 
     The other parameters are those of :func:`find_larger_and_masks`.
     """
-    known = transform or resize_to(size, size)
-    scale = np.array([known.scale_x, known.scale_y]) * size / np.array(stored)  # from pixels of the file to the grid
-    corner, grid = np.array([known.left, known.top]), np.array([known.width, known.height])
-    reduction = np.array([cameras.width, cameras.height]) / grid  # views of unaligned scenes may be reduced again
-    first = np.floor(corner / scale).astype(int)
-    last = np.minimum(np.ceil((corner + grid) / scale - _EDGE_ROUNDING).astype(int), stored)
+    # all arrays hold x and y
+    to_grid = transform or resize_to(size, size)
+    scale = np.array([to_grid.scale_x, to_grid.scale_y]) * size / np.array(stored)  # from pixels of the file to a grid
+    corner, grid_size = np.array([to_grid.left, to_grid.top]), np.array([to_grid.width, to_grid.height])
+    reduction = np.array([cameras.width, cameras.height]) / grid_size  # views of unaligned scenes may be reduced again
+    start = np.floor(corner / scale).astype(int)
+    stop = np.minimum(np.ceil((corner + grid_size) / scale - _EDGE_ROUNDING).astype(int), stored)
     to_file = np.eye(3)
     to_file[(0, 1), (0, 1)] = 1 / (scale * reduction)
-    to_file[:2, 2] = corner / scale - first
-    (left, top), (right, bottom) = first.tolist(), last.tolist()
+    to_file[:2, 2] = corner / scale - start
+    (left, top), (right, bottom) = start.tolist(), stop.tolist()
     return _Window(slice(top, bottom), slice(left, right), to_file, bool((scale * reduction).max() < 1))
 
 
@@ -135,39 +135,40 @@ def limit_photo_size(
 ) -> tuple[PhotoArrays, list[str]]:
     """Resize photos that are too large for memory to at most ``max_side`` pixels per side; return them and notes.
 
-    Photos keep their size if they fit into memory. They also keep it if there are more than half as many rows as pixels
-    of photos, because the rows may then be these pixels. With ``unaligned``, the rows are known to have no pixels, so
+    Photos that fit into memory keep their size. Photos also keep it if their pixels are less than twice as many as the
+    rows, because the rows may be these pixels. If ``unaligned`` is True, the rows are known to have no pixels, so
     photos are resized whatever memory they take.
     """
     size = photo_size(photos)
     if size is None:
         return photos, []
-    pixels = len(photos) * size[0] * size[1]
+    num_pixels = len(photos) * size[0] * size[1]
     pixel_bytes = 12  # bytes of a pixel as three floats
-    if not unaligned and (pixel_bytes * pixels <= _MAX_BYTES or 2 * num_rows > pixels):
+    if not unaligned and (pixel_bytes * num_pixels <= _MAX_BYTES or 2 * num_rows > num_pixels):
         return photos, []
-    transform, notes = _limit(size, max_side)
+    transform, notes = _choose_reduction(size, max_side)
     return photos if transform is None else keep_photos(transform.photos(photos)), notes
 
 
 def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tuple[Cameras, np.ndarray, list[str]]:
     """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; return them and a note.
 
-    The size is the same as that of :func:`gsmerge.measure.sizes.shrink_views`, but the pixels differ. Here photos are
-    resized as their files are. There they are resized as the renders that they are compared with.
+    The function :func:`gsmerge.measure.sizes.shrink_views` chooses the same size, but resizes photos as renders are
+    resized. This function resizes photos as the photos of files are resized.
     """
-    transform, notes = _limit((cameras.width, cameras.height), max_side)
+    transform, notes = _choose_reduction((cameras.width, cameras.height), max_side)
     if transform is not None:
         cameras, smaller = transform.cameras(cameras), transform.photos(images)
-        pictures = [smaller[view] for view in range(len(smaller))]
-        images = np.array(pictures, images.dtype).reshape(-1, cameras.height, cameras.width, 3)
+        images = np.array([smaller[view] for view in range(len(smaller))], images.dtype).reshape(
+            -1, cameras.height, cameras.width, 3
+        )
     return cameras, images, notes
 
 
-def _limit(size: Size, max_side: int) -> tuple[PhotoTransform | None, list[str]]:
-    """Return how pictures are resized to ``max_side`` pixels, and a note; None and no note if they are small enough."""
+def _choose_reduction(size: Size, max_side: int) -> tuple[PhotoTransform | None, list[str]]:
+    """Return how pictures are reduced to ``max_side`` pixels per side, and a note; None if they are small enough."""
     smaller = limit_size(size, max_side)
     if smaller == size:
         return None, []
-    note = f"views of {size[0]} x {size[1]} are resized to {smaller[0]} x {smaller[1]}"
-    return resize_to(size, smaller), [f"{note}, since max_side allows {max_side} pixels per side"]
+    sizes = f"views of {size[0]} x {size[1]} are resized to {smaller[0]} x {smaller[1]}"
+    return resize_to(size, smaller), [f"{sizes}, since max_side allows {max_side} pixels per side"]

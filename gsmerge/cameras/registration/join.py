@@ -26,13 +26,13 @@ class JoinedScene:
     used: tuple[int, ...]  # numbers of the input scenes that are joined
     names: tuple[str, ...]  # of all input scenes, for messages
     notes: tuple[str, ...]  # for the user, one sentence each
-    # For each input scene: its path, and whether it was joined. For joined scenes also the number of keypoints by which
-    # they were registered, the angle of their rotation in degrees, their scale, and the shift of their origin
+    # For each input scene its path, and whether it was joined. A joined scene also has the number of keypoints by which
+    # it was registered, the angle of its rotation in degrees, its scale, and the shift of its origin
     facts: tuple[dict[str, Any], ...]
 
 
 def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
-    """Join scenes of pixels of one place, each with its own frame and scale, into one scene.
+    """Join scenes of one place into one scene. All have pixels, and each has a frame and a scale of its own.
 
     ``paths`` are their files, for messages. Raises SceneError if a scene has no pixels, if views or harmonics differ in
     size, or if no two scenes show the same surfaces.
@@ -44,41 +44,38 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     used = [i for i, similarity in enumerate(registration.similarities) if similarity is not None]
     if len(used) < 2:
         problem = f"expected files that show one place, found no two of {len(paths)}"
-        remedy = "give photos that overlap by half, name their folder with --images"
-        remedy += ", or compact each file by itself"
+        remedy = "give photos that overlap by half, name their folder with --images, or compact each file by itself"
         raise SceneError(paths[0], f"{problem} whose photos share enough of it", remedy)
     moved = [move_scene(scenes[i], move) for i in used if (move := registration.similarities[i]) is not None]
     counts = [registration.matches[i] for i in used]
     joined = f"{len(used)} of {len(scenes)} files are joined in the frame of {names[used[0]]}"
-    notes = [f"{joined}, by {min(counts)} to {max(counts)} keypoints each"]
     left_out = "is left out: its photo shares too few keypoints with the others"
-    notes += [Doubt(f"{name} {left_out}") for i, name in enumerate(names) if i not in used]
+    notes = [
+        f"{joined}, by {min(counts)} to {max(counts)} keypoints each",
+        *(Doubt(f"{name} {left_out}") for i, name in enumerate(names) if i not in used),
+    ]
     if len({scene.images is None for scene in moved}) > 1:
         notes.append(Doubt("some files have no photos, so none are used; name the folder of all with --images"))
-    facts = [
-        _describe_scene(*entry) for entry in zip(paths, registration.similarities, registration.matches, strict=True)
-    ]
+    facts = map(_describe_scene, paths, registration.similarities, registration.matches)
     return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 
 
 def _check_joinable(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
     """Raise SceneError if a scene has no pixels, or differs from the first scene in size or degree of harmonics."""
-    first = scenes[0]
-    size = first.cameras.width, first.cameras.height
-    degree = first.gaussians.sh_degree
+    size = scenes[0].cameras.width, scenes[0].cameras.height
+    degree = scenes[0].gaussians.sh_degree
     for scene, path in zip(scenes, paths, strict=True):
         scene_size = scene.cameras.width, scene.cameras.height
         sh_degree = scene.gaussians.sh_degree
         if not scene.has_own_pixels:
-            actual = "no cameras"
-            if len(scene):
-                actual = count_words(len(scene), "camera", "and Gaussians that are no pixels")
+            actual = (
+                count_words(len(scene), "camera", "and Gaussians that are no pixels") if len(scene) else "no cameras"
+            )
             problem = f"expected cameras and one Gaussian for each of their pixels, as scenes to join, found {actual}"
             raise SceneError(path, problem, "compact it by itself")
         if scene_size != size:
-            problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}"
-            problem += f", found {scene_size[0]} x {scene_size[1]}"
-            raise SceneError(path, problem, "export all at one size")
+            expected, actual = f"{size[0]} x {size[1]} as in {paths[0].name}", f"{scene_size[0]} x {scene_size[1]}"
+            raise SceneError(path, f"expected views of {expected}, found {actual}", "export all at one size")
         if sh_degree != degree:
             problem = f"expected harmonics of degree {degree} as in {paths[0].name}, found {sh_degree}"
             raise SceneError(path, problem, "export all with one degree")
@@ -91,8 +88,12 @@ def _describe_scene(path: Path, similarity: Similarity | None, matches: int) -> 
         return facts
     half_cosine = np.abs(rotmat_to_quat(similarity.rotation[None])[0, :1]).clip(0, 1)
     degrees = round(float(np.degrees(2 * arccos(half_cosine))[0]), 4)
-    facts |= {"matches": matches, "degrees": degrees}
-    return facts | {"scale": similarity.scale, "shift": similarity.shift.tolist()}
+    return facts | {
+        "matches": matches,
+        "degrees": degrees,
+        "scale": similarity.scale,
+        "shift": similarity.shift.tolist(),
+    }
 
 
 def move_scene(scene: Scene, similarity: Similarity) -> Scene:

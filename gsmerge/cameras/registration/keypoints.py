@@ -32,7 +32,7 @@ class PhotoKeypoints:
 
 @dataclass(frozen=True, eq=False)
 class MatchSide:
-    """One scene's half of m keypoint matches: pixels, points and cameras."""
+    """The keypoints of one scene in m matches with another scene: pixels, points and cameras."""
 
     points: np.ndarray  # [m,3] in the scene's frame
     pixels: np.ndarray  # [m,2] positions in the scene's grid
@@ -68,9 +68,9 @@ def find_keypoints(scene: Scene) -> list[PhotoKeypoints]:
         K = cameras.Ks[view].astype(np.float64)
         viewmat = cameras.viewmats[view].astype(np.float64)
         picture, picture_K = _read_picture(scene, view, K)
-        places, descriptors = _detect_keypoints(picture, picture_K[1, 1] / picture_K[0, 0])
-        zoom = K[0, 0] / picture_K[0, 0], K[1, 1] / picture_K[1, 1]
-        pixels = (places - picture_K[:2, 2]) * zoom + K[:2, 2]
+        picture_pixels, descriptors = _detect_keypoints(picture, picture_K[1, 1] / picture_K[0, 0])
+        focal_ratios = K[0, 0] / picture_K[0, 0], K[1, 1] / picture_K[1, 1]
+        pixels = (picture_pixels - picture_K[:2, 2]) * focal_ratios + K[:2, 2]
         z, is_surface = _depths_at(_surface_depths(scene, view, viewmat), pixels)
         rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
         points = matmul(rays[is_surface] * z[is_surface, None] - viewmat[:3, 3], viewmat[:3, :3])
@@ -169,7 +169,7 @@ def match_photos(
 
 
 def _make_side(photos: Sequence[PhotoKeypoints], rows: Sequence[np.ndarray]) -> MatchSide:
-    """Collect the keypoints of photos; each photo has the numbers of its keypoints in ``rows``."""
+    """Collect the matched keypoints of photos, whose indices in each photo are ``rows``."""
     photo_rows = list(zip(photos, rows, strict=True))
     counts = [len(ids) for ids in rows]
     return MatchSide(
@@ -181,9 +181,9 @@ def _make_side(photos: Sequence[PhotoKeypoints], rows: Sequence[np.ndarray]) -> 
 
 
 def _match_descriptors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Match descriptors ``a`` and ``b``; return the rows in each of those that match.
+    """Match descriptors ``a`` and ``b``; return the rows of ``a`` that match, and their rows of ``b``.
 
-    Two descriptors match if each is the best match of the other, clearly better than the second best.
+    Two descriptors match if each is the best match of the other, and clearly better than the second-best match.
     """
     if min(len(a), len(b)) < 2:  # there is no second best
         return np.empty(0, int), np.empty(0, int)

@@ -1,10 +1,10 @@
 """Register scenes of one place: find the similarities between their frames from photos and depths.
 
-Matched keypoints of two photos are points of both scenes, at the depths of the Gaussians in their pixels. Three matches
-determine a similarity (Umeyama 1991). Similarities are fitted to random triples, and the similarity that agrees with
-most matches is chosen. Then all scenes are moved at once by Gauss-Newton steps, until points project to their keypoints
-in the other photos. A single depth may be wrong. So residuals allow a point to move along its ray, within the standard
-deviation of depths.
+A keypoint is a point of its scene, at the depth of the Gaussian in its pixel. If keypoints of photos of two scenes
+match, their points are the same. Three matches determine a similarity (Umeyama 1991). Similarities are fitted to random
+triples, and the similarity that agrees with most matches is chosen. Then all scenes are moved at once by Gauss-Newton
+steps, until points project to their keypoints in the other photos. A single depth may be wrong. So residuals allow a
+point to move along its ray, within the standard deviation of depths.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ from gsmerge.types import Scene
 DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
 NORMAL_2D = 1 / 1.1774  # standard deviation of two normal components, divided by the median length of their vector
 AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
-# Multiples of AGREE up to which matches are used in each round. The first are large because chains of scenes drift
+# Largest squared residual of the matches that each round uses, divided by AGREE. The first are large, because errors
+# add up along a chain of scenes
 LOOSE = (100.0, 10.0, 2.0, 2.0)
 MIN_MATCHES = 16  # least number of agreeing matches of two connected scenes; unrelated photos have up to 5
-SIMILARITY_DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
+SIMILARITY_DAMPING = Damping(steps=40, first=1e-4, decrease=0.1, increase=10.0, largest=1e6, min_gain=1e-9)
 NUM_PARAMETERS = 7  # parameters of a step: rotation, shift, logarithm of the scale
 
 Similarities = Sequence[Similarity | None]
@@ -61,10 +62,10 @@ class Registration:
 
 
 def register(scenes: Sequence[Scene]) -> Registration:
-    """Find the similarities that map aligned scenes, with grids of one size, into the frame of the first connected one.
+    """Find the similarities that map scenes into the frame of the first connected scene.
 
     Scenes are connected if enough keypoints of their photos match. If they form several connected sets, the largest is
-    used.
+    used. All scenes have pixels, and grids of one size.
     """
     count, cameras = len(scenes), scenes[0].cameras
     photos = [find_keypoints(scene) for scene in scenes]
@@ -75,8 +76,10 @@ def register(scenes: Sequence[Scene]) -> Registration:
     similarities = _chain_largest_set(links, count)
     connected = [pair for _, pair in links if all(similarities[scene] is not None for scene in pair.scenes)]
     spread = DEPTH_SPREAD
-    for loose in LOOSE if connected else ():
-        agreeing = [pair.select(_squared_residuals(similarities, pair, spread) < loose * AGREE) for pair in connected]
+    for multiple in LOOSE if connected else ():
+        agreeing = [
+            pair.select(_squared_residuals(similarities, pair, spread) < multiple * AGREE) for pair in connected
+        ]
         similarities = _refine_similarities(similarities, agreeing, spread)
         connected, spread = _measure_spreads(similarities, connected)
     agreeing = [pair.select(_squared_residuals(similarities, pair, spread) < AGREE) for pair in connected]
@@ -98,10 +101,10 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
         return None
     pair = replace(matches, scenes=(0, 1))
     trials = _sample_similarities(matches)
-    misses = [_squared_residuals((trial, IDENTITY), pair, DEPTH_SPREAD) for trial in trials]
-    scores = [(1 - squares / AGREE).clip(0).sum() for squares in misses]
-    similarities: Similarities = (trials[int(np.argmax(scores))], IDENTITY)
-    agree = misses[int(np.argmax(scores))] < AGREE
+    squares = [_squared_residuals((trial, IDENTITY), pair, DEPTH_SPREAD) for trial in trials]
+    best = int(np.argmax([(1 - trial_squares / AGREE).clip(0).sum() for trial_squares in squares]))
+    similarities: Similarities = (trials[best], IDENTITY)
+    agree = squares[best] < AGREE
     rounds = 3  # in each, the similarity is refined and the agreeing matches are selected anew
     for _ in range(rounds):
         if agree.sum() < MIN_MATCHES // 2:
@@ -116,7 +119,7 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
 
 
 def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
-    """Fit similarities to random triples of matches; return those with which the points of most matches agree."""
+    """Fit similarities to random triples of matches; return the similarities that agree with most matches."""
     rng = np.random.default_rng(0)
     p, q = (side.points for side in matches.sides)
     first_depths, second_depths = (camera_depths(side.points, side.viewmats) for side in matches.sides)
@@ -158,8 +161,8 @@ def _one_way_residuals(
 ) -> _Residuals:
     """Compute the errors between projected points of one side and the keypoints of the other.
 
-    ``similarity`` maps from the frame of ``side`` to the frame of ``other``. The errors are in standard deviations:
-    ``pixels`` is that of a keypoint, and ``spread`` that of the logarithm of a depth.
+    ``similarity`` maps from the frame of ``side`` to the frame of ``other``. The errors are in standard deviations.
+    A keypoint has the standard deviation ``pixels``, and the logarithm of a depth has ``spread``.
     """
     rotmats = other.viewmats[:, :3, :3]
     moved = similarity.move_points(side.points)
@@ -168,13 +171,14 @@ def _one_way_residuals(
     projected = transform(other.Ks, camera)[:, :2] / z[:, None]
     by_camera = np.zeros((len(moved), 3, 3))
     by_camera[:, :2] = (other.Ks[:, :2] - projected[..., None] * np.eye(3)[2]) / z[:, None, None]
-    # shift of the position in the photo if a depth is wrong by one standard deviation
-    poses = side.viewmats[:, :3, :3]
-    eyes = -transform(poses.swapaxes(1, 2), side.viewmats[:, :3, 3])
-    along = similarity.scale * transform(rotmats, matmul(side.points - eyes, similarity.rotation.T))
-    streaks = spread * transform(by_camera[:, :2], along)
-    lengths = np.maximum((streaks * streaks).sum(1), 1e-30)
-    shrink = (1 - pixels / np.sqrt(pixels**2 + lengths)) / lengths
+    # a depth that is wrong by one standard deviation shifts the position in the photo by a streak
+    side_rotmats = side.viewmats[:, :3, :3]
+    centres = -transform(side_rotmats.swapaxes(1, 2), side.viewmats[:, :3, 3])
+    rays = similarity.scale * transform(rotmats, matmul(side.points - centres, similarity.rotation.T))
+    streaks = spread * transform(by_camera[:, :2], rays)
+    squared_lengths = np.maximum((streaks * streaks).sum(1), 1e-30)
+    # errors along the streak count less
+    shrink = (1 - pixels / np.sqrt(pixels**2 + squared_lengths)) / squared_lengths
     outer = shrink[:, None, None] * streaks[:, :, None] * streaks[:, None]
     whiten = (np.eye(2) - outer) / pixels
     by_camera[:, :2] = matmul(whiten, by_camera[:, :2])
@@ -207,35 +211,37 @@ def _two_way_residuals(similarities: Similarities, matches: KeypointMatches, spr
 def _measure_spreads(
     similarities: Similarities, matches: Sequence[KeypointMatches]
 ) -> tuple[list[KeypointMatches], float]:
-    """Measure the standard deviations of keypoints and of depths robustly.
+    """Measure the standard deviations of keypoints and of logarithms of depths, robustly.
 
-    Returns the matches with the measured standard deviation of keypoints, and that of the logarithms of depths.
+    Returns the matches with the first standard deviation, and the second one by itself.
     """
-    values = [_two_way_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
-    lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
-    ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
-    spread = NORMAL_SPREAD * float(lower_median(ratios))
+    errors = [_two_way_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
+    # residuals are in standard deviations; here they become pixels, and differences of logarithms of depths
+    lengths = [pair.spread * np.sqrt((xyz[:, :2] ** 2).sum(1)) for pair, xyz in zip(matches, errors, strict=True)]
+    depth_errors = np.abs(np.concatenate(errors)[:, 2]) * DEPTH_SPREAD
+    depth_spread = NORMAL_SPREAD * float(lower_median(depth_errors))
     min_pixels = 0.2  # least measured standard deviation of a keypoint, pixels
     pixels = max(NORMAL_2D * float(lower_median(np.concatenate(lengths))), min_pixels)
     measured = [replace(pair, spread=min(pixels, pair.spread)) for pair in matches]
     min_depth_spread = 0.01  # least measured standard deviation of the logarithm of a depth
-    return measured, min(max(spread, min_depth_spread), DEPTH_SPREAD)
+    return measured, min(max(depth_spread, min_depth_spread), DEPTH_SPREAD)
 
 
 # All scenes
 
 
 def _chain_largest_set(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
-    """Return similarities of the largest connected set of scenes into the frame of its first scene; None for others.
+    """Return the similarities of the largest connected set of scenes, into the frame of its first scene.
 
-    Scenes are placed one after the other, along the links with most matches. ``count`` is the number of all scenes.
+    Scenes are placed one after the other, along the links with most matches. The result has None for all other scenes.
+    ``count`` is the number of all scenes.
     """
-    strength = [0] * count
+    num_matches = [0] * count
     for _, pair in links:
         for scene in pair.scenes:
-            strength[scene] += len(pair)
+            num_matches[scene] += len(pair)
     best: Similarities = []
-    for start in sorted(range(count), key=lambda scene: -strength[scene]):
+    for start in sorted(range(count), key=lambda scene: -num_matches[scene]):
         similarities = _chain_from_scene(start, links, count)
         if _count_placed(similarities) > _count_placed(best):
             best = similarities
@@ -264,7 +270,11 @@ def _chain_from_scene(start: int, links: Sequence[tuple[Similarity, KeypointMatc
     similarities: list[Similarity | None] = [None] * count
     similarities[start] = IDENTITY
     while True:
-        half_placed = [link for link in links if sum(similarities[scene] is not None for scene in link[1].scenes) == 1]
+        half_placed = [
+            (similarity, pair)
+            for similarity, pair in links
+            if sum(similarities[scene] is not None for scene in pair.scenes) == 1
+        ]
         if not half_placed:
             return similarities
         similarity, pair = max(half_placed, key=lambda link: len(link[1]))
@@ -293,8 +303,8 @@ def _refine_similarities(
     def step(state: _SimilarityFit, damping: float) -> _SimilarityFit | None:
         """Return the fit after one damped Gauss-Newton step; None if the step is not finite."""
         current, (_, curvature, slope) = state
-        scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
-        steps = -solve(curvature + np.diag(scale), slope).reshape(-1, NUM_PARAMETERS)
+        added = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
+        steps = -solve(curvature + np.diag(added), slope).reshape(-1, NUM_PARAMETERS)
         if not np.isfinite(steps).all():
             return None
         moved = list(current)
@@ -302,7 +312,7 @@ def _refine_similarities(
             moved[i] = compose(current[i] or IDENTITY, _make_similarity(vector))
         return linearise(moved)
 
-    return descend(linearise(similarities), lambda state: state[1][0], step, SIMILARITY_DAMPING)[0]
+    return descend(linearise(similarities), lambda fit: fit[1][0], step, SIMILARITY_DAMPING)[0]  # [1][0]: the cost
 
 
 def _make_similarity(step: np.ndarray) -> Similarity:
@@ -332,9 +342,11 @@ def _normal_equations(
             squares = (residuals.values**2).sum(1)
             weights = 1 / (1 + squares / half_weight)
             cost += half_weight * float(log1p(squares / half_weight).sum())
+            # a step of the source scene moves points before the similarity; a step of the target, back and after it
             source_jacobian = _differentiate_by_step(residuals.slopes, pair.sides[source].points, similarity)
             target_jacobian = -_differentiate_by_step(residuals.slopes, residuals.moved, IDENTITY)
             jacobians = {pair.scenes[source]: source_jacobian, pair.scenes[1 - source]: target_jacobian}
+            # scenes that are not free stay where they are
             jacobians = {scene: jacobian for scene, jacobian in jacobians.items() if scene in columns}
             for scene, jacobian in jacobians.items():
                 weighted = (weights[:, None, None] * jacobian).reshape(-1, NUM_PARAMETERS).T
@@ -346,9 +358,10 @@ def _normal_equations(
 
 
 def _differentiate_by_step(slopes: np.ndarray, points: np.ndarray, similarity: Similarity) -> np.ndarray:
-    """Return the derivatives ``[m,3,7]`` of residuals by a step that moves their points before ``similarity`` does.
+    """Return the derivatives ``[m,3,7]`` of residuals by the parameters of a step.
 
-    ``slopes [m,3,3]`` are the derivatives of the residuals by the moved points.
+    The step moves ``points [m,3]`` before ``similarity`` moves them. ``slopes [m,3,3]`` are the derivatives of the
+    residuals by the moved points.
     """
     by_point = similarity.scale * matmul(slopes, similarity.rotation)
     x, y, z = points.T
@@ -359,7 +372,10 @@ def _differentiate_by_step(slopes: np.ndarray, points: np.ndarray, similarity: S
 
 
 def _choose_shift_unit(photos: Sequence[Sequence[PhotoKeypoints]], similarities: Similarities) -> float:
-    """Return the unit in which shifts are rounded: the power of two above the first placed scene's median depth."""
+    """Return the unit in which shifts are rounded. It is the power of two above the first placed scene's median depth.
+
+    Without keypoints in this scene the unit is 1.
+    """
     first = next(scene_photos for scene_photos, each in zip(photos, similarities, strict=True) if each is not None)
     depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
     return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0
