@@ -55,7 +55,7 @@ def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
 
 
 def count_links(path: Path) -> int:
-    """Count the symbolic links in a path. If several paths lead to a scene, the one with the fewest links names it."""
+    """Count the symbolic links in a path. Of several paths to a scene, the path with the fewest links names it."""
     return sum(map(os.path.islink, (path.absolute(), *path.absolute().parents)))
 
 
@@ -169,7 +169,7 @@ class _Search:
 
 
 def _is_packed(path: Path) -> bool:
-    """Return whether a file is a zip archive with Gaussians, which counts as a scene so that its reader refuses it."""
+    """Return whether a file is a zip archive with Gaussians. It counts as a scene, so that its reader refuses it."""
     if path.suffix != ".zip" or path.with_suffix("").exists():  # an archive beside its unpacked folder is not needed
         return False
     with suppress(OSError, SceneError, BadZipFile), open_archive(path) as archive:

@@ -97,7 +97,7 @@ class CompactCall:
         settings = self.settings.to_dict()
         del settings["threads"]
         checkpoint = Path(self.settings.checkpoint)
-        if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # the content counts, not the path
+        if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # its path does not change the result
             settings["checkpoint"] = file_sha256(checkpoint)
         without = [name for name in sorted(files.named) if getattr(files, name) is None]
         reading = {"opacity": self.opacity, **vars(self.hints), "without": without}
@@ -127,7 +127,7 @@ class Job:
     scene: str  # path of a file of Gaussians or of its folder
     outputs: tuple[str, ...]  # names of the result and of its coarser levels in the output folder
     call: CompactCall
-    num_gaussians: int  # estimated by the headers or the sizes of its files; 0 if they cannot be read
+    num_gaussians: int  # estimated from the headers or the sizes of the scene's files; 0 if they cannot be read
     num_rest: int = 0  # values of higher harmonics of a Gaussian, estimated in the same way
     cameras: StrPath | None = None  # None for those beside the scene
     images: StrPath | None = None  # None for those beside the scene

@@ -209,7 +209,7 @@ def _make_result(job: Job, run: Run, mark: Path) -> dict[str, Any]:
     if refused:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
     out, cameras = run.folder / job.output, viewer_cameras_path(run.folder / job.output)
-    # A camera file that is there may be the input's, or that of a result of the same name in another format
+    # A camera file of this name may be the input's, or may belong to a result of the same name in another format
     owns_cameras = known is not None and any(run.folder / file["path"] == cameras for file in known.files)
     writes_cameras = os.path.realpath(cameras) not in map(os.path.realpath, files.paths) and (
         owns_cameras or run.overwrite or not os.path.lexists(cameras)

@@ -262,7 +262,7 @@ def _machine_hash() -> str:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove temporary files in a folder whose process has ended, and those of other machines after a week."""
+    """Remove temporary files in a folder if their process has ended, and files of other machines after a week."""
     with suppress(OSError), os.scandir(folder) as entries:  # another process may remove files, or rights may be missing
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)
@@ -276,8 +276,8 @@ _remove_stale_once = cache(remove_stale)  # once per folder and process, since l
 def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
     """Return whether a temporary file is abandoned, because the process that wrote it has ended.
 
-    It is not possible to ask for processes of other machines, or on Windows, where ``os.kill`` would end them. Their
-    files count as abandoned if they are old.
+    Processes of other machines are not visible. On Windows ``os.kill`` would end a process instead of asking for it. In
+    both cases, a file is abandoned if it is old.
     """
     if machine != _machine_hash() or sys.platform == "win32":
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS

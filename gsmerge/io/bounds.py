@@ -21,11 +21,11 @@ from gsmerge.errors import OUT_OF_MEMORY, SceneError
 from gsmerge.io.first_bytes import check_first_bytes
 from gsmerge.types import StrPath
 
-MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any real one has
-MAX_MODEL_BYTES = 256 << 20  # of a COLMAP text file, which also lists the points of every image
-MAX_VIEWS = 10_000  # of a camera file
-MAX_FILES = 100_000  # below a folder of photos
-MAX_PIXELS = 1 << 26  # of one image
+MAX_TEXT_BYTES = 32 << 20  # most bytes of a camera file; real files have far fewer
+MAX_MODEL_BYTES = 256 << 20  # most bytes of a COLMAP text file, which also lists the points of every image
+MAX_VIEWS = 10_000  # most views of a camera file
+MAX_FILES = 100_000  # most files and folders below a folder of photos
+MAX_PIXELS = 1 << 26  # most pixels of an image
 
 _ADDRESS = re.compile(r"(https?|s3|gs|ftp|file):/")  # start of a URL
 _FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20  # bytes of memory for any file, and for each byte of it
@@ -99,7 +99,7 @@ def read_errors(path: StrPath) -> Iterator[None]:
 
 
 def check_file(path: Path) -> int:
-    """Return the size of a file in bytes; SceneError if it is missing, no file, or of a kind that is not read."""
+    """Return the size of a file in bytes; SceneError if the file is missing, or of a kind that is not read."""
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
@@ -171,9 +171,10 @@ def check_image_size(path: StrPath, width: int, height: int) -> None:
 
 
 def check_whole(value: Any, name: str, least: int, most: int = 2**53) -> int:
-    """Return ``value`` if it is a whole number from ``least`` to ``most``; ValueError, which names ``name``, if not.
+    """Return ``value`` if it is a whole number from ``least`` to ``most``; ValueError for any other value.
 
-    By default ``most`` is 2^53, since every JSON reader stores whole numbers up to 2^53 exactly.
+    The error begins with ``name``. By default ``most`` is 2^53, since every JSON reader stores whole numbers up to 2^53
+    exactly.
     """
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError(f"{name}: expected a whole number from {least} to {most}, found {value!r:.40}")

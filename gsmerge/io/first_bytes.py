@@ -30,8 +30,8 @@ class OtherContent:
     what: str  # its name in messages
     start: str  # pattern of the first bytes; messages quote its group ``quote``, if it has one
     remedy: str
-    right: tuple[str, ...] = ()  # endings of files that are not refused for this content
-    wrong: tuple[str, ...] | None = None  # endings of files that are refused for it; None: all others
+    allowed: tuple[str, ...] = ()  # endings of files that are not refused for this content
+    refused: tuple[str, ...] | None = None  # endings of files that are refused for it; None: all others
 
 
 _TRAIN_OR_MAKE = "train Gaussians on it, or make Gaussians from the photos with a model"
@@ -87,25 +87,25 @@ OTHER_CONTENTS = (
         r"(?is)(?:\xef\xbb\xbf)?\s*<(?:!doctype\s+html|html|head|body|script)\b"
         r"(?:.*?<title[^>]*>\s*(?P<quote>[^<]*[^<\s]))?",
         _DOWNLOAD,
-        right=(".html", ".htm"),
+        allowed=(".html", ".htm"),
     ),
     OtherContent(
         "tensors of torch.save, which Lyra 1 writes as .ply",
         r"(?s)PK.*/data\.pkl",
         "run Lyra with save_gaussians_orig: true, and name the file in gaussians_orig",
-        right=(".torch",),
+        allowed=(".torch",),
     ),
-    OtherContent("a zip archive", r"PK\x03\x04", _UNPACK, right=(".sog", ".npz", ".torch")),
-    OtherContent("a gzip archive", r"\x1f\x8b\x08[\0-\x1f]", _UNPACK, right=(".spz",)),
+    OtherContent("a zip archive", r"PK\x03\x04", _UNPACK, allowed=(".sog", ".npz", ".torch")),
+    OtherContent("a gzip archive", r"\x1f\x8b\x08[\0-\x1f]", _UNPACK, allowed=(".spz",)),
     OtherContent("a tar archive", r"(?s).{257}ustar", _UNPACK),
     OtherContent("a 7z archive", r"7z\xbc\xaf\x27\x1c", _UNPACK),
     OtherContent("a rar archive", r"Rar!\x1a\x07", _UNPACK),
     OtherContent("a packed file", r"BZh[1-9]1AY|\xfd7zXZ\0|\x28\xb5\x2f\xfd", _UNPACK),
-    OtherContent("glTF in several files", r"\s*\{", _GLB, wrong=(".gltf",)),
-    OtherContent("a PLY file", r"ply\r?\n", "change its ending to .ply", wrong=_PACKED_SCENES),
+    OtherContent("glTF in several files", r"\s*\{", _GLB, refused=(".gltf",)),
+    OtherContent("a PLY file", r"ply\r?\n", "change its ending to .ply", refused=_PACKED_SCENES),
     OtherContent(
         "text", r"(?!ply[\r\n])\s*(?P<quote>[ -~\x80-\xff]+)(?:[\t\r\n][\t\r\n -~\x80-\xff]*)?\Z", _DOWNLOAD,
-        wrong=NO_TEXT,
+        refused=NO_TEXT,
     ),
 )  # fmt: skip
 
@@ -146,7 +146,7 @@ def check_first_bytes(path: Path, size: int) -> None:
     if ending in IMAGE_SUFFIXES:
         refuse_picture(path)
     for row in OTHER_CONTENTS:
-        is_refused = ending not in row.right and (row.wrong is None or ending in row.wrong)
+        is_refused = ending not in row.allowed and (row.refused is None or ending in row.refused)
         match = re.match(row.start.encode("latin-1"), start) if is_refused else None
         if match:
             quote = (match.groupdict().get("quote") or b"").decode("utf-8", "replace").strip()

@@ -25,7 +25,7 @@ from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map, quiet_warnings
 from gsmerge.types import Cameras
 
-_FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads; that of PNG is read here
+_FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads; headers of PNG are read here
 # Orientation tag -> number of quarter turns counterclockwise, plus 4 if the photo is mirrored first
 _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
@@ -51,9 +51,9 @@ _BAND = 256  # rows of a mask that are converted at once
 _REDUCTIONS = {  # number by which each side is divided -> OpenCV's flag
     1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
 }  # fmt: skip
-_PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})  # those that determine the pixels
+_PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})  # chunks that determine the pixels
 
-Size = tuple[int, int]  # width, height, pixels
+Size = tuple[int, int]  # width and height in pixels
 Part = tuple[float, float, float, float]  # left, top, right and bottom of a part of a photo, as shares of its sides
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)  # all of a photo
 _AT_ONCE = 128 << 20  # most bytes of decoded photos in memory; if they need more, photos are decoded at each use
@@ -85,8 +85,8 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 
     ``source`` is a folder, which is searched with its sub-folders, or a list of image files. ``names`` are the names in
     a camera file, with or without folders and extension. If no name matches but there are as many images as names, the
-    images of a folder are used in natural order ("2" before "10"), and those of a list in its order. SceneError if an
-    image is missing or cannot be read, or if images differ in size.
+    images of a folder are used in natural order ("2" before "10"), and images of a list in the order of the list.
+    SceneError if an image is missing or cannot be read, or if images differ in size.
     """
     return as_floats(decode_images(match_images(source, names)))
 
@@ -176,12 +176,12 @@ def change_photos(
 
 
 def keep_photos(photos: PhotoArrays) -> PhotoArrays:
-    """Decode the photos of a reader into memory, for callers that use them more than once."""
+    """Decode all photos of a reader into memory, for callers that use each photo more than once."""
     return parallel_map(photos.read, range(len(photos))) if isinstance(photos, PhotoReader) else photos
 
 
 def decode_image(path: Path, size: Size) -> np.ndarray:
-    """Decode an image file of known size to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
+    """Decode an image file whose ``size`` is known to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
     with read_errors(path):
         data = np.fromfile(path, np.uint8)
     _check_scans(path, data, size)
@@ -282,7 +282,7 @@ def decode_alpha(path: Path) -> np.ndarray | None:
         return image.convert("RGBA").getchannel("A")
 
     values = _decode_channel(path, alpha)
-    half_opaque = 127  # of 255; a pixel counts if it is more opaque
+    half_opaque = 127  # of 255; pixels with a higher value are opaque
     return None if values is None or values.min() > half_opaque else values > half_opaque
 
 
@@ -335,7 +335,7 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
 def _undecodable(path: Path, size: Size) -> SceneError:
     """Make the error for an image that a library did not decode; raise MemoryError if memory was the reason."""
     work_bytes = 9  # additional bytes of a pixel while a library decodes it
-    np.empty((_CHANNELS + work_bytes, *size), np.uint8)  # raises it, since the library does not say so
+    np.empty((_CHANNELS + work_bytes, *size), np.uint8)  # raises MemoryError, since the library does not say so
     return _unreadable(path)
 
 
@@ -524,7 +524,7 @@ def resize_to(size: Size, to: Size) -> PhotoTransform:
 
 
 def resize_and_crop(size: Size, to: Size) -> PhotoTransform:
-    """Make the transform that resizes photos in proportion until they cover ``to``, and crops them at the centre."""
+    """Make the transform that resizes photos in proportion until they cover the size ``to``, and crops their centre."""
     scale = max(to[0] / size[0], to[1] / size[1])
     width, height = (max(least, round(length * scale)) for least, length in zip(to, size, strict=True))
     return PhotoTransform(*to, width / size[0], height / size[1], (width - to[0]) // 2, (height - to[1]) // 2)

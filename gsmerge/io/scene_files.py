@@ -47,11 +47,11 @@ _no_gaussians = LazyFunction("gsmerge.io.no_gaussians", "no_gaussians")
 _holds_views = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
 # Places of a scene's .ply. The first file that exists and is no result is read, or else the folder's only .ply
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
-# Places where INRIA and gsplat write trained scenes. Of several in a folder, the one after the most steps is read
+# Places where INRIA and gsplat write trained scenes. Of several scenes, the scene after the most steps is read
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # folder where DepthSplat and its relatives write NAME.ply; the photos are in images/NAME
 IMAGE_PLACES = (
-    "images_resized",  # the photos as WorldMirror saw them; tall photos in its images/ are squeezed
+    "images_resized",  # photos as WorldMirror saw them; in its images/, tall photos are squeezed
     "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
     "keyframes/images",
 )  # fmt: skip
@@ -77,15 +77,15 @@ _MAX_ENTRIES = 10_000  # most files and folders that a search below a folder lis
 class SceneFiles:
     """The files of a scene.
 
-    ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if it holds its cameras. ``images`` may be an ``.npz``
-    that holds images. For a ``.gsm`` both are the ``.gsm`` itself.
+    ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if the cameras are in it. ``images`` may be an ``.npz``
+    with images in it. For a ``.gsm`` both are the ``.gsm`` itself.
     """
 
     ply: Path
     cameras: Path | None
     images: Path | None
     masks: Path | None = None  # a folder
-    protect: Path | None = None  # a folder that the caller names, since it is never searched
+    protect: Path | None = None  # a folder of images of what has to stay sharp; only the caller can name it
     more: tuple[SceneFiles, ...] = ()  # other scenes that show the same place, each in a frame of its own
     parts: tuple[Path, ...] = ()  # all files of a scene in several files, ``ply`` first; empty for a single file
     num_copies: int = 0  # number of other files in the folder with the same bytes as ``ply``
@@ -127,7 +127,7 @@ class SceneFiles:
         return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
 
     def describe_choice(self, cameras: Path | None) -> list[str]:
-        """Return a note that ``cameras`` are read and not others; no note if there were no others to choose from.
+        """Return a list with a note that ``cameras`` are read and not others; empty if there were no others.
 
         The others are cameras that were tried before, and COLMAP models beside the model that is read.
         """
@@ -253,7 +253,7 @@ def find_scene_files(
 
 
 def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, list[Path], bool]:
-    """Return the cameras of a scene or None, further cameras, and whether the further ones are in folders below.
+    """Return the cameras of a scene or None, a list of further cameras, and whether these are in folders below.
 
     The order of cameras is that of :func:`find_scene_files`. Folders below the scene are searched only if there are no
     cameras beside it.
@@ -297,7 +297,7 @@ def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], pl
 def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
     """Return whether a path belongs to another scene than ``ply``.
 
-    A folder below ``root`` that has Gaussians, but not ``ply``, is another scene. All files in it belong to it.
+    A folder below ``root`` that has Gaussians, but not ``ply``, is another scene, with all files in it.
     """
     folders = [place for place in (path, *path.parents) if place != root and place.is_relative_to(root)]
     scenes = [_plys_in(place) or other_plys(place / SCENES_PLACE) for place in folders if place.is_dir()]
@@ -339,7 +339,7 @@ def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Pa
 
 
 def _search_roots(path: Path, ply: Path, within: StrPath | None) -> tuple[list[Path], list[Path]]:
-    """List a scene's own folders, and those that other scenes may share with it; see :func:`find_scene_files`."""
+    """List a scene's own folders, and folders that other scenes may share with it; see :func:`find_scene_files`."""
     given_folder = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
     program_folders = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
@@ -397,7 +397,7 @@ def _rate_camera_file(ply: Path) -> int:
 
 
 def named_path(path: StrPath | None) -> Path | None:
-    """Return the path that a caller named; None for None and "none", SceneError if it does not exist."""
+    """Return a path that the caller named, None for None and "none"; SceneError if the path does not exist."""
     if path is None or path == NONE:
         return None
     if not os.path.exists(path):
@@ -567,9 +567,9 @@ def named_ply(folder: Path) -> Path | None:
 
 
 def other_plys(folder: Path) -> list[Path]:
-    """List the ``.ply`` files in a folder, not below it, that may be scenes and are neither results nor point clouds.
+    """List the ``.ply`` files in a folder, not below it, that are neither results nor point clouds.
 
-    If there are none, list the only file of another format.
+    If there are none, list the only file of another format that may have Gaussians.
     """
     plys = natural_order(folder.glob("[!.]*.ply"))
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]

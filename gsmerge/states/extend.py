@@ -46,11 +46,11 @@ class BatchReport:
     num_new: int  # Gaussians that the batch became; superpixels in a state of Feature Gaussians
     num_gaussians: int  # Gaussians, or Feature Gaussians, of the state afterwards
     num_kept: int  # views whose pictures the state keeps afterwards
-    pictures: str  # pictures that the batch is fitted to: "photos", or what stands in for them
+    pictures: str  # pictures to which the batch is fitted: "photos", or the name of what stands in for photos
     views: Mapping[str, str]  # names in the batch, by names in the state, of its views whose pictures the state keeps
     sh_degree: int  # of the batch's Gaussians
     seconds: Mapping[str, float]  # wall time of each stage
-    choices: Mapping[str, Any]  # decisions of the stages; `world` says whether the batch is in that of earlier batches
+    choices: Mapping[str, Any]  # decisions of the stages; `world` compares the world of the batch with earlier batches
     notes: tuple[str, ...]  # warnings, one sentence each
     options: Mapping[str, Any]  # all settings, by their names in reports
 
@@ -116,7 +116,7 @@ def extend(
 
 
 def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
-    """Compare the world of new views with that of the Gaussians ``before``.
+    """Compare the world of new views with the world of the Gaussians ``before``.
 
     Returns SAME_WORLD, ANOTHER_WORLD or UNKNOWN_WORLD. In the same world the pictures show the earlier Gaussians,
     except where Gaussians of the batch, with their ``means [n,3]``, hide them. In another world the pictures are as

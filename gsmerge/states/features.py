@@ -326,7 +326,7 @@ def _without_members(features: FeatureGaussians) -> FeatureGaussians:
 
 
 def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
-    """Decode a state into ``k`` Gaussians per group, and return them in the world frame; a mixed K follows saliency.
+    """Decode a state into ``k`` Gaussians per group in the world frame; with a mixed K, saliency decides their number.
 
     Raises UsageError if the networks' heads make fewer Gaussians, or if ``k_rule`` needs the members of the groups.
     """

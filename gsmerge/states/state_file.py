@@ -166,7 +166,7 @@ def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
 
 
 def _read_numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
-    """Return a float32 array of a file; SceneError if it has numbers so large that later steps would overflow."""
+    """Return a float32 array of a file; SceneError for numbers so large that later steps would overflow."""
     array = file.array(name, np.float32, *shape)
     largest = 1e37  # largest absolute value; float32 ends at 3e38
     if not (np.abs(array).max(initial=0) <= largest):  # NaN fails too

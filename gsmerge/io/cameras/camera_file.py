@@ -72,8 +72,8 @@ class CameraFile:
     viewmats: np.ndarray  # ``[c,4,4]`` world to camera, OpenCV axes, float64
     Ks: np.ndarray  # ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5)
     widths: np.ndarray  # ``[c]`` int64, pixels; 0 if unknown, 1 if unknown and the intrinsics are relative to it
-    heights: np.ndarray  # likewise
-    names: tuple[str, ...]  # image names as the file gives them
+    heights: np.ndarray  # ``[c]`` int64, as widths
+    names: tuple[str, ...]  # names of the images in the file
     source: str  # name of the format
     convention: Convention = W2C_OPENCV  # how the format stores poses
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty if the file holds no images
@@ -178,7 +178,7 @@ def make_camera_file(
 
 
 def _check_pose(path: StrPath, view: StoredView) -> np.ndarray:
-    """Return the first three rows ``[3,4]`` of a pose; SceneError if it has another shape than 3x4 or 4x4."""
+    """Return the first three rows ``[3,4]`` of a view's pose; SceneError unless the pose is 3x4 or 4x4."""
     pose = np.asarray(view.pose, np.float64)
     if pose.shape not in ((3, 4), (4, 4)):
         raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")

@@ -43,9 +43,9 @@ def list_keyframes(source: CameraSource) -> list[Entry]:
 
 
 def join_matrices(source: CameraSource) -> list[Entry]:
-    """List WorldMirror's views. A view has the same ``camera_id`` in the list of extrinsics and in that of intrinsics.
+    """List WorldMirror's views from the lists of extrinsics and intrinsics, in which a view has the same ``camera_id``.
 
-    ``camera_id`` is a number, or the stem of the image's name. Views with numbers are ordered by them, and views with
+    ``camera_id`` is a number, or the stem of the image's name. Views with numbers are sorted by the numbers. Views with
     names keep the order of the file. SceneError if one of the lists lacks a view.
     """
     poses, Ks = (_matrices_by_id(source, key) for key in ("extrinsics", "intrinsics"))

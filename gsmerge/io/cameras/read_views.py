@@ -26,7 +26,7 @@ from gsmerge.kernels.elementary import cos, sin
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's "distortion_params"
 _COEFFICIENTS = (*_DISTORTION, "k5", "k6")
-# Camera models with distortion, and with them all models that are read, but for OPENCV_FISHEYE
+# Camera models with distortion, and all models that are read, without OPENCV_FISHEYE
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PINHOLE_OR_OPENCV = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
 _FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length follows
@@ -94,7 +94,7 @@ def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None
 
 
 def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert intrinsics, size and lens from the ``values`` of a view, or from those that several views share.
+    """Convert intrinsics, size and lens from the ``values`` of a view, or from values that several views share.
 
     The result has the names of ``number_keys``, "K" for a matrix, and "mask". For a lens it also has "model",
     "is_fisheye", "distortion_params" and the coefficients. Names are left out if the file has no value. Errors are
@@ -136,7 +136,7 @@ def _two_numbers(values: Any) -> tuple[float, float]:
 def _with_size(
     path: Path, name: str, layout: ViewLayout, values: dict[str, Any], size_of: Callable[[Path], Size]
 ) -> dict[str, Any]:
-    """Return the values of a view. If the intrinsics need a size and the file has none, add that of the view's image.
+    """Return the values of a view. If the intrinsics need a size and the file has none, read it from the view's image.
 
     ``size_of`` returns the size of an image. SceneError if the intrinsics or the image are missing.
     """

@@ -39,7 +39,7 @@ class CameraFormat:
     recognise: Callable[[CameraSource], bool] = lambda _: True  # is called only for files with the ending
 
     def cameras(self, source: CameraSource) -> CameraFile:
-        """Read the cameras of a file; SceneError if it is damaged or incomplete."""
+        """Read the cameras of a file; SceneError if the file is damaged or incomplete."""
         stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
         convention = stored.convention or self.convention
         return make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
@@ -62,7 +62,7 @@ def is_keyframes(folder: Path) -> bool:
 
 
 def _has_views_with(source: CameraSource, key: str) -> bool:
-    """Return whether a JSON file has a list ``views`` of objects, any of which has the key."""
+    """Return whether a JSON file has a list ``views`` of objects, and at least one of these has the ``key``."""
     views = source.object.get("views")
     return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any(key in v for v in views)
 
