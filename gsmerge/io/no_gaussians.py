@@ -74,7 +74,7 @@ def find_remedy(folder: Path) -> str:
     with suppress(OSError):
         subfolders = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
         searched = (folder, *islice(subfolders, MAX_SEARCHED_FOLDERS))
-        contents = [(path, *content) for path in searched if (content := _describe_content(path)) is not None]
+        contents = [(path, *known) for path in searched if (known := _describe_content(path)) is not None]
         if contents:
             path, content, remedy = min(contents, key=lambda entry: entry[1:] == _PHOTOS)  # photos only without others
             return f"{path} has {content}: {remedy}"
