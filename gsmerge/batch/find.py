@@ -23,12 +23,13 @@ from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, lis
 from gsmerge.runtime.record import list_some
 from gsmerge.values.words import count_words
 
-NamedScene = tuple[Path, Path | None]  # a scene, and the folder in which it was found; None if the user named the scene
+NamedScene = tuple[Path, Path | None]  # a scene, and the named folder in which it is; None if the user named the scene
 MAX_FOLDERS = 100_000  # most folders in a row without a scene; a link into a system's folders leads to more
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
-# Names, without .ply, that make a folder look like a scene if it contains them. A folder of such a name is part of one
-_LOOKS = {place.split("/")[0].removesuffix(".ply") for place in (*PLY_PLACES, *IMAGE_PLACES, *CAMERA_PLACES)}
+# A folder that has one of these names in it, with or without .ply, looks like a scene. A folder that itself has one of
+# these names is a part of a scene
+_USUAL_NAMES = {place.split("/")[0].removesuffix(".ply") for place in (*PLY_PLACES, *IMAGE_PLACES, *CAMERA_PLACES)}
 
 
 def scene_plys(scene: Path) -> list[Path]:
@@ -54,37 +55,42 @@ def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
 
 
 def count_links(path: Path) -> int:
-    """Count the symbolic links in a path. If several paths lead to a scene, the one with the fewest links names it."""
+    """Count the symbolic links in a path. Of several paths to a scene, the path with the fewest links names it."""
     return sum(map(os.path.islink, (path.absolute(), *path.absolute().parents)))
 
 
-def describe_lost(looks: Sequence[str], scenes: Collection[str]) -> list[str]:
-    """Return a note about folders that look like the scenes beside them, but have no Gaussians; empty without any.
+def describe_lost(lookalikes: Sequence[str], scenes: Collection[str]) -> list[str]:
+    """Return a list with a note about folders beside scenes that look like scenes, but have no Gaussians.
 
-    ``looks`` are the folders that look like scenes, and ``scenes`` those that are.
+    The list is empty if there are no such folders. ``lookalikes`` are all folders that look like scenes, with or
+    without Gaussians. ``scenes`` are all scenes.
     """
-    above = {str(folder) for scene in scenes for folder in (Path(scene), *Path(scene).parents)}
-    beside = {os.path.dirname(folder) for folder in looks if folder in scenes}
+    with_gaussians = {str(folder) for scene in scenes for folder in (Path(scene), *Path(scene).parents)}
+    with_scenes = {os.path.dirname(folder) for folder in lookalikes if folder in scenes}
     lost = [
-        folder for folder in looks
-        if os.path.dirname(folder) in beside and folder not in above and os.path.basename(folder) not in _LOOKS
-    ]  # fmt: skip
+        folder
+        for folder in lookalikes
+        if os.path.dirname(folder) in with_scenes
+        and folder not in with_gaussians
+        and os.path.basename(folder) not in _USUAL_NAMES
+    ]
     return [
         f"no Gaussians are read from {count_words(len(lost), 'folder')} beside the scenes: {list_some(lost)};"
         " inspect says why"
-    ][: len(lost)]
+    ] if lost else []  # fmt: skip
 
 
-def find_named_scenes(arguments: Sequence[str], out: Path, looks: list[str] | None = None) -> Iterator[NamedScene]:
-    """Yield the scenes of all arguments, in natural order within each argument; a scene may come twice.
+def find_named_scenes(arguments: Sequence[str], out: Path, lookalikes: list[str] | None = None) -> Iterator[NamedScene]:
+    """Yield the scenes of all arguments, in natural order within each argument. A scene may come twice.
 
-    A folder that cannot be read counts as a scene, so that the reason is reported when it is read. Folders behind links
-    come last. The folders that look like scenes are appended to ``looks``. Raises SceneError if an argument does not
-    exist, has no scene, or has too many folders without a scene, and UsageError if it is the output folder.
+    A folder that cannot be read counts as a scene, and its reader reports the reason. Folders behind links come last.
+    The folders that look like scenes are appended to ``lookalikes``. Raises SceneError if an argument does not exist,
+    has no scene, or has too many folders without a scene. Raises UsageError if an argument is the output folder
+    ``out``.
     """
     skip = os.path.realpath(out)
     for argument in arguments:
-        path, search = Path(argument), _Search(skip, [] if looks is None else looks)
+        path, search = Path(argument), _Search(skip, [] if lookalikes is None else lookalikes)
         if path.is_dir():
             if os.path.realpath(path) == skip:
                 raise UsageError(
@@ -94,15 +100,15 @@ def find_named_scenes(arguments: Sequence[str], out: Path, looks: list[str] | No
         elif path.suffix in (*SCENE_SUFFIXES, STATE_ENDING) and path.is_file():
             yield path, None
         elif glob.has_magic(argument) and not path.exists():
-            yield from _require_some(_matches(argument, search), argument, "that match")
+            yield from _require_some(_match_pattern(argument, search), argument, "that match")
         elif path.is_file():
-            yield from _require_some(_listed(path, search), argument, "in the list")
+            yield from _require_some(_read_list(path, search), argument, "in the list")
         else:
             raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
 
 
 def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> Iterator[NamedScene]:
-    """Yield the scenes of an argument; SceneError if there are none ``where`` the argument says."""
+    """Yield the scenes of an argument; SceneError without any. ``where`` says in the error where they were expected."""
     first_scene = next(scenes, None)
     if first_scene is None:
         raise SceneError(argument, f"expected scenes {where}, found none", _remedy(Path(argument)))
@@ -111,7 +117,7 @@ def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> It
 
 
 def _remedy(folder: Path) -> str:
-    """Return what helps if no scene was found in a folder; empty if it is no folder."""
+    """Return what the user can do about a folder without a scene; empty if the path is no folder."""
     if not os.path.isdir(folder):
         return ""
     file = next(iter(list_plys(folder)), None)
@@ -126,37 +132,36 @@ class _Search:
     """The search for the scenes of one argument. It enters each folder once, even if several links lead to it."""
 
     skip: str  # real path of the output folder, which is not searched
-    looks: list[str]  # folders that look like scenes, because they have photos, cameras or files with usual names
+    lookalikes: list[str]  # folders that look like scenes, because they have photos, cameras or files with usual names
     seen: set[str] = field(default_factory=set)  # real paths of the folders entered so far
     num_empty: int = 0  # number of folders since the last scene
 
     def walk(self, top: Path) -> Iterator[NamedScene]:
         """Yield the scenes in a folder and below it, or the folder itself if it is a scene."""
-        errors: list[OSError] = []  # folders that cannot be read count as scenes
-        starts = [top]  # folders behind links are added at the end
-        for folder, folders, files in (entry for start in starts for entry in os.walk(start, onerror=errors.append)):
+        errors: list[OSError] = []  # one for each folder that cannot be read; such folders count as scenes
+        starts = [top]  # the loop appends folders behind links, so that they come last
+        for path, subfolders, files in (entry for start in starts for entry in os.walk(start, onerror=errors.append)):
             yield from ((Path(error.filename), top) for error in errors)
             errors.clear()
-            current, names, real = Path(folder), [*folders, *files], os.path.realpath(folder)
-            if real == self.skip or real in self.seen:
-                folders.clear()
+            folder, names, real_path = Path(path), [*subfolders, *files], os.path.realpath(path)
+            if real_path == self.skip or real_path in self.seen:
+                subfolders.clear()  # os.walk enters none of them
                 continue
-            self.seen.add(real)
-            is_scene = _is_scene(current, names)
-            folders[:] = natural_order(
-                name for name in folders if not name.startswith(".") and not (is_scene and name in SCENE_PARTS)
+            self.seen.add(real_path)
+            is_scene = _is_scene(folder, names)
+            subfolders[:] = natural_order(
+                name for name in subfolders if not name.startswith(".") and not (is_scene and name in SCENE_PARTS)
             )
-            starts += [current / name for name in folders if os.path.islink(current / name)]
-            self.looks += [str(current)] * any(
-                (name if is_scene else name.lower().split(".ply")[0]) in _LOOKS
-                for name in names  # scene.ply.part
-            )
-            scenes = [current] if is_scene else _other_scenes(current, names)
-            scenes += [current / name for name in natural_order(files) if not is_scene and _is_packed(current / name)]
+            starts += [folder / name for name in subfolders if os.path.islink(folder / name)]
+            stems = names if is_scene else [name.lower().split(".ply")[0] for name in names]  # also of scene.ply.part
+            if not _USUAL_NAMES.isdisjoint(stems):
+                self.lookalikes.append(str(folder))
+            scenes = [folder] if is_scene else _other_scenes(folder, names)
+            scenes += [folder / name for name in natural_order(files) if not is_scene and _is_packed(folder / name)]
             self.num_empty = 0 if scenes else self.num_empty + 1
             if self.num_empty > MAX_FOLDERS:
                 raise SceneError(
-                    folder, f"expected scenes, found more than {MAX_FOLDERS:,} folders without one",
+                    path, f"expected scenes, found more than {MAX_FOLDERS:,} folders without one",
                     "name the folders of the scenes, or a list of them",
                 )  # fmt: skip
             yield from ((scene, top) for scene in scenes)
@@ -164,8 +169,8 @@ class _Search:
 
 
 def _is_packed(path: Path) -> bool:
-    """Return true if a file is a zip archive with Gaussians, which counts as a scene so that its reader refuses it."""
-    if path.suffix != ".zip" or path.with_suffix("").exists():  # the second: it was unpacked already
+    """Return whether a file is a zip archive with Gaussians. It counts as a scene, so that its reader refuses it."""
+    if path.suffix != ".zip" or path.with_suffix("").exists():  # an archive beside its unpacked folder is not needed
         return False
     with suppress(OSError, SceneError, BadZipFile), open_archive(path) as archive:
         return any(name.endswith(SCENE_SUFFIXES) for name in archive.namelist())
@@ -173,9 +178,10 @@ def _is_packed(path: Path) -> bool:
 
 
 def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
-    """List the files that are scenes in a folder that is no scene itself; the folder if it cannot be read any more.
+    """List the files that are scenes, in a folder that is no scene itself.
 
-    ``names`` are those of the files and folders in it.
+    ``names`` are the names of the files and folders in it. If the folder cannot be read any more, it is returned, and
+    its reader reports the reason.
     """
     if SCENE_NAMES.isdisjoint(names) and not any(name.endswith(SCENE_SUFFIXES) for name in names):
         return []
@@ -183,11 +189,11 @@ def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
         scenes = other_plys(folder)
         if scenes or os.path.isdir(folder):
             return scenes
-    return [folder]  # so that the reason is reported when it is read
+    return [folder]
 
 
 def _is_scene(folder: Path, names: list[str]) -> bool:
-    """Return true if a folder is a scene; ``names`` are those of the files and folders in it."""
+    """Return whether a folder is a scene; ``names`` are the names of the files and folders in it."""
     try:
         if SCENE_NAMES.isdisjoint(names):
             return False
@@ -195,18 +201,18 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
             return True
         if other_plys(folder):
             return False
-        # a single file with a usual name but without Gaussians is a scene, so that its error is reported
+        # A single file with a usual name but without Gaussians counts as a scene, and its reader says what it lacks
         return [header_content(path) for path in list_plys(folder)] == ["other"]
-    except (SceneError, OSError):  # so that the reason is reported when it is read
+    except (SceneError, OSError):  # the reader of the folder reports the reason
         return True
 
 
-def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
-    """Yield the scenes that match a pattern, and those in matching folders; the pattern does not pass through links."""
-    anchor = Path(pattern).anchor
-    found = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
-    named = Path(pattern).parts  # other names with a dot in front are hidden
-    shown = (str(p) for p in found if all(part[:1] != "." or part in named for part in p.parts))
+def _match_pattern(pattern: str, search: _Search) -> Iterator[NamedScene]:
+    """Yield the scenes that match a pattern, and those in matching folders; ``**`` does not pass through links."""
+    anchor, named = Path(pattern).anchor, Path(pattern).parts
+    paths = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
+    # Hidden files and folders match only if the pattern has their names
+    shown = (str(path) for path in paths if all(part[:1] != "." or part in named for part in path.parts))
     for path in sorted(map(Path, natural_order(shown)), key=count_links):
         if path.is_dir():
             yield from search.walk(path)
@@ -214,9 +220,9 @@ def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
             yield path, None
 
 
-def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:
-    """Yield the scenes of a list with one path per line, relative to its folder; missing scenes are yielded too."""
-    budget, lines = read_budget(file), dict[str, None]()
+def _read_list(file: Path, search: _Search) -> Iterator[NamedScene]:
+    """Yield the scenes of a text file with one path per line, relative to its folder, and also missing scenes."""
+    budget, entries = read_budget(file), dict[str, None]()  # a dict keeps each line once, in order
     job_bytes = 700  # bytes of memory for each scene of a list
     for line in read_lines(file):
         if "\0" in line:
@@ -225,13 +231,13 @@ def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:
             raise SceneError(
                 file, "expected a list of scenes, one path per line, found JSON", "name the folder of the scene"
             )
-        lines[line.strip()] = None
-        budget.check_memory(job_bytes * len(lines), count_words(len(lines), "scene"))
-    paths = [file.parent / os.path.expanduser(entry) for entry in lines if entry and not entry.startswith("#")]
+        entries[line.strip()] = None
+        budget.check_memory(job_bytes * len(entries), count_words(len(entries), "scene"))
+    paths = [file.parent / os.path.expanduser(entry) for entry in entries if entry and not entry.startswith("#")]
     for path in sorted(paths, key=count_links):
         if not os.path.isdir(path):
             yield path, None
         elif os.path.realpath(path) not in search.seen:
             scenes = search.walk(path)
-            yield next(scenes, (path, path))
+            yield next(scenes, (path, path))  # the reader of a folder without a scene says so
             yield from scenes

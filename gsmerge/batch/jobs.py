@@ -63,13 +63,14 @@ class BatchOptions(Settings):
     address: str | None = setting(None, "Address of the Ray cluster, see `Engine`.")
 
     def __post_init__(self) -> None:
+        """Raise ValueError for an engine or an output pattern that is not possible."""
         super().__post_init__()
         Engine(self.engine, self.address)
         try:
             names = {name for _, name, _, _ in Formatter().parse(self.output) if name is not None}
             example = self.output.format(**dict.fromkeys(FIELDS, 1)) if names <= set(FIELDS) else ""
         except (ValueError, LookupError):
-            example = ""
+            example = ""  # refused below
         is_inside = not example.startswith(("/", "~", ".")) and "\\" not in example and ".." not in example.split("/")
         if not (is_inside and example.lower().endswith(OUTPUT_FORMATS)):
             placeholders, endings = ", ".join(f"{{{name}}}" for name in FIELDS), ", ".join(OUTPUT_FORMATS)
@@ -81,18 +82,22 @@ class BatchOptions(Settings):
 
 @dataclass(frozen=True)
 class CompactCall:
-    """The call that makes a result, the same as that of ``gsmerge compact``."""
+    """The call that makes a result as ``gsmerge compact`` does."""
 
     settings: CompactOptions
     opacity: OpacityChoice
     hints: ReadHints
 
     def key(self, files: SceneFiles) -> str:
-        """Return the key of a result: a digest of the input's files and the version, a dot, and one of the settings."""
+        """Return the key of a result, which tells whether an earlier result of these ``files`` can be kept.
+
+        The key has two digests with a dot between them. The first is of the scene's files and the version of gsmerge,
+        the second is of the settings.
+        """
         settings = self.settings.to_dict()
         del settings["threads"]
         checkpoint = Path(self.settings.checkpoint)
-        if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # the content counts, not the path
+        if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # its path does not change the result
             settings["checkpoint"] = file_sha256(checkpoint)
         without = [name for name in sorted(files.named) if getattr(files, name) is None]
         reading = {"opacity": self.opacity, **vars(self.hints), "without": without}
@@ -101,7 +106,7 @@ class CompactCall:
         return f"{scene}.{digest({'settings': settings, 'reading': reading})}"
 
     def run(self, files: SceneFiles, outputs: Outputs, threads: int) -> tuple[dict[str, Any], list[Path]]:
-        """Compact a scene; return its report, and the paths of the result, its coarser levels and its cameras."""
+        """Compact a scene. Return its report, and the paths of the result, its coarser levels and its cameras."""
         document = compact_files(
             files, replace(self.settings, threads=threads), outputs,
             opacity=self.opacity, hints=self.hints, hashed=True,
@@ -117,7 +122,7 @@ class Job:
     scene: str  # path of a file of Gaussians or of its folder
     outputs: tuple[str, ...]  # names of the result and of its coarser levels in the output folder
     call: CompactCall
-    num_gaussians: int  # estimated by the headers or the sizes of its files; 0 if they cannot be read
+    num_gaussians: int  # estimated from the headers or the sizes of the scene's files; 0 if they cannot be read
     num_rest: int = 0  # values of higher harmonics of a Gaussian, estimated in the same way
     cameras: StrPath | None = None  # None for those beside the scene
     images: StrPath | None = None  # None for those beside the scene
@@ -133,7 +138,7 @@ class Job:
 
     @property
     def memory(self) -> int:
-        """Estimated memory of the call in bytes, right up to a factor of about two."""
+        """Estimate the memory of the call in bytes, up to a factor of about two."""
         return memory_bytes(self.num_gaussians, num_rest=self.num_rest)
 
     def find_files(self) -> SceneFiles:
@@ -147,16 +152,20 @@ def find_jobs(
     out: Path,
     options: BatchOptions,
     results: Collection[str] = (),
-    looks: list[str] | None = None,
+    lookalikes: list[str] | None = None,
 ) -> list[Job]:
-    """Find all scenes, and return a job for each, which names its result in the output folder ``out``.
+    """Find all scenes, and return a job for each.
 
-    ``arguments`` are folders, patterns, ``.ply`` files, and text files with one of these per line. The output folder is
-    not searched. ``results`` has the real paths of former results, which are not scenes. The folders that look like
-    scenes are appended to ``looks``, for :func:`describe_lost`. If several paths lead to a scene, the one with the
-    fewest links names it. If a result would have the name of another result or of a scene's file, its job has a
-    ``clash``. Raises SceneError if an argument does not exist or has no scene, if cameras, photos or masks for all
-    scenes do not exist, or if networks cannot be used.
+    Args:
+        arguments: Folders, patterns, ``.ply`` files, and text files with one of these per line.
+        out: The output folder, which is not searched.
+        options: Settings of the batch.
+        results: Real paths of former results, which are not scenes.
+        lookalikes: The folders that look like scenes are appended to this list, for :func:`describe_lost`.
+
+    If several paths lead to a scene, the path with the fewest links names it. If another result or a scene has the name
+    of a result, the job has a ``clash``. Raises SceneError if an argument does not exist or has no scene, if cameras,
+    photos or masks for all scenes do not exist, or if networks cannot be used.
     """
     if options.settings.checkpoint not in CHECKPOINTS:
         load_checkpoint(options.settings.checkpoint)  # fail once, not for each scene
@@ -164,29 +173,31 @@ def find_jobs(
     for name in PLACE_OPTIONS:
         _check_place(name, getattr(options, name))
     jobs: list[Job] = []
-    owners: dict[str, list[str]] = {}  # scenes whose results would have a name, by this name
-    inputs: set[str] = set()
-    found = [(main_file(scene), scene, within) for scene, within in find_named_scenes(arguments, out, looks)]
-    for file, scene, within in sorted(found, key=lambda entry: count_links(entry[0])):
-        real = os.path.realpath(file)
-        if real in inputs or real in results:
+    scenes_by_output: dict[str, list[str]] = {}  # name of an output -> the scenes whose results would have it
+    inputs: set[str] = set()  # real paths of the scenes' main files
+    scenes = [(main_file(scene), scene, within) for scene, within in find_named_scenes(arguments, out, lookalikes)]
+    for file, scene, within in sorted(scenes, key=lambda entry: count_links(entry[0])):
+        real_path = os.path.realpath(file)
+        if real_path in inputs or real_path in results:
             continue
-        inputs.add(real)
+        inputs.add(real_path)
         outputs = _output_names(options, scene, len(jobs))
-        for name in outputs:
-            owners.setdefault(os.path.normcase(name), []).append(str(scene))  # on Windows A.ply and a.ply are one file
+        for name in outputs:  # on Windows A.ply and a.ply are one file
+            scenes_by_output.setdefault(os.path.normcase(name), []).append(str(scene))
         patterns = {name: getattr(options, name) for name in PLACE_OPTIONS}
-        paths: dict[str, Any] = {
+        places: dict[str, Any] = {
             name: pattern if pattern == NONE else fill_template(pattern, scene) for name, pattern in patterns.items()
         }
-        jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), **paths, within=within))
-    return [replace(job, clash=_find_clash(job, out, owners, inputs)) for job in jobs]
+        jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), **places, within=within))
+    return [replace(job, clash=_find_clash(job, out, scenes_by_output, inputs)) for job in jobs]
 
 
-def _find_clash(job: Job, out: Path, owners: Mapping[str, Sequence[str]], inputs: Collection[str]) -> str | None:
-    """Return the message for a result that would have the name of another result or of a scene; None if it may."""
+def _find_clash(
+    job: Job, out: Path, scenes_by_output: Mapping[str, Sequence[str]], inputs: Collection[str]
+) -> str | None:
+    """Return why a result cannot have its name; None if no other result and no scene has this name."""
     for name in job.outputs:
-        scenes = owners[os.path.normcase(name)]
+        scenes = scenes_by_output[os.path.normcase(name)]
         if len(scenes) > 1:
             return (
                 f"{out / name}: expected a different name for each result, would be that of"
@@ -198,7 +209,7 @@ def _find_clash(job: Job, out: Path, owners: Mapping[str, Sequence[str]], inputs
 
 
 def _check_place(option: str, place: str | None) -> None:
-    """Raise SceneError if the path that an option gives for all scenes does not exist, because each would fail."""
+    """Raise SceneError if an option names a missing path for all scenes, because each scene would fail."""
     if place in (None, NONE) or "{" in place or os.path.exists(place):
         return
     remedy = f"for one beside each scene pass --{option} '{{parent}}/{place}'"
@@ -215,11 +226,11 @@ def _output_names(options: BatchOptions, scene: Path, index: int) -> tuple[str, 
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     """Return the name of a scene's result in the output folder."""
     path = Path(os.path.abspath(scene))
-    stem = scene_name(path).removesuffix(".compressed")  # belongs to the format of the scene, not of its result
+    stem = scene_name(path).removesuffix(".compressed")  # the result may have another format than the scene
     decode = options.settings.decode
     k = decode.k if decode.k != AUTO else decode.max_k
     values = {"stem": stem, "parent": path.parent.name, "index": index, "k": k}
     try:
         return Path(os.path.normpath(options.output.format(**values))).as_posix()
-    except ValueError as error:  # a format specification that fits numbers only
+    except ValueError as error:  # such as {stem:03d}, which is for numbers only
         raise UsageError(f"--name: {options.output!r} does not fit {values}: {error}") from error

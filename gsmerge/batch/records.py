@@ -21,7 +21,7 @@ SKIPPED = "skipped"  # `status` of a result that was done before, which is repor
 
 @dataclass(frozen=True)
 class DoneResult:
-    """What the record of a result that is done says."""
+    """A result that is done, by its record."""
 
     key: str  # digest of the scene's files, the settings and the version
     files: list[dict[str, Any]]  # of each file: `path` in the output folder, `sha256` and `bytes`
@@ -30,12 +30,12 @@ class DoneResult:
     unmet: str | None = None  # why the result misses its target, or None
 
     def holds(self, folder: Path, key: str) -> bool:
-        """Return true if the result has this key, and all its files in ``folder`` are unchanged."""
+        """Return whether the result is up to date: it has the ``key``, and its files in ``folder`` are unchanged."""
         if self.key != key or not self.files:
             return False
         try:
             paths = [folder / file["path"] for file in self.files]
-            if not all(path.is_file() for path in paths):  # reading a pipe would never end
+            if not all(path.is_file() for path in paths):  # a pipe could be read for ever
                 return False
             return [file_sha256(path) for path in paths] == [file["sha256"] for file in self.files]
         except (OSError, ValueError):  # ValueError: no file can have this name
@@ -51,16 +51,14 @@ class RecordIndex:
     results: dict[str, DoneResult] = field(default_factory=dict)  # by name of the result in the folder
 
     def read_on(self) -> RecordIndex:
-        """Read the records that were added since the last call, also by other processes; return this index.
+        """Read the records that any process has added since the last call, and return this index.
 
         Damaged lines are skipped.
         """
         for end, line in each_line(self.folder / RECORDS, self.end):
             self.end = end
-            with suppress(KeyError, TypeError, AttributeError):  # the line is not a record
-                if line is None:
-                    continue
-                if line["status"] == DONE:
+            with suppress(KeyError, TypeError, AttributeError):  # raised for a line that is not a record
+                if line is not None and line["status"] == DONE:
                     self.results[_text(line["output"])] = _read_result(line)
         return self
 
@@ -73,21 +71,21 @@ class RecordIndex:
 
 
 def _read_result(line: Mapping[str, Any]) -> DoneResult:
-    """Read a record of a result; KeyError, TypeError or AttributeError if it is damaged."""
+    """Return the result of a record; KeyError, TypeError or AttributeError if the record is damaged."""
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
     doubts, unmet = tuple(map(_text, line.get("doubts", ()))), _text(line.get("unmet") or "") or None
     return DoneResult(_text(line["key"]), files, _text(line["scene"]), doubts, unmet)
 
 
 def _text(value: Any) -> str:
-    """Return the value if it is a text; TypeError otherwise."""
+    """Return a value that has to be text; TypeError for any other value."""
     if not isinstance(value, str):
         raise TypeError
     return value
 
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
-    """Return a record with all its keys; those that ``facts`` do not have get empty values."""
+    """Make a record with all keys. A key that ``facts`` lacks gets an empty value."""
     blank: dict[str, Any] = {"key": None, "files": [], "error": None, "doubts": [], "unmet": None, "report": None}
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **facts}
 
@@ -101,7 +99,7 @@ def prepare_folder(folder: Path) -> None:
             problem = "expected a file of records, found a link"
             raise SceneError(records, problem, "remove it, or name another folder with --output")
         if records.exists():
-            check_file(records)  # raises for a pipe, which would wait for its reader
+            check_file(records)  # raises for a pipe, in which writing would wait for a reader
         if os.access(folder, os.W_OK) or not records.exists():  # a read-only folder may hold results that are done
             records.touch()
     except OSError as error:

@@ -1,8 +1,8 @@
 """Run a batch: make the result of every job that is not done, and record how each ended.
 
-The run may be killed at any moment. A result is written completely or not at all, and its record follows at once. If a
-process is killed in between, the result has no record. Then a file that marks the result as begun shows that a batch
-made it.
+The run may be killed at any moment. A result is written completely or not at all, and its record follows at once. A
+process that is killed in between leaves a result without a record. A file that marks the result as begun, and that is
+written before it, shows that a batch made it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FREE_MEMORY_SHARE = 0.8  # scenes that run at the same time may by default take 
 
 @dataclass(frozen=True)
 class Concurrency:
-    """Number of scenes that are compacted at the same time, and number of threads for each."""
+    """How many scenes are compacted at the same time, and with how many threads each."""
 
     jobs: int  # 0 for as many as the cluster has processors for
     threads: int  # of each scene
@@ -52,7 +52,7 @@ class Concurrency:
 
 @dataclass(frozen=True)
 class Run:
-    """What all jobs of a run share."""
+    """Facts that all jobs of a run share."""
 
     folder: Path  # output folder
     threads: int  # of each job
@@ -60,10 +60,10 @@ class Run:
 
 
 def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrency:
-    """Choose how many scenes run at the same time, by the processors and the free memory, and the threads of each.
+    """Choose by the processors and the free memory how many scenes run at the same time, with how many threads each.
 
-    The number of scenes is that of the scenes of median size that fit into the memory. While larger ones run, fewer run
-    at the same time.
+    The memory limits the number as if every scene had the median size. While larger scenes run, fewer run at the same
+    time.
     """
     threads, processors = options.settings.threads, available_threads()
     if options.engine == "ray":
@@ -75,7 +75,10 @@ def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrenc
 
 
 def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> list[tuple[Job, str | None]]:
-    """List the jobs whose results are not done, each with the reason if it will be refused; with ``overwrite`` all."""
+    """List the jobs that a run would take on, each with the reason if it would refuse the job, or None.
+
+    These are the jobs whose results are not done, and with ``overwrite`` all jobs.
+    """
     results, pending = RecordIndex(folder).read_on().results, list[tuple[Job, str | None]]()
     for job in jobs:
         known = results.get(job.output)
@@ -83,7 +86,7 @@ def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> li
             key = job.call.key(job.find_files())
             if options.overwrite or known is None or not known.holds(folder, key):
                 pending.append((job, refusal(job, folder, known, key, overwrite=options.overwrite)))
-        except Exception as error:  # a bad scene must not end the list, as in the run
+        except Exception as error:  # a bad scene must not end the list
             pending.append((job, _record_failure(job, folder, error_line(error))["error"]))
     return pending
 
@@ -100,15 +103,16 @@ def _record_failure(job: Job, folder: Path, reason: str) -> dict[str, Any]:
 def refusal(
     job: Job, folder: Path, known: DoneResult | None, key: str, *, overwrite: bool, begun: bool = False
 ) -> str | None:
-    """Return why a result must not be made, or None if it may.
+    """Return why a result must not be made; None if it can be made.
 
-    ``known`` is the result in the record, and ``key`` that of the result to make. ``begun`` is true if a file without a
-    record may come from a run that was killed.
+    ``known`` is the recorded result of this name, and ``key`` is the key of the result to make. ``begun`` is True if a
+    killed run may have left files without a record.
     """
-    names = () if known is None else [file["path"] for file in known.files]
-    foreign = [folder / name for name in job.outputs if os.path.lexists(folder / name) and name not in names]
-    (scene, _, settings), former = key.partition("."), ("" if known is None else known.key).partition(".")
-    if job.clash and (foreign or former[0] != scene):
+    recorded_names = () if known is None else [file["path"] for file in known.files]
+    foreign = [folder / name for name in job.outputs if os.path.lexists(folder / name) and name not in recorded_names]
+    scene, _, settings = key.partition(".")
+    known_scene, _, known_settings = ("" if known is None else known.key).partition(".")
+    if job.clash and (foreign or known_scene != scene):
         return job.clash
     if overwrite:
         return None
@@ -120,7 +124,7 @@ def refusal(
     if known is None or not os.path.lexists(folder / job.output):
         return None
     if (
-        former[0] != scene
+        known_scene != scene
         and os.path.exists(known.scene)
         and len({os.path.realpath(main_file(Path(path))) for path in (known.scene, job.scene)}) == 2
     ):
@@ -128,20 +132,22 @@ def refusal(
             f"{folder / job.output}: is the result of {known.scene}, which is another scene; {DISTINGUISH}, or pass"
             " --overwrite to replace it"
         )
-    remedy = "pass --overwrite to make it again, or name another --output"
-    return None if former[2] == settings else f"{folder / job.output}: was made with other settings; {remedy}"
+    return None if known_settings == settings else (
+        f"{folder / job.output}: was made with other settings; pass --overwrite to make it again, or name another"
+        " --output"
+    )  # fmt: skip
 
 
 def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Generator[dict[str, Any], None, None]:
     """Make the results of all jobs in a folder, several at a time; yield the record of each job as it ends.
 
-    Jobs that are done already are yielded as skipped. Several runs may share a folder; jobs on which another run works
-    come last. Close the generator to end the processes. SceneError if the folder cannot be written; UsageError if Ray
-    is not installed.
+    The record of a job that was done before says "skipped". Several runs may share a folder. Jobs on which another run
+    works come last. Close the generator to end the processes. SceneError if the folder cannot be written, UsageError if
+    Ray is not installed.
     """
     concurrency = choose_concurrency(jobs, options)
     prepare_folder(folder)
-    run, active = Run(folder, concurrency.threads, options.overwrite), dict[str, Job]()  # by scene
+    run, active = Run(folder, concurrency.threads, options.overwrite), dict[str, Job]()  # jobs in the pool, by scene
     with ExitStack() as stack:
         stack.callback(lambda: remove_unfinished(run, active.values()))
         pool: WorkerPool = ProcessPool(concurrency.jobs, concurrency.threads, concurrency.memory)
@@ -155,7 +161,7 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
                 active[job.scene] = job
                 yield Call(job, (job, run, wait), job.memory)
 
-        # Scenes for which others wait come last
+        # A scene that needs more than its share of the memory makes others wait, so it comes last
         remaining, wait = sorted(jobs, key=lambda job: job.memory * concurrency.jobs > concurrency.memory), False
         while remaining:
             busy: list[Job] = []
@@ -172,8 +178,9 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
 def run_job(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str, Any] | None:
     """Make a result unless it is done, record the outcome, and return the record.
 
-    If another process works on the result, ``wait`` for it or return None. ``lost`` says why the process that should
-    make the result has ended; then only this failure is recorded. SceneError if the record cannot be written.
+    If another process works on the result, the call waits for it, or returns None without ``wait``. ``lost`` says why
+    the process that should make the result has ended. With it only this failure is recorded. SceneError if the record
+    cannot be written.
     """
     with lock_result(run.folder, job.output, wait=wait) as mark:
         if mark is None:
@@ -191,7 +198,7 @@ def run_job(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str
 
 
 def _make_result(job: Job, run: Run, mark: Path) -> dict[str, Any]:
-    """Make a result, which this process has locked, unless it is done or refused; return its record."""
+    """Make a result, unless it is done or refused, and return its record. The caller has locked the result."""
     files = job.find_files()
     key, known = job.call.key(files), read_run_index(run.folder).read_on().results.get(job.output)
     if known is not None and not run.overwrite and known.holds(run.folder, key):
@@ -203,12 +210,13 @@ def _make_result(job: Job, run: Run, mark: Path) -> dict[str, Any]:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
     outputs = plan_outputs(run.folder / job.output, overwrite=True)
     if (cameras := outputs.viewer_cameras) is not None:
-        is_own = known is not None and any(run.folder / file["path"] == cameras for file in known.files)
-        is_free = os.path.realpath(cameras) not in map(os.path.realpath, files.paths) and (
-            is_own or run.overwrite or not os.path.lexists(cameras)  # results in other formats share them
+        # A camera file of this name may be the input's, or may belong to a result of the same name in another format
+        owns_cameras = known is not None and any(run.folder / file["path"] == cameras for file in known.files)
+        writes_cameras = os.path.realpath(cameras) not in map(os.path.realpath, files.paths) and (
+            owns_cameras or run.overwrite or not os.path.lexists(cameras)
         )
-        outputs = outputs if is_free else replace(outputs, viewer_cameras=None)
-    with atomic_output(mark, overwrite=True) as temporary:  # on the disk before the result
+        outputs = outputs if writes_cameras else replace(outputs, viewer_cameras=None)
+    with atomic_output(mark, overwrite=True) as temporary:  # the mark is on the disk before the result
         temporary.write_text(f"{os.getpid()}\n")
     with warnings.catch_warnings(record=True) as caught_warnings:
         warnings.simplefilter("default")
@@ -227,12 +235,12 @@ def _make_result(job: Job, run: Run, mark: Path) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def read_run_index(folder: Path) -> RecordIndex:
-    """Return the index of a folder's records, which each process keeps for all jobs of a run."""
+    """Return the index of a folder's records; a process keeps it for all its jobs of a run."""
     return RecordIndex(folder)
 
 
 def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
-    """Remove the unfinished files of jobs that no process makes any more."""
+    """Remove the unfinished files of jobs that no process works on any more."""
     for job in jobs:
         with suppress(SceneError), lock_result(run.folder, job.output, wait=False) as mark:
             if mark is not None:
@@ -240,7 +248,10 @@ def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
 
 
 def _remove_unfinished_files(job: Job, run: Run, mark: Path) -> None:
-    """Remove what a killed process has left. Keep the file ``mark`` if the result exists, perhaps unrecorded."""
+    """Remove the files that a killed process left of a job.
+
+    The file ``mark`` stays if the result exists, since the result may lack a record.
+    """
     if mark.exists():
         paths = [run.folder / name for name in job.outputs]
         for folder in {path.parent for path in paths}:
@@ -251,10 +262,11 @@ def _remove_unfinished_files(job: Job, run: Run, mark: Path) -> None:
 
 @contextmanager
 def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[Path | None]:
-    """Lock a result against other processes in the block; SceneError if that fails.
+    """Lock a result against other processes while the block runs; SceneError if it cannot be locked.
 
-    Yields the path of the file that marks the result as mark. If another process has locked the result, ``wait`` for
-    it or yield None. A folder that cannot be written needs no lock, because no result is made in it.
+    Yields the path of the file that marks the result as begun. If another process has locked the result, the call waits
+    for it, or yields None without ``wait``. A folder that cannot be written needs no lock, because no result is made in
+    it.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
     lock = lock_file(folder / f".batch-{name}.lock", wait=wait) if os.access(folder, os.W_OK) else nullcontext(True)

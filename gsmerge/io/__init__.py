@@ -1,4 +1,4 @@
-"""Read and write files; no other room knows their formats."""
+"""Read and write files. Other packages of gsmerge know nothing about the formats of files."""
 
 from gsmerge.io.atomic import atomic_output as atomic_output
 from gsmerge.io.atomic import atomic_outputs as atomic_outputs

@@ -1,4 +1,4 @@
-"""Read and write zip archives; no member unpacks to more bytes than the directory of the archive states for it."""
+"""Read and write zip archives. No member unpacks to more bytes than the archive's directory states."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from contextlib import contextmanager
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
 
-# With any other method, zipfile unpacks a piece of packed bytes completely, even if the directory states fewer bytes
+# With other methods, zipfile may unpack more bytes of a member than the directory states
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 @contextmanager
 def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
-    """Open a zip archive; SceneError if any member is packed by another method than "stored" or "deflated"."""
+    """Open a zip archive; SceneError if a member is packed with a method other than "stored" or "deflated"."""
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
             if info.compress_type not in _METHODS:
@@ -25,13 +25,13 @@ def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
 
 
 def new_member(name: str) -> zipfile.ZipInfo:
-    """Return a member to write, dated 1980 and marked as Unix, so that bytes are equal at any time on any system."""
+    """Make a member to write. Its date is 1980 and its system Unix, so that archives have the same bytes everywhere."""
     member = zipfile.ZipInfo(name)
     member.create_system = 3
     return member
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """Read as many bytes of a member as the directory states; ``ZipFile.read`` might unpack more."""
+    """Read only as many bytes of a member as the directory states, where ``ZipFile.read`` might unpack more."""
     with archive.open(info) as file:
         return file.read(info.file_size)

@@ -4,9 +4,9 @@ Each file is first written under a temporary name in its folder. When all files 
 temporary name contains the process id and a hash of the machine. A later process can thus remove the files of a killed
 process.
 
-A file that replaces another one takes its mode, and its owner and group where the system allows that.
-A new file has the rights that the umask leaves. If it holds the content of another file, such as a photo, it has only
-rights that this file has as well.
+A file that replaces another file takes its mode, and its owner and group where the system allows that. A new file has
+the rights that the umask leaves. A new file with the content of other files, such as photos, gets only rights that
+these files have as well.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import walk_files
 from gsmerge.types import StrPath
 
-# Errors of the disk while a file is written; other OSErrors are errors of the caller
+# Errors of the disk while a file is written. Other OSErrors come from what the caller does
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
-# Problem and remedy of an output that exists
+# Problem and remedy in the error for an output that exists
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
 _PRIVATE = 0o600  # mode of a file that its owner alone can read and write
 _STALE_SECONDS = 7 * 86400  # age at which a file is stale if its process is not visible here
@@ -48,9 +48,9 @@ _written: set[str] = set()  # the temporary files of this process
 def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = 0o666) -> Iterator[Path]:
     """Yield an empty temporary file beside ``path``, and rename it to ``path`` when the block succeeds.
 
-    Missing folders are made. A link stays a link, and the file that it points to is replaced. If ``path`` is itself a
-    temporary file of an outer block, it is yielded unchanged. SceneError if the file cannot be written, or if it exists
-    and ``overwrite`` is False.
+    Missing folders are made. If ``path`` is a link, the file to which it points is replaced. If ``path`` is already a
+    temporary file, made by a block around this block, it is yielded unchanged. SceneError if the file cannot be
+    written, or if it exists and ``overwrite`` is False.
     """
     with atomic_outputs(overwrite=overwrite, mode=mode) as add:
         yield add(Path(path))
@@ -58,25 +58,25 @@ def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = 0o666) 
 
 @contextmanager
 def atomic_outputs(*, overwrite: bool = False, mode: int = 0o666) -> Iterator[AddOutput]:
-    """Write several files and rename all of them at the end; if the block fails, no file remains.
+    """Write several files and rename all of them at the end. If the block fails, no file remains.
 
     Yields a function that adds a file and returns its temporary file, as in :func:`atomic_output`. If the process is
     killed or the disk fails between two renames, each file is complete, either old or new. Files in deeper folders are
-    renamed first, and their names are on the disk before the next folder is renamed. Therefore an index above them
-    never names a missing file.
+    renamed first, and are on the disk under their names before files of the next folder are renamed. Therefore an index
+    in a folder above never names a missing file.
 
-    ``mode``: the most rights that new files have. For outputs that hold the content of other files,
-    :func:`common_mode` returns it. New files also have at most the rights of files that the same call replaces.
+    ``mode``: the most rights that new files get. For outputs with the content of other files, :func:`common_mode` gives
+    this mode. If the same call replaces other files, new files get only rights that these files have as well.
     """
     outputs = _Outputs(overwrite, [mode])
     try:
         yield outputs.add
         outputs.rename()
     except (SceneError, OSError) as error:
-        renamed_error = outputs.name_error(error)
-        if renamed_error is None:
+        error_for_caller = outputs.name_error(error)
+        if error_for_caller is None:
             raise
-        raise renamed_error from error
+        raise error_for_caller from error
     finally:
         outputs.remove_rest()
 
@@ -87,16 +87,16 @@ class _Outputs:
 
     overwrite: bool
     modes: list[int]  # a new file has only rights that all of these modes have
-    # Temporary file -> path as the caller gave it, and path after links
+    # Temporary file -> the path that the caller gave, and the path to which it leads if it is a link
     paths: dict[str, tuple[Path, Path]] = field(default_factory=dict)
     new_folders: list[Path] = field(default_factory=list)  # parents before their children
 
     def add(self, path: Path) -> Path:
-        """Make the temporary file of an output, and return its path; return a path that is temporary itself."""
-        if str(path) in _written:
+        """Make the temporary file of an output, and return its path."""
+        if str(path) in _written:  # the path is a temporary file itself
             return path
         self.new_folders.extend(_make_folder(path.parent))
-        _check_not_there(path, self.overwrite)
+        _check_writable(path, self.overwrite)
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
         _remove_stale_once(target.parent.absolute())
         temporary = temporary_path(target)
@@ -111,19 +111,21 @@ class _Outputs:
         return temporary
 
     def rename(self) -> None:
-        """Wait until all files are on the disk, and rename them, deepest folders first."""
+        """Wait until all files are on the disk, and rename them, files in the deepest folders first."""
         for temporary, (_, target) in self.paths.items():
             _flush(temporary)
             if sys.platform != "win32" and os.path.exists(target):
                 _copy_rights(target, temporary)
         for folder in {folder.parent for folder in self.new_folders}:
             _flush_names(folder)
-        files = [(temporary, path, target) for temporary, (path, target) in self.paths.items()]
-        files.sort(key=lambda file: (-len(file[1].parts), file[2].parent))
-        _rename_all([(temporary, target) for temporary, _, target in files], overwrite=self.overwrite)
+        files = [
+            (-len(path.parts), target.parent, temporary, target) for temporary, (path, target) in self.paths.items()
+        ]
+        files.sort(key=lambda file: file[:2])  # by depth and folder
+        _rename_all([(temporary, target) for *_, temporary, target in files], overwrite=self.overwrite)
 
     def name_error(self, error: SceneError | OSError) -> SceneError | None:
-        """Return an error that names the caller's path instead of a temporary file; None for any other error."""
+        """Convert an error about a temporary file to an error about the caller's path; None for any other error."""
         if isinstance(error, SceneError):
             if error.path not in self.paths:
                 return None
@@ -135,12 +137,12 @@ class _Outputs:
         return SceneError(path, f"could not be written ({error.strerror})", remedy)
 
     def remove_rest(self) -> None:
-        """Remove temporary files that were not renamed, and new folders without files."""
+        """Remove temporary files that were not renamed, and new folders that are empty."""
         for temporary in self.paths:
             with suppress(OSError):
                 os.unlink(temporary)
         for folder in reversed(self.new_folders):
-            with suppress(OSError):  # a folder with files is not removed
+            with suppress(OSError):  # of a folder with files
                 os.rmdir(folder)
         _written.difference_update(self.paths)
 
@@ -159,18 +161,18 @@ def _make_folder(folder: Path) -> Iterator[Path]:
 
 
 def common_mode(paths: Iterable[Path]) -> int:
-    """Return the rights, as a mode, that all files have in common; owners can read and write in any case.
+    """Return the mode with the rights that all files have in common. The owner can always read and write.
 
-    A folder in ``paths`` stands for all files in it. Missing files do not count.
+    A folder in ``paths`` stands for all files in it and below it. Missing files do not count.
     """
     files = (file for path in paths for file in (walk_files(path) if path.is_dir() else [path]))
     return reduce(and_, (os.stat(file).st_mode | _PRIVATE for file in files if os.path.exists(file)), 0o666)
 
 
 def _copy_rights(source: Path, path: str) -> None:
-    """Give a file the mode of ``source``, and its group and owner if the system allows that.
+    """Give a file the mode of ``source``, and the group and owner of ``source`` if the system allows that.
 
-    If the file keeps another group, this group gets only rights that ``source`` gives to everyone.
+    If the file keeps another group, this group gets only the rights that ``source`` gives to everyone.
     """
     status = os.stat(source)
     with suppress(OSError):
@@ -184,7 +186,8 @@ def _copy_rights(source: Path, path: str) -> None:
 def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
     """Rename each temporary file to its final name, folder by folder.
 
-    Without ``overwrite``, all renamed files are removed again if another process has made one of the names meanwhile.
+    Without ``overwrite``, all renamed files are removed again if another process has meanwhile made a file with one of
+    the names.
     """
     renamed = list[Path]()
     try:
@@ -202,40 +205,40 @@ def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
 def _rename_to_new(temporary: str, target: Path) -> None:
     """Give a file a new name; FileExistsError if a file has this name, even if another process makes it meanwhile.
 
-    The file may keep its temporary name as well, which :meth:`_Outputs.remove_rest` removes.
+    The temporary name may stay as a second name, until :meth:`_Outputs.remove_rest` removes it.
     """
     try:
         (os.rename if sys.platform == "win32" else os.link)(temporary, target)  # both fail if the name exists
     except FileExistsError:
         raise
-    except OSError:  # a file system without links
+    except OSError:  # the file system has no links
         if os.path.lexists(target):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), temporary) from None
         os.replace(temporary, target)
 
 
 def _flush_names(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk, if the system can do that."""
+    """Wait until the names in a folder are on the disk, if the system can wait for that."""
     with suppress(OSError):
         _flush(folder)
 
 
 def _flush(path: str | Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk."""
+    """Wait until the content of a file, or the names in a folder, are on the disk."""
     if sys.platform == "win32" and not os.access(path, os.W_OK):
         return  # the file is a link to a read-only file, and Windows flushes only writable files
     descriptor = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that cannot flush
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # errors of file systems that cannot flush
             raise
     finally:
         os.close(descriptor)
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a temporary name in the folder of ``path``, with its suffix, a hash of the machine and the process id."""
+    """Return a temporary path beside ``path`` that has its suffix, a hash of the machine and the process id."""
     max_suffix = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
     suffix = path.suffix if len(os.fsencode(path.suffix)) <= max_suffix else ""
     return path.with_name(f".gsmerge-{_machine_hash()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
@@ -243,15 +246,15 @@ def temporary_path(path: Path) -> Path:
 
 @cache
 def _machine_hash() -> str:
-    """Return a hash of the machine and the container, in which process ids are unique.
+    """Return a hash of the machine and the container. Within both, process ids are unique.
 
-    Host names and ids of name spaces are often equal in different containers. Therefore Linux's random boot id is used
-    as well.
+    Different containers often have equal host names and equal ids of name spaces. Therefore Linux's random boot id is
+    hashed as well.
     """
     try:
         names = f"{Path(_BOOT).read_text(encoding='ascii')} {os.readlink('/proc/self/ns/pid')}"
     except OSError:
-        import socket  # these take some milliseconds, and Linux does not need them
+        import socket  # on Linux these imports are not needed, and they take some milliseconds
         import uuid
 
         names = f"{socket.gethostname()} {uuid.getnode()}"
@@ -260,7 +263,7 @@ def _machine_hash() -> str:
 
 def remove_stale(folder: Path) -> None:
     """Remove temporary files in a folder if their process has ended, and files of other machines after a week."""
-    with suppress(OSError), os.scandir(folder) as entries:  # another process may remove them, or rights may be missing
+    with suppress(OSError), os.scandir(folder) as entries:  # another process may remove files, or rights may be missing
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)
             if match is not None and _is_stale(entry, match["machine"], int(match["pid"])):
@@ -271,26 +274,26 @@ _remove_stale_once = cache(remove_stale)  # once per folder and process, since l
 
 
 def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
-    """Return whether a temporary file is abandoned, which is so if the process that writes it has ended.
+    """Return whether a temporary file is abandoned, because the process that wrote it has ended.
 
-    Processes of other machines cannot be asked, nor those on Windows, where ``os.kill`` would end them. There a file
-    counts as abandoned if it is old.
+    Processes of other machines are not visible. On Windows ``os.kill`` would end a process instead of asking for it. In
+    both cases, a file is abandoned if it is old.
     """
     if machine != _machine_hash() or sys.platform == "win32":
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS
     try:
         os.kill(pid, 0)
-    except (OSError, OverflowError) as error:  # another user's process is not ours to ask, and a number may be none
+    except (OSError, OverflowError) as error:  # a process of another user, or a number that is no process id
         return isinstance(error, ProcessLookupError)
-    try:  # a killed process whose parent has not asked for its exit status is still listed, as a zombie
+    try:  # an ended process is listed as a zombie until its parent asks for its exit status
         status = Path(f"/proc/{pid}/stat").read_bytes()
         return status.rpartition(b") ")[2][:1] in (b"Z", b"X")
     except OSError:
         return False
 
 
-def _check_not_there(path: Path, overwrite: bool) -> None:
-    """Raise SceneError for an output that cannot be written or must not be replaced."""
+def _check_writable(path: Path, overwrite: bool) -> None:
+    """Raise SceneError if an output cannot be written, or if it exists and ``overwrite`` is False."""
     try:
         status = os.stat(path)
     except FileNotFoundError:
@@ -309,5 +312,5 @@ def _check_not_there(path: Path, overwrite: bool) -> None:
 
 
 def describe_existing(path: Path) -> str:
-    """Say that an output exists already, or that its name is a link without a file."""
+    """Say that an output exists already, or that its path is a link to a missing file."""
     return _EXISTS[0] if os.path.exists(path) else f"is a link to {os.readlink(path)}, which does not exist"

@@ -1,7 +1,7 @@
-"""Limit the memory and time for reading a file, before its content is read or memory is allocated for it.
+"""Limit the memory and time for reading a file, so that a small damaged file cannot fill the memory.
 
-All readers have the same budget: at most 64 MB + 20 x the file's bytes of memory, and 5 s + 2 s per MB of processor
-time. A reader checks its :class:`ReadBudget` before it allocates memory or runs a loop whose size the file states.
+A reader may take 64 MB of memory and 20 bytes more for each byte of the file. Its loops may take 5 s, and 2 s more for
+each MB. A reader checks its :class:`ReadBudget` before it allocates memory or runs a loop whose size the file states.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from gsmerge.errors import OUT_OF_MEMORY, SceneError
 from gsmerge.io.first_bytes import check_first_bytes
 from gsmerge.types import StrPath
 
-MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any real one has
-MAX_MODEL_BYTES = 256 << 20  # of a COLMAP text file, which also lists the points of every image
-MAX_VIEWS = 10_000  # of a camera file
-MAX_FILES = 100_000  # below a folder of photos
-MAX_PIXELS = 1 << 26  # of one image
+MAX_TEXT_BYTES = 32 << 20  # most bytes of a camera file; real files have far fewer
+MAX_MODEL_BYTES = 256 << 20  # most bytes of a COLMAP text file, which also lists the points of every image
+MAX_VIEWS = 10_000  # most views of a camera file
+MAX_FILES = 100_000  # most files and folders below a folder of photos
+MAX_PIXELS = 1 << 26  # most pixels of an image
 
 _ADDRESS = re.compile(r"(https?|s3|gs|ftp|file):/")  # start of a URL
 _FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20  # bytes of memory for any file, and for each byte of it
 _FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # steps of 20 microseconds: 5 s for any file, and 2 s for each MB
-# For each of these characters in a JSON text, CPython 3.10 to 3.14 makes objects of at most this many bytes
+# Character in a JSON text -> most bytes of the objects that CPython 3.10 to 3.14 makes for it
 _JSON_BYTES = {"[": 88, "{": 130, ":": 110, '"': 30, ",": 34}
 
 
 @dataclass(frozen=True)
 class ReadBudget:
-    """Limits for reading a file: 64 MB + 20 x its bytes of memory, and loops that take 5 s + 2 s per MB.
+    """Limits for reading a file, by its size in bytes.
 
     Args:
         path: The file.
-        file_bytes: Size of the file, and of all files that are read together with it.
-        memory_per_byte: Bytes of memory for each byte of the file.
-        remedy: Remedy in the error for a file that exceeds the memory.
+        file_bytes: Size of the file, with all files that are read together with it.
+        memory_per_byte: Bytes of memory for each byte of the file, besides 64 MB for any file.
+        remedy: Remedy in the error for a file that needs more memory.
     """
 
     path: StrPath
@@ -52,17 +52,20 @@ class ReadBudget:
 
     @property
     def memory(self) -> int:
-        """Bytes of memory that the file allows."""
+        """Most bytes of memory for reading the file."""
         return _FREE_MEMORY + self.memory_per_byte * self.file_bytes
 
     def check_memory(self, num_bytes: float, what: str) -> None:
-        """Raise SceneError if ``num_bytes`` of memory for ``what`` are more than the file allows."""
+        """Raise SceneError if ``what`` needs ``num_bytes`` of memory, and the file allows fewer."""
         if not num_bytes <= self.memory:
             problem = f"expected at most {self.memory / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
             raise SceneError(self.path, f"{problem}, found {what} of {num_bytes / 1e6:,.0f} MB", self.remedy)
 
     def check_steps(self, count: int, what: str) -> None:
-        """Raise SceneError if a loop with ``count`` steps of 20 microseconds, named ``what``, exceeds the budget."""
+        """Raise SceneError if a loop has more steps than the file allows; a step takes 20 microseconds.
+
+        ``what`` names the steps in the error.
+        """
         most = _FREE_STEPS + self.file_bytes // _BYTES_PER_STEP
         if not count <= most:
             problem = f"expected at most {most:,} {what} in a file of {self.file_bytes:,} bytes"
@@ -75,7 +78,7 @@ def read_budget(path: Path) -> ReadBudget:
 
 
 def parse_json(text: str, budget: ReadBudget) -> Any:
-    """Parse JSON; SceneError if its objects would take more memory than the budget, ValueError if it is not JSON."""
+    """Parse JSON; SceneError if its objects would take more memory than the budget, ValueError for other text."""
     objects = sum(size * text.count(character) for character, size in _JSON_BYTES.items())
     budget.check_memory(sys.getsizeof(text) + objects, "JSON")
     try:
@@ -96,7 +99,7 @@ def read_errors(path: StrPath) -> Iterator[None]:
 
 
 def check_file(path: Path) -> int:
-    """Return the size of a file in bytes; SceneError if it is missing, no file, or has unread content."""
+    """Return the size of a file in bytes; SceneError if the file is missing, or of a kind that is not read."""
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
@@ -114,7 +117,7 @@ def check_file(path: Path) -> int:
 
 
 def walk_files(folder: Path) -> list[Path]:
-    """List all files in a folder and its sub-folders, without links to folders; SceneError if there are too many."""
+    """List all files in and below a folder, but not behind links to folders; SceneError for too many files."""
     files: list[Path] = []
     for num_folders, (base, _, names) in enumerate(os.walk(folder), 1):
         files += [Path(base) / name for name in names]
@@ -125,7 +128,7 @@ def walk_files(folder: Path) -> list[Path]:
 
 
 def read_text(path: Path) -> str:
-    """Read a UTF-8 text file; SceneError if it is not text or is too large."""
+    """Read a UTF-8 text file; SceneError if the file is too large or no text."""
     with _text_file(path, MAX_TEXT_BYTES) as file:
         return file.read()
 
@@ -150,7 +153,7 @@ def _text_file(path: Path, limit: int) -> Iterator[TextIO]:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file of at most 32 MiB; SceneError if it cannot be read or is no JSON."""
+    """Read a JSON file of at most 32 MiB; SceneError if the file cannot be read or is no JSON."""
     text = read_text(path)
     try:
         return parse_json(text, read_budget(path))
@@ -168,9 +171,10 @@ def check_image_size(path: StrPath, width: int, height: int) -> None:
 
 
 def check_whole(value: Any, name: str, least: int, most: int = 2**53) -> int:
-    """Return ``value`` if it is a whole number from ``least`` to ``most``; else ValueError, which begins with ``name``.
+    """Return ``value`` if it is a whole number from ``least`` to ``most``; ValueError for any other value.
 
-    By default ``most`` is 2^53. Every JSON reader stores whole numbers up to this one exactly.
+    The error begins with ``name``. By default ``most`` is 2^53, since every JSON reader stores whole numbers up to 2^53
+    exactly.
     """
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError(f"{name}: expected a whole number from {least} to {most}, found {value!r:.40}")

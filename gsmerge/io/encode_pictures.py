@@ -13,6 +13,6 @@ def encode_picture(picture: np.ndarray, quality: int) -> bytes:
     from PIL import WebPImagePlugin  # noqa: F401 - without it, Pillow imports the plugins of all formats
 
     content = io.BytesIO()
-    effort = 0  # 0 to 6; an effort of 1 takes a quarter longer for 1 % fewer bytes, and one of 2 twice as long
+    effort = 0  # of 0 to 6; an effort of 1 takes a quarter longer for 1 % fewer bytes, and an effort of 2 twice as long
     Image.fromarray(picture).save(content, "WEBP", quality=quality, method=effort)
     return content.getvalue()

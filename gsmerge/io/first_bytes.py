@@ -1,4 +1,4 @@
-"""Recognise files that are no scenes, cameras or photos by their first bytes, and refuse them with a remedy."""
+"""Recognise by their first bytes files that are no scenes, cameras or photos, and refuse them with a remedy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", "
 # Endings of files that are never text
 NO_TEXT = (".ply", *_PACKED_SCENES, *IMAGE_SUFFIXES - {".ppm"}, ".torch", ".safetensors", ".bin")
 _START = 1 << 10  # number of first bytes of a file that are compared with patterns
-# A report that gsmerge writes (a page, JSON or CSV) has one of these texts among its first bytes
+# A report of gsmerge (a page, JSON or CSV) has one of these texts among its first bytes
 _REPORTS = b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,"
 _DOWNLOAD = "download it again, in a browser if the page needs a click or a login"
 _UNPACK = "unpack it, and name the scene in it"
@@ -25,13 +25,13 @@ _COPY_AGAIN = "copy or download it again"
 
 @dataclass(frozen=True)
 class OtherContent:
-    """Content for which a file is refused, with a remedy."""
+    """A kind of content for which a file is refused, with a remedy."""
 
     what: str  # its name in messages
     start: str  # pattern of the first bytes; messages quote its group ``quote``, if it has one
     remedy: str
-    right: tuple[str, ...] = ()  # endings of files that may have this content
-    wrong: tuple[str, ...] | None = None  # endings of files that may not have it; None: all others
+    allowed: tuple[str, ...] = ()  # endings of files that are not refused for this content
+    refused: tuple[str, ...] | None = None  # endings of files that are refused for it; None: all others
 
 
 _TRAIN_OR_MAKE = "train Gaussians on it, or make Gaussians from the photos with a model"
@@ -40,7 +40,7 @@ _WRITE_GAUSSIANS = (
 )
 _EXPORT = "export the scene from that program as .ply"
 FILM = "a film"
-# A program that converts other formats
+# The npm package of a program that converts other formats
 CONVERTER_PACKAGE = "@playcanvas/splat-transform@3.7"
 # In remedies, {path} stands for the path of the file
 _PACKED_BY_OTHERS = (
@@ -48,7 +48,7 @@ _PACKED_BY_OTHERS = (
     f"convert it with: npx {CONVERTER_PACKAGE} {{path}} -L 0 scene.ply",
 )
 _FILM_ENTRY = FILM, "save its frames as photos, and make a scene from them with a model such as Depth Anything 3"
-# Ending of other files that are often beside scenes -> their content, and the remedy
+# Ending of a file that is never read -> its content, and the remedy
 FOREIGN: dict[str, tuple[str, str]] = {
     **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"), _FILM_ENTRY),
     **dict.fromkeys((".pt", ".pth", ".ckpt", ".pkl"), ("a checkpoint", _WRITE_GAUSSIANS)),
@@ -79,7 +79,7 @@ OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("TIFF", (".tif", ".tiff"), r"II[*+]\0|MM\0[*+]"),
 )
 CONVERT = "convert it to .jpg or .png"
-# The first row that matches a file counts
+# If several rows match a file, the first of them says what it is
 OTHER_CONTENTS = (
     OtherContent("a Git LFS pointer", r"version https://git-lfs\.github\.com/spec/", "fetch it with: git lfs pull"),
     OtherContent(
@@ -87,43 +87,43 @@ OTHER_CONTENTS = (
         r"(?is)(?:\xef\xbb\xbf)?\s*<(?:!doctype\s+html|html|head|body|script)\b"
         r"(?:.*?<title[^>]*>\s*(?P<quote>[^<]*[^<\s]))?",
         _DOWNLOAD,
-        right=(".html", ".htm"),
+        allowed=(".html", ".htm"),
     ),
     OtherContent(
         "tensors of torch.save, which Lyra 1 writes as .ply",
         r"(?s)PK.*/data\.pkl",
         "run Lyra with save_gaussians_orig: true, and name the file in gaussians_orig",
-        right=(".torch",),
+        allowed=(".torch",),
     ),
-    OtherContent("a zip archive", r"PK\x03\x04", _UNPACK, right=(".sog", ".npz", ".torch")),
-    OtherContent("a gzip archive", r"\x1f\x8b\x08[\0-\x1f]", _UNPACK, right=(".spz",)),
+    OtherContent("a zip archive", r"PK\x03\x04", _UNPACK, allowed=(".sog", ".npz", ".torch")),
+    OtherContent("a gzip archive", r"\x1f\x8b\x08[\0-\x1f]", _UNPACK, allowed=(".spz",)),
     OtherContent("a tar archive", r"(?s).{257}ustar", _UNPACK),
     OtherContent("a 7z archive", r"7z\xbc\xaf\x27\x1c", _UNPACK),
     OtherContent("a rar archive", r"Rar!\x1a\x07", _UNPACK),
     OtherContent("a packed file", r"BZh[1-9]1AY|\xfd7zXZ\0|\x28\xb5\x2f\xfd", _UNPACK),
-    OtherContent("glTF in several files", r"\s*\{", _GLB, wrong=(".gltf",)),
-    OtherContent("a PLY file", r"ply\r?\n", "change its ending to .ply", wrong=_PACKED_SCENES),
+    OtherContent("glTF in several files", r"\s*\{", _GLB, refused=(".gltf",)),
+    OtherContent("a PLY file", r"ply\r?\n", "change its ending to .ply", refused=_PACKED_SCENES),
     OtherContent(
         "text", r"(?!ply[\r\n])\s*(?P<quote>[ -~\x80-\xff]+)(?:[\t\r\n][\t\r\n -~\x80-\xff]*)?\Z", _DOWNLOAD,
-        wrong=NO_TEXT,
+        refused=NO_TEXT,
     ),
 )  # fmt: skip
 
 
 def read_start(path: Path, count: int = 1 << 12) -> bytes:
-    """Read the first bytes of a file, which show its kind; empty if it cannot be read."""
+    """Read the first bytes of a file, which show its kind; empty if the file cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         return file.read(count)
     return b""
 
 
 def may_be_replaced(path: Path) -> bool:
-    """Return whether a report may be written to a path: it has no file, an empty file, or a report of gsmerge."""
+    """Return whether a report may be written to a path, because no file, an empty file, or another report is there."""
     return not path.is_file() or path.stat().st_size == 0 or any(mark in read_start(path) for mark in _REPORTS)
 
 
 def refuse_picture(path: Path) -> None:
-    """Raise SceneError for a picture of a format that is not read, by its name or its first bytes."""
+    """Raise SceneError if a file's ending or first bytes show a picture of a format that is not read."""
     ending, start = path.suffix.lower(), read_start(path, _START)
     for name, endings, pattern in OTHER_PICTURES:
         if ending in endings or re.match(pattern.encode("latin-1"), start):
@@ -132,9 +132,9 @@ def refuse_picture(path: Path) -> None:
 
 
 def check_first_bytes(path: Path, size: int) -> None:
-    """Raise SceneError, with a remedy, for a file of ``size`` bytes whose first bytes or ending show unread content.
+    """Raise SceneError, with a remedy, if the ending or the first bytes of a file show content that is not read.
 
-    A file that cannot be opened is not refused here, since its reader reports that.
+    ``size``: bytes of the file. A file that cannot be opened is not refused here, since its reader reports that.
     """
     ending = path.suffix.lower()
     if size == 0 and ending in NO_TEXT:
@@ -146,10 +146,11 @@ def check_first_bytes(path: Path, size: int) -> None:
     if ending in IMAGE_SUFFIXES:
         refuse_picture(path)
     for row in OTHER_CONTENTS:
-        is_wrong = ending not in row.right and ending in (row.wrong or (ending,))
-        match = re.match(row.start.encode("latin-1"), start) if is_wrong else None
+        is_refused = ending not in row.allowed and (row.refused is None or ending in row.refused)
+        match = re.match(row.start.encode("latin-1"), start) if is_refused else None
         if match:
             quote = (match.groupdict().get("quote") or b"").decode("utf-8", "replace").strip()
             shown = f" ({' '.join(quote.split())!r:.60})" if quote else ""
+            # Archives and glTF may have a scene inside
             expected = "scene" if row.remedy in (_UNPACK, _GLB) else f"{ending} file".strip()
             raise SceneError(path, f"expected a {expected}, found {row.what}{shown}", row.remedy)

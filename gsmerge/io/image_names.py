@@ -1,4 +1,4 @@
-"""Find image files by the names of views, in a folder and its sub-folders, with or without extension."""
+"""Find image files by the names of views, in a folder and its sub-folders. Names may lack the extension."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from gsmerge.io.bounds import walk_files
 from gsmerge.io.first_bytes import FILM, FOREIGN, IMAGE_SUFFIXES, OTHER_PICTURES
 from gsmerge.types import StrPath
 
-OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of unread formats
+OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of formats not read
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
-# Last bytes of the videos that gsmerge writes: a box or an element that players skip. Films of a capture do not have
-# them
+# Last bytes of the videos that gsmerge writes, which tell them from other videos. Players skip them as an unknown part
 CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
 _CUT_FILM = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
 HOLD_PHOTOS = (".npz", ".gsm")  # endings of files that may have photos inside
@@ -30,7 +29,7 @@ PathT = TypeVar("PathT", str, Path)
 
 
 def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
-    """Find the image file of each name, in order; ``source`` and errors are those of :func:`read_images`."""
+    """Find the image file of each name, in the order of ``names``; see :func:`read_images` for source and errors."""
     if isinstance(source, str | os.PathLike):
         root = Path(source)
         if not root.is_dir():
@@ -49,7 +48,7 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
         missing = names[matched.index(None)]
         problem = f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}"
         raise SceneError(root, problem, "add the missing images, or name another folder with --images")
-    if len(set(paths)) < len(set(names)):  # several layers of one view share its name, and its file
+    if len(set(paths)) < len(set(names)):  # equal names are no error, since layers of one view share name and file
         ((repeated, _),) = Counter(paths).most_common(1)
         problem = f"expected a different image for each camera, found {repeated.name} for two of them"
         raise SceneError(root, problem, "give each image the name of its camera")
@@ -57,36 +56,36 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
 
 
 def _files_by_ending(root: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
-    """Map every ending of the files' paths below a folder to the files that have it."""
+    """Map every ending of :func:`_path_endings` to the files whose paths below a folder have this ending."""
     by_ending: dict[str, list[Path]] = {}
     for file in files:
-        for ending in _endings(file.relative_to(root) if file.is_relative_to(root) else file):
+        for ending in _path_endings(file.relative_to(root) if file.is_relative_to(root) else file):
             by_ending.setdefault(ending, []).append(file)
     return by_ending
 
 
-def _endings(path: PurePath) -> list[str]:
-    """List the endings of a path, the longest first: of "a/b.png" these are "a/b.png", "a/b", "b.png" and "b"."""
-    max_parts = 16  # parts at the end of a path that are compared: the file's name, and the folders above it
+def _path_endings(path: PurePath) -> list[str]:
+    """List the endings of a path, the longest first: "a/b.png", "a/b", "b.png" and "b" for "a/b.png"."""
+    max_parts = 16  # most parts of an ending: the file's name, and the folders above it
     parts = path.parts[-max_parts:]
     endings = [PurePosixPath(*parts[i:]) for i in range(len(parts))]
     return list(dict.fromkeys(str(name) for ending in endings for name in (ending, ending.with_suffix(""))))
 
 
 def _find_matches(by_ending: dict[str, list[Path]], name: str) -> list[Path]:
-    """List the files that match a name best; empty if none does.
+    """List the files that match a name best: all files with the longest ending of the name that any file has.
 
-    They have the longest ending of the name that any file has.
+    The list is empty if no file matches.
     """
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
-    return next((by_ending[ending] for ending in _endings(PurePosixPath(*parts)) if ending in by_ending), [])
+    return next((by_ending[ending] for ending in _path_endings(PurePosixPath(*parts)) if ending in by_ending), [])
 
 
 def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixels: PixelCount) -> list[Path | None]:
     """Propose one of ``files`` below a folder for each name; None if no file matches the name.
 
-    Of several files that match, one whose whole path is in the name is preferred, then one outside hidden folders, then
-    the one with most ``pixels``.
+    Of several files that match, a file whose whole path is in the name comes first, then a file outside of hidden
+    folders, then the file with most ``pixels``.
     """
     by_ending = _files_by_ending(root, files)
 
@@ -94,11 +93,11 @@ def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixe
         """Return a sort key by which the preferred file comes first."""
         relative = path.relative_to(root) if path.is_relative_to(root) else path
         whole_paths = str(relative), str(relative.with_suffix(""))
-        has_whole_path = any(ending in whole_paths for ending in _endings(PurePosixPath(name)))
+        has_whole_path = any(ending in whole_paths for ending in _path_endings(PurePosixPath(name)))
         return not has_whole_path, any(part[0] in _HIDDEN for part in relative.parts), -pixels(path)
 
     def choose(name: str) -> Path | None:
-        """Return the preferred file for a name; None without any."""
+        """Return the preferred file for a name; None if no file matches."""
         matches = _find_matches(by_ending, name)
         return min(matches, key=lambda path: rank(path, name)) if len(matches) > 1 else next(iter(matches), None)
 
@@ -120,12 +119,12 @@ def match_masks(
 ) -> tuple[list[Path | None], list[str]]:
     """Find the mask of every view by the name of its photo, with or without extension; None for a view without a mask.
 
-    Also returns notes: on masks that belong to no view, or that no view has a mask. SceneError, which names the
-    ``option``, if a view has two masks, or if no view has one although the caller ``named`` the folder.
+    Also returns a list of notes. A note names masks that belong to no view, or says that no view has a mask. SceneError
+    if a view has two masks, or if the user ``named`` the folder and no view has a mask; the error names the ``option``.
     """
 
     def is_of_neighbour(mask: Path, photo: Path) -> bool:
-        """Return whether a mask lies in a sub-folder with the name of another photo folder beside that of ``photo``."""
+        """Return whether a mask lies in a sub-folder that has the name of another folder of photos than the photo's."""
         neighbour = photo.parent.parent / mask.parent.name
         return mask.parent != folder and neighbour != photo.parent and neighbour.is_dir()
 
@@ -134,8 +133,8 @@ def match_masks(
     pairs = ((_find_only(folder, by_ending, name, option), Path(name)) for name in names)
     masks = [None if mask is None or is_of_neighbour(mask, photo) else mask for mask, photo in pairs]
     if not any(masks):
-        other_names = "none", f"rename the masks, or name another folder with {option}"
-        content, remedy = (None if files else _find_unread(walk_files(folder))) or other_names
+        unread = None if files else _describe_unread_files(walk_files(folder))
+        content, remedy = unread or ("none", f"rename the masks, or name another folder with {option}")
         problem = f"expected masks with the names of the photos, such as {PurePath(names[0]).stem}.png, found {content}"
         if named:
             raise SceneError(folder, problem, remedy)
@@ -147,7 +146,7 @@ def match_masks(
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List all images below a folder in natural order ("2" before "10"); SceneError for too many files."""
+    """List all images in and below a folder in natural order ("2" before "10"); SceneError for too many files."""
     images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
     return natural_order(images)
 
@@ -160,27 +159,28 @@ def check_photo_folder(path: Path) -> None:
         raise SceneError(path, f"expected a folder of photos, found {content}", remedy)
     if not path.is_dir() or list_images(path):
         return
-    content, remedy = _find_unread(walk_files(path)) or ("none", _NAME_FOLDER.format(option="--images"))
+    content, remedy = _describe_unread_files(walk_files(path)) or ("none", _NAME_FOLDER.format(option="--images"))
     raise SceneError(path, f"expected photos ({', '.join(sorted(IMAGE_SUFFIXES))}), found {content}", remedy)
 
 
 def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
-    """Note pictures or films that cannot be read, in one of a folder's sub-folders ``places`` or in the folder itself.
+    """Return a note on pictures or videos that cannot be read, in the sub-folders ``places`` or in the folder itself.
 
-    Only the first of these folders with such files is noted; empty if none has any.
+    The note is on the first of these folders that has such files. The list is empty if none has any.
     """
     for place in (*(folder / name for name in places), folder):
         with suppress(OSError):
             files = (path for path in place.iterdir() if path.is_file())
-            # A GIF is a clip, and no photo
-            unread = _find_unread([path for path in files if path.suffix.lower() != ".gif"])
+            # A GIF is no photo, but a video
+            unread = _describe_unread_files([path for path in files if path.suffix.lower() != ".gif"])
             if unread is not None:
-                return [f"{place} has {unread[0]}, which cannot be read; {unread[1]}"]
+                content, remedy = unread
+                return [f"{place} has {content}, which cannot be read; {remedy}"]
     return []
 
 
-def _find_unread(files: Sequence[Path]) -> tuple[str, str] | None:
-    """Describe the pictures, or else films, among files that cannot be read, and return a remedy; None without any."""
+def _describe_unread_files(files: Sequence[Path]) -> tuple[str, str] | None:
+    """Describe files that are pictures of unread formats, or else videos, and add a remedy; None without such files."""
     counts = Counter(file.suffix.lower() for file in files)
     if num_pictures := sum(counts[ending] for ending in OTHER_SUFFIXES):
         endings = " and ".join(sorted(ending for ending in counts if ending in OTHER_SUFFIXES))
@@ -188,10 +188,10 @@ def _find_unread(files: Sequence[Path]) -> tuple[str, str] | None:
     return (FILM, _CUT_FILM) if any(file.suffix.lower() in FILMS and not is_clip(file) for file in files) else None
 
 
-def is_clip(film: Path) -> bool:
-    """Return whether gsmerge wrote a film, as the last bytes of the file show."""
-    end = CLIP_ENDS.get(film.suffix.lower(), b"")
-    with suppress(OSError), film.open("rb") as file:
+def is_clip(video: Path) -> bool:
+    """Return whether gsmerge wrote a video, which its last bytes show."""
+    end = CLIP_ENDS.get(video.suffix.lower(), b"")
+    with suppress(OSError), video.open("rb") as file:
         file.seek(-len(end), os.SEEK_END)
         return bool(end) and file.read() == end
     return False
@@ -204,7 +204,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def natural_order(paths: Iterable[PathT]) -> list[PathT]:
-    """Sort paths so that "view 2" comes before "view 10"; equal numbers, as in "view 02", are sorted as text."""
+    """Sort paths so that "view 2" comes before "view 10". "view 2" and "view 02" are sorted as text."""
     return sorted(sorted(paths), key=lambda path: natural_key(os.fspath(path).replace(os.sep, "/")))
 
 
@@ -212,8 +212,8 @@ def find_image(folder: Path, name: str, cameras: Path, *, option: str = "--image
     """Find the image that a file of ``cameras`` names, with or without extension; None if there is none.
 
     SceneError for an image outside the folder, since a camera file from elsewhere could name any picture of this
-    machine. Its remedy is ``remedy``, or by default to name the folder with the ``option``. Links to files inside the
-    folder are followed.
+    machine. The error has the ``remedy``, or by default says to name the folder with the ``option``. Links to files
+    inside the folder are followed.
     """
     path = os.path.normpath(os.path.join(folder, name))
     candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]

@@ -1,4 +1,4 @@
-"""Read and append JSON lines; files stay valid if a process is killed, or if several processes append at once."""
+"""Read and append JSON lines. Files stay valid if a process is killed, or if several processes append at once."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import ReadBudget, parse_json, read_budget, read_errors
 from gsmerge.io.locks import lock_file
 
-LOCK = ".gsmerge-lock"  # name of the lock file beside a file, while a line is appended to it
+LOCK = ".gsmerge-lock"  # name of the lock file that is beside a file while a line is appended
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
-    """Yield the position after each complete line in bytes, and its object, from byte ``start`` on.
+    """Yield the position in bytes after each complete line, and the line's JSON object, from byte ``start`` on.
 
-    The object of a damaged line is None. A line whose object takes more memory than the file's budget counts as
-    damaged, too.
+    A damaged line has None as its object. A line whose object takes more memory than the file's budget counts as
+    damaged.
     """
     if not path.exists():
         return
@@ -45,10 +45,10 @@ def _parse(line: bytes, budget: ReadBudget) -> dict[str, Any] | None:
 
 
 def append_line(path: Path, value: Mapping[str, Any]) -> None:
-    """Append one JSON line and wait until it is on the disk; an incomplete last line is replaced.
+    """Append one JSON line and wait until it is on the disk.
 
-    If the disk is full, the file stays as it was. SceneError if the file cannot be written, ValueError if a value is
-    NaN or inf.
+    The line replaces an incomplete last line, which a killed process left. If the disk is full, all complete lines
+    stay. SceneError if the file cannot be written, ValueError if a value is NaN or inf.
     """
     line = json.dumps(value, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
     try:
@@ -65,7 +65,7 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
 
 
 def _end_of_lines(file: FileIO) -> int:
-    """Return the position after the last complete line, in bytes."""
+    """Return the position in bytes after the last complete line."""
     size = file.seek(0, os.SEEK_END)
     if size == 0:
         return 0

@@ -1,4 +1,4 @@
-"""Locks between processes; the file of a lock exists only while the lock is held."""
+"""Lock files between processes. A lock file exists only while a process has the lock."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from gsmerge.errors import SceneError
 
 @contextmanager
 def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Let one process at a time into the block, by a lock file; yield whether this process has the lock.
+    """Lock a file for the block against other processes, and yield whether this process has the lock.
 
-    ``wait``: wait for the lock; otherwise yield False if another process has it. SceneError if the lock file cannot be
-    made.
+    If another process has the lock, the call waits for it, or yields False without ``wait``. SceneError if the lock
+    file cannot be made.
     """
     from filelock import FileLock, Timeout  # most commands need no lock
 
@@ -29,6 +29,7 @@ def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
     try:
         yield True
     finally:
-        with suppress(OSError):  # Windows removes no open file; there the release removes it
-            path.unlink()  # before the release, so that a waiting process notices that its file is no longer the lock
+        # The file is removed before the release, so that a waiting process notices that its file is no longer the lock
+        with suppress(OSError):  # Windows cannot remove an open file; there the release removes the file
+            path.unlink()
         lock.release()

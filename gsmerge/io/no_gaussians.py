@@ -1,4 +1,4 @@
-"""Recognise the output of models and programs that has no Gaussians, and say how to get Gaussians from each."""
+"""Recognise output without Gaussians, and say how to get Gaussians from the model or program that wrote it."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _NAME_PLY = "name the .ply of the Gaussians, or the folder that it is in"
 
 @dataclass(frozen=True)
 class PointsOnly:
-    """A model or program whose output has no Gaussians, and how the user gets Gaussians in its place."""
+    """A model or program whose output has no Gaussians, with a remedy."""
 
     title: str  # the name that people use
     files: tuple[str, ...]  # patterns of its output in a folder; one match is enough
-    remedy: str
+    remedy: str  # how the user gets Gaussians
 
 
 _TRAIN_OR_NAME = "train Gaussians on it, or name the .ply of a model, and this file with --cameras"
-# Content of a folder of photos, and the remedy
+# What a folder of photos contains, and the remedy
 _PHOTOS = "photos", "make Gaussians from the photos first, with a model such as Depth Anything 3 or AnySplat"
-# The first row with a matching file counts
+# If several rows match a folder, the first of them says what it is
 POINTS_ONLY = (
     PointsOnly(
         "Depth Anything 3",
@@ -59,29 +59,30 @@ POINTS_ONLY = (
 
 
 def no_gaussians(folder: Path) -> SceneError:
-    """Make the error of a folder without a scene, which says what it contains instead, and what to do."""
+    """Make the error for a folder without a scene. It says what the folder contains, and what to do."""
     try:
         os.scandir(folder).close()
     except OSError as error:
         return SceneError(folder, f"cannot be read ({error.strerror})")
-    content, remedy = _content(folder) or ("", _NAME_PLY)
+    content, remedy = _describe_content(folder) or ("", _NAME_PLY)
     problem = "expected a .ply of Gaussians in the folder, found none"
     return SceneError(folder, f"{problem} but {content}" if content else problem, remedy)
 
 
 def find_remedy(folder: Path) -> str:
-    """Say what a folder without scenes, or one of its folders, has instead, and what to do; "" if nothing is known."""
+    """Say what a folder without scenes, or one of its sub-folders, contains, and what to do; empty if not known."""
     with suppress(OSError):
         subfolders = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
-        contents = [(path, _content(path)) for path in (folder, *islice(subfolders, MAX_SEARCHED_FOLDERS))]
-        for path, content in sorted(contents, key=lambda entry: entry[1] == _PHOTOS):  # photos come last
-            if content is not None:
-                return f"{path} has {content[0]}: {content[1]}"
+        searched = (folder, *islice(subfolders, MAX_SEARCHED_FOLDERS))
+        contents = [(path, *known) for path in searched if (known := _describe_content(path)) is not None]
+        if contents:
+            path, content, remedy = min(contents, key=lambda entry: entry[1:] == _PHOTOS)  # photos only without others
+            return f"{path} has {content}: {remedy}"
     return ""
 
 
-def _content(folder: Path) -> tuple[str, str] | None:
-    """Describe what a folder without a scene contains, and return a remedy; None if no content is known."""
+def _describe_content(folder: Path) -> tuple[str, str] | None:
+    """Describe what a folder without a scene contains, and return a remedy with it; None if nothing in it is known."""
     files = (
         path
         for path in sorted(folder.glob("[!.]*"))
@@ -106,9 +107,9 @@ def _content(folder: Path) -> tuple[str, str] | None:
 
 
 def check_scene_file(path: Path) -> None:
-    """Raise SceneError, with a remedy, for a file that is known to hold no Gaussians, such as ``results.npz``."""
+    """Raise SceneError, with a remedy, for a file of an ending like ``.npz`` or ``.glb`` that holds no Gaussians."""
     suffix = path.suffix.lower()
-    if suffix not in SEVERAL_USES or not check_file(path) or may_hold_gaussians(path):
+    if suffix not in SEVERAL_USES or check_file(path) == 0 or may_hold_gaussians(path):
         return
     matching = (row for row in POINTS_ONLY if any(path.match(Path(file).name) for file in row.files))
     row = next(matching, POINTS_ONLY[-1])

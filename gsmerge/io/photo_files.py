@@ -1,4 +1,4 @@
-"""Read the photos of a scene: match them by name, decode them in parallel, resize and crop them."""
+"""Read photos and masks: match them by name, decode them in parallel, resize and crop them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map, quiet_warnings
 from gsmerge.types import Cameras
 
-_FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads; that of PNG is read here
+_FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads; headers of PNG are read here
 # Orientation tag -> number of quarter turns counterclockwise, plus 4 if the photo is mirrored first
 _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
-# Relative difference up to which two ratios of width and height are equal. Models that round the shorter side of a
-# picture to a multiple of 14 change it by 7 of 350 pixels
+# Relative difference up to which two ratios of width and height are equal. A network that rounds a side of 350 pixels
+# to a multiple of 14 changes it by up to 7 pixels, which is this share
 ASPECT_TOLERANCE = 0.02
 # First and last bytes of a PNG file
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
@@ -38,25 +38,25 @@ _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # start of a file, and of each of its s
 _PHOTO_MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
 _COPIES = 2, 3  # copies of all pixels in memory: while OpenCV decodes, and at most while Pillow decodes and converts
 _PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # bytes of a pixel by Pillow's mode; 4 in all other modes
-# Bytes of memory for each pixel while it is decoded
+# Bytes of memory for each pixel while a decoder works, besides the decoded pixel
 _COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10
-# First bytes of a file -> Pillow's plugin. It is imported before, since Pillow would else import those of all formats
+# First bytes of a file -> the plugin of Pillow that opens it
 _PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp"}
 _CHANNELS = 3  # bytes of a decoded photo's pixel
-# Bytes of a scene's decoded photos that are allowed in any case, and in addition for each byte of the files. Even
-# strongly compressed photos have more than 0.03 bytes per pixel
+# Most bytes of a scene's decoded photos: for any files, and in addition for each byte of the files. Even strongly
+# compressed photos have more than the 0.03 bytes per pixel that this needs
 _FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100
 _SMALLER = "reduce its size: a mask to that of its photo, a photo to about that of its view"
 _BAND = 256  # rows of a mask that are converted at once
 _REDUCTIONS = {  # number by which each side is divided -> OpenCV's flag
     1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
 }  # fmt: skip
-_PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})  # those that determine the pixels
+_PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})  # chunks that determine the pixels
 
-Size = tuple[int, int]  # width, height, pixels
+Size = tuple[int, int]  # width and height in pixels
 Part = tuple[float, float, float, float]  # left, top, right and bottom of a part of a photo, as shares of its sides
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)  # all of a photo
-_AT_ONCE = 128 << 20  # bytes of decoded photos in memory; if there are more, photos are decoded at each use
+_AT_ONCE = 128 << 20  # most bytes of decoded photos in memory; if they need more, photos are decoded at each use
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class PhotoReader:
 
 
 PhotoArrays = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c photos [h,w,3], uint8 sRGB; empty without photos
-NO_IMAGES = np.empty((0, 1, 1, 3), np.float32)  # stands for photos as floats if there are none
+NO_IMAGES = np.empty((0, 1, 1, 3), np.float32)  # photos as floats, of a scene without photos
 
 
 def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
@@ -85,17 +85,17 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 
     ``source`` is a folder, which is searched with its sub-folders, or a list of image files. ``names`` are the names in
     a camera file, with or without folders and extension. If no name matches but there are as many images as names, the
-    images are used in their order, in which numbers in names count as numbers. SceneError if an image is missing or
-    cannot be read, or if images differ in size.
+    images of a folder are used in natural order ("2" before "10"), and images of a list in the order of the list.
+    SceneError if an image is missing or cannot be read, or if images differ in size.
     """
     return as_floats(decode_images(match_images(source, names)))
 
 
 def decode_images(paths: Sequence[Path]) -> PhotoArrays:
-    """Decode image files of one size to ``[h,w,3]`` uint8 each; if they are large, they are decoded at each use.
+    """Decode image files of one size to ``[h,w,3]`` uint8 each. Large images are decoded at each use.
 
-    A file that is several times in ``paths`` is decoded once. SceneError if an image cannot be read, if two differ in
-    size, or if all together take more memory than the bytes of their files allow.
+    A file that is several times in ``paths`` is decoded once. SceneError if an image cannot be read, if two images
+    differ in size, or if all together take more memory than the bytes of their files allow.
     """
     files = list(dict.fromkeys(paths))
     sizes = {path: image_size(path) for path in files}
@@ -107,9 +107,10 @@ def decode_images(paths: Sequence[Path]) -> PhotoArrays:
     return decode_photos(paths, [0] * len(paths), size) if files else []
 
 
-def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
-    """Raise SceneError if the photos of a scene take more memory together than the bytes of their files allow."""
-    num_bytes, max_bytes = _CHANNELS * len(paths) * size[0] * size[1], _FREE_PHOTOS + _PHOTOS_PER_BYTE * file_bytes
+def _check_total_memory(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
+    """Raise SceneError if all photos of a scene together take more memory than the bytes of their files allow."""
+    num_bytes = _CHANNELS * len(paths) * size[0] * size[1]
+    max_bytes = _FREE_PHOTOS + _PHOTOS_PER_BYTE * file_bytes
     if num_bytes > max_bytes:
         problem = f"expected photos of at most {max_bytes / 1e6:,.0f} MB together from files of {file_bytes:,} bytes"
         found = f"found {len(paths):,} of {size[0]} x {size[1]}, {num_bytes / 1e6:,.0f} MB"
@@ -117,17 +118,17 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
 
 
 def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size, part: Part = WHOLE) -> PhotoArrays:
-    """Decode the photo of each view, turn it, and resize a ``part`` of it to ``[h,w,3]`` uint8 of one ``size``.
+    """Decode the photo of each view, turn it upright, and resize a ``part`` of it to ``[h,w,3]`` uint8 of one ``size``.
 
-    A view without a file has a black photo. If photos are large, they are decoded at each use. Otherwise a photo that
-    several views have is decoded once. SceneError as in :func:`decode_images`.
+    ``turns`` are those of :func:`orientation_turn`. A view without a file gets a black photo. Large photos are decoded
+    at each use. Other photos are decoded once, also if several views have them. SceneError as in :func:`decode_images`.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
-    _check_together([path for path in paths if path is not None], sum(map(check_file, files)), size)
+    _check_total_memory([path for path in paths if path is not None], sum(map(check_file, files)), size)
 
     def decode(view: tuple[Path | None, int]) -> np.ndarray:
-        """Decode the part of one view's photo."""
+        """Decode, turn, cut and resize the photo of one view, which is the photo's path and turn."""
         path, turn = view
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
@@ -146,8 +147,8 @@ def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size
 def decode_small(path: Path, side: int) -> np.ndarray:
     """Decode a small version of a photo to ``[h,w,3]`` float32 sRGB in [0, 1].
 
-    The longer side has from ``side`` to twice as many pixels; small photos keep their size. The orientation tag is
-    ignored. JPEG files are decoded at a reduced size, which is fast.
+    The longer side has ``side`` to twice ``side`` pixels; a photo that is smaller keeps its size. The orientation tag
+    is ignored. JPEG files are decoded at a reduced size, which is fast.
     """
     width, height = image_size(path)
     divisor = next(divisor for divisor in reversed(_REDUCTIONS) if max(width, height) >= divisor * side or divisor == 1)
@@ -165,22 +166,22 @@ def decode_small(path: Path, side: int) -> np.ndarray:
 def change_photos(
     photos: PhotoArrays, change: Callable[[int, np.ndarray], np.ndarray], size: Size | None = None
 ) -> PhotoArrays:
-    """Apply ``change(index, photo)`` to every photo; a reader applies it at each use.
+    """Apply ``change(index, photo)`` to every photo. Photos of a reader are changed at each use.
 
-    ``size``: size of the results, if it is not that of the photos.
+    ``size``: size of the changed photos, if it differs from that of the photos.
     """
     if isinstance(photos, PhotoReader):
-        return PhotoReader(len(photos), size or photos.size, lambda photo: change(photo, photos[photo]))
-    return parallel_map(lambda photo: change(photo, photos[photo]), range(len(photos)))
+        return PhotoReader(len(photos), size or photos.size, lambda index: change(index, photos[index]))
+    return parallel_map(lambda index: change(index, photos[index]), range(len(photos)))
 
 
 def keep_photos(photos: PhotoArrays) -> PhotoArrays:
-    """Decode the photos of a reader into memory, for callers that use them more than once."""
+    """Decode all photos of a reader into memory, for callers that use each photo more than once."""
     return parallel_map(photos.read, range(len(photos))) if isinstance(photos, PhotoReader) else photos
 
 
 def decode_image(path: Path, size: Size) -> np.ndarray:
-    """Decode an image file of known size to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
+    """Decode an image file whose ``size`` is known to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
     with read_errors(path):
         data = np.fromfile(path, np.uint8)
     _check_scans(path, data, size)
@@ -189,12 +190,12 @@ def decode_image(path: Path, size: Size) -> np.ndarray:
 
 def as_floats(images: PhotoArrays) -> np.ndarray:
     """Convert c photos ``[h,w,3]`` uint8 to one array ``[c,h,w,3]`` float32 in [0, 1]."""
-    width, height = photo_size(images) or (1, 1)
+    width, height = photo_size(images) or (1, 1)  # the array has no entry if there are no photos
     out = make_array((len(images), height, width, 3), np.float32)
 
     def convert(i: int) -> None:
         np.multiply(images[i], np.float32(1 / 255), out=out[i])
-        free_pages([out])
+        free_pages([out])  # a large array lies in a file, so that its memory can be released
 
     parallel_map(convert, range(len(images)))
     return out
@@ -208,18 +209,18 @@ def photo_size(photos: PhotoArrays) -> Size | None:
 
 
 def photo_array(images: np.ndarray | None) -> np.ndarray:
-    """Return photos ``[c,h,w,3]`` unchanged, or an empty array in place of None."""
+    """Return photos ``[c,h,w,3]`` unchanged, and an empty array for None."""
     return NO_IMAGES if images is None else images
 
 
 def part_size(size: Size, part: Part) -> Size:
-    """Return the size in pixels of a part of a photo that has a ``size``."""
+    """Return the size in pixels of a part of a photo whose size is ``size``."""
     left, top, right, bottom = (round(side * share) for side, share in zip(size * 2, part, strict=True))
     return max(1, right - left), max(1, bottom - top)
 
 
 def cut_part(photo: np.ndarray, part: Part) -> np.ndarray:
-    """Cut a part out of a photo ``[h,w,...]``; the result is a view of the photo."""
+    """Cut a part out of a photo ``[h,w,...]``. The returned array shares the photo's memory."""
     width, height = part_size(photo.shape[1::-1], part)
     left, top = round(photo.shape[1] * part[0]), round(photo.shape[0] * part[1])
     return photo[top : top + height, left : left + width]
@@ -233,13 +234,13 @@ def same_shape(size: Size, other: Size) -> bool:
 def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     """Decode the brightness ``[h,w]`` of a mask, times its opacity, as uint8 with white as 255.
 
-    White in the file is 1, 255 or 65,535: the least of these that no value exceeds. The bytes of the mask and of its
-    ``photo`` together limit the memory, since masks compress to very few bytes.
+    The file may store white as 1, 255 or 65,535. White is the least of these values that no pixel exceeds. The bytes of
+    the mask and of its ``photo`` together limit the memory, since masks compress to very few bytes.
     """
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 
     def brightness(image: Image.Image) -> np.ndarray:
-        """Return the brightness ``[h,w]`` as stored; of 8 bits times the opacity."""
+        """Return the brightness ``[h,w]`` that the file stores, in images of 8 bits times the opacity."""
         _check_channels(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
             return np.asarray(image)
@@ -255,8 +256,10 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     grey = _decode_channel(path, brightness)
     assert grey is not None
     brightest = float(grey.max(initial=0))
-    whites = 1, 255, 65535  # largest value of pictures of 0 and 1 or of fractions, of 8 bits, and of 16 bits
-    white = next((white for white in whites if brightest <= white), brightest)
+    whites = 1, 255, 65535  # of fractions or of 0 and 1, of 8 bits, and of 16 bits
+    white = next(
+        (white for white in whites if brightest <= white), brightest
+    )  # other files are scaled to the brightest
     if grey.dtype == np.uint8 and white == 255:
         return grey
     levels = np.zeros(grey.shape, np.uint8)
@@ -267,29 +270,29 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
 
 
 def decode_alpha(path: Path) -> np.ndarray | None:
-    """Decode a photo's transparency to ``[h,w]`` bool, True where it is opaque; None if it is opaque everywhere."""
+    """Decode where a photo is opaque: ``[h,w]`` bool, True for opaque pixels; None if the whole photo is opaque."""
     if path.suffix.lower() in _OPAQUE_SUFFIXES:
         return None
 
     def alpha(image: Image.Image) -> Image.Image | None:
-        """Return the channel of opacity; None if the image has none."""
+        """Return the opacities; None if the image has none."""
         if "A" not in image.getbands() and "transparency" not in image.info:
             return None
         _check_channels(_photo_budget(path), image)
         return image.convert("RGBA").getchannel("A")
 
     values = _decode_channel(path, alpha)
-    half_opaque = 127  # of 255; a pixel counts if it is more opaque
+    half_opaque = 127  # of 255; pixels with a higher value are opaque
     return None if values is None or values.min() > half_opaque else values > half_opaque
 
 
 def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
-    """Return the budget of a photo or mask that is decoded alone; the bytes of files ``beside`` it count as well."""
+    """Return the budget of a photo or mask that is decoded alone; bytes of the files ``beside`` it count as well."""
     return ReadBudget(path, sum(map(check_file, (path, *beside))), _PHOTO_MEMORY_PER_BYTE, _SMALLER)
 
 
 def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
-    """Raise SceneError if Pillow needs more memory for an image and one of its channels than the file allows."""
+    """Raise SceneError if Pillow needs more memory to convert an image to one channel than the file allows."""
     pixel_bytes = _PILLOW_BYTES.get(image.mode, 4)
     decoder_bytes = _decoder_bytes(image) + (_PILLOW_WEBP_BYTES if image.format == "WEBP" else 0)
     num_bytes = max(_COPIES[1] * pixel_bytes, pixel_bytes + decoder_bytes) * image.width * image.height
@@ -297,18 +300,19 @@ def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
 
 
 def _decoder_bytes(image: Image.Image) -> float:
-    """Return the measured bytes per pixel that a decoder needs besides its output.
+    """Return how many bytes per pixel a decoder needs besides its output, as measured.
 
     These bytes hold the frames of a WebP, or the coefficients of a progressive JPEG.
     """
     if image.format == "WEBP":
         return _MOVING_WEBP_BYTES if getattr(image, "is_animated", False) else _WEBP_BYTES
-    shares = [across * down for _, across, down, _ in getattr(image, "layer", ())]
-    return _COEFFICIENT_BYTES * sum(shares) / max(shares, default=1)
+    # Channels of a JPEG may be sampled less densely than the pixels
+    densities = [across * down for _, across, down, _ in getattr(image, "layer", ())]
+    return _COEFFICIENT_BYTES * sum(densities) / max(densities, default=1)
 
 
 def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
-    """Open an image with Pillow, and return what ``choose`` makes of it as an array; None if that is None.
+    """Open an image with Pillow, and return as an array what ``choose`` returns for it; None if this is None.
 
     SceneError if the image cannot be decoded.
     """
@@ -316,7 +320,7 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
     try:
         with quiet_warnings():
             data = np.fromfile(path, np.uint8)
-            pixels = _png_pixels(data) if data[: len(PNG)].tobytes() == PNG else data  # without texts of many MB
+            pixels = _png_pixels(data) if data[: len(PNG)].tobytes() == PNG else data
             if pixels is None:
                 raise ValueError("damaged chunks")
             with _open_image(io.BytesIO(pixels.data), ("PNG", *_FORMATS)) as image:
@@ -329,14 +333,14 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
 
 
 def _undecodable(path: Path, size: Size) -> SceneError:
-    """Make the error of an image that a library did not decode; raise MemoryError if there is no memory for it."""
+    """Make the error for an image that a library did not decode; raise MemoryError if memory was the reason."""
     work_bytes = 9  # additional bytes of a pixel while a library decodes it
-    np.empty((_CHANNELS + work_bytes, *size), np.uint8)  # libraries do not say if memory was the reason
+    np.empty((_CHANNELS + work_bytes, *size), np.uint8)  # raises MemoryError, since the library does not say so
     return _unreadable(path)
 
 
 def _unreadable(path: Path) -> SceneError:
-    """Make the error of a file that is no image; raise another SceneError if its format is known, but not read."""
+    """Make the error for a file that is no image; raise a SceneError that names the format if it is a known one."""
     refuse_picture(path)
     return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
 
@@ -344,8 +348,8 @@ def _unreadable(path: Path) -> SceneError:
 def image_size(path: Path) -> Size:
     """Read (width, height) from the header of a PNG, JPEG, WebP, BMP or PNM file; its orientation is ignored.
 
-    SceneError if it is another file, if it cannot be read, if its size is impossible, or if its pixels take more memory
-    than the file allows.
+    SceneError if the file has another format or cannot be read, if the size is impossible, or if the pixels take more
+    memory than the file allows.
     """
     (width, height), pixel_bytes = _read_header(path)
     _photo_budget(path).check_memory(pixel_bytes * width * height, f"{width} x {height} pixels")
@@ -353,11 +357,14 @@ def image_size(path: Path) -> Size:
 
 
 def _read_header(path: Path) -> tuple[Size, float]:
-    """Read an image's size, and return it with the bytes of memory for each pixel while it is decoded."""
+    """Read the size of an image, and how many bytes of memory a decoder needs for each pixel.
+
+    SceneError if the file is no image, or has far more bytes than pixels.
+    """
     num_bytes = check_file(path)
     with read_errors(path), path.open("rb") as file:
         (width, height), pixel_bytes = _parse_header(path, file)
-    max_pixel_bytes, max_extra = 16, 16 << 20  # of a file: four floats per pixel, and profiles or thumbnails
+    max_pixel_bytes, max_extra = 16, 16 << 20  # most bytes of a pixel, four floats, and of profiles and thumbnails
     if num_bytes > max_pixel_bytes * width * height + max_extra:
         limit = f"{max_pixel_bytes} bytes per pixel and {max_extra >> 20} MiB"
         found = f"{num_bytes >> 20} MiB for {width} x {height} pixels"
@@ -366,27 +373,27 @@ def _read_header(path: Path) -> tuple[Size, float]:
 
 
 def orientation_turn(path: Path) -> int:
-    """Return a photo's orientation by its tag, 0 to 7, as :func:`gsmerge.kernels.pictures.turn_picture` takes it."""
+    """Return the turn, 0 to 7, with which :func:`turn_picture` turns a photo upright, from its orientation tag."""
     with read_errors(path), quiet_warnings():
         try:
             with path.open("rb") as file, _open_image(file, (*_FORMATS, "PNG")) as image:
-                orientation_tag = 274  # of EXIF
+                orientation_tag = 274  # number of the tag in EXIF
                 return _TURNS.get(image.getexif().get(orientation_tag, 0), 0)
-        except Exception:  # a damaged tag may make the library raise any error; pixels are checked later
+        except Exception:  # damage may make the library raise any error; pixels are checked later
             return 0
 
 
 def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
-    """Return the size in the header of an image, and the bytes of memory for each pixel while it is decoded."""
-    start, pixel_bytes = file.read(24), 0.0
+    """Return the size in the header of an image, and how many bytes of memory a decoder needs for each pixel."""
+    start, work_bytes = file.read(24), 0.0
     file.seek(0)
     try:
-        if start[:8] == PNG:  # Pillow refuses a PNG for damage outside its pixels as well
+        if start[:8] == PNG:  # Pillow would also refuse a PNG with damage outside its pixels
             width, height = struct.unpack(">II", start[16:24])
         else:
             with quiet_warnings():
                 image = _open_image(file, _FORMATS)
-            pixel_bytes = _decoder_bytes(image)
+            work_bytes = _decoder_bytes(image)
             width, height = image.size
     except (SceneError, MemoryError):
         raise
@@ -396,11 +403,14 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
     except Exception as error:  # a damaged header may make the library raise any error
         raise _unreadable(path) from error
     check_image_size(path, width, height)
-    return (width, height), max(_COPIES[0] * _CHANNELS, _CHANNELS + pixel_bytes)
+    return (width, height), max(_COPIES[0] * _CHANNELS, _CHANNELS + work_bytes)
 
 
 def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
-    """Open an image in one of Pillow's ``formats``; errors as those of ``Image.open``."""
+    """Open an image in one of Pillow's ``formats``, with the errors of ``Image.open``.
+
+    Only the plugin for the image's format is imported. Pillow would import the plugins of all formats.
+    """
     start = file.read(max(map(len, _PLUGINS)))
     plugin = next((plugin for first, plugin in _PLUGINS.items() if start.startswith(first)), None)
     if plugin is not None and plugin.upper() in formats:
@@ -410,7 +420,7 @@ def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
 
 
 def _check_scans(path: Path, data: np.ndarray, size: Size) -> None:
-    """Raise SceneError if the scans of a JPEG file, each over all pixels, take longer than its bytes allow."""
+    """Raise SceneError if the scans of a JPEG file take longer than its bytes allow; each scan covers all pixels."""
     num_scans = data.tobytes().count(_SCAN) if data[:2].tobytes() == _JPEG else 0
     pixels_per_step = 50_000  # pixels of an empty scan that are decoded in one step of a budget
     steps = num_scans * size[0] * size[1] // pixels_per_step
@@ -418,7 +428,10 @@ def _check_scans(path: Path, data: np.ndarray, size: Size) -> None:
 
 
 def _decode(path: Path, data: np.ndarray, size: Size, divisor: int = 1) -> np.ndarray:
-    """Decode ``[h,w,3]`` uint8 sRGB, with each side divided by ``divisor``; the orientation tag is ignored."""
+    """Decode the bytes of a file to ``[h,w,3]`` uint8 sRGB, with each side divided by ``divisor``.
+
+    The orientation tag is ignored.
+    """
     width, height = (-(-side // divisor) for side in size)
     flags = _REDUCTIONS[divisor] | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = _png_pixels(data) if data[: len(PNG)].tobytes() == PNG else data
@@ -435,9 +448,9 @@ def _decode(path: Path, data: np.ndarray, size: Size, divisor: int = 1) -> np.nd
 
 
 def _png_pixels(data: np.ndarray) -> np.ndarray | None:
-    """Return a PNG file ``[b]`` uint8 with only the chunks that determine its pixels; None if it is damaged.
+    """Return a PNG file ``[b]`` uint8 with only the chunks that determine its pixels; None if these are damaged.
 
-    The decoder would print messages about damaged colour profiles and texts.
+    Other chunks may have texts of many MB, and the decoder would print messages about damaged colour profiles.
     """
     view, start, pixels = np.ascontiguousarray(data).data, len(PNG), bytearray(PNG)
     while start + 12 <= len(view):
@@ -469,12 +482,12 @@ class PhotoTransform:
 
     @property
     def crops(self) -> bool:
-        """Return whether the transform crops photos at the left or top."""
+        """Return whether the transform crops photos at the left or at the top."""
         return bool(self.left or self.top)
 
     @property
     def description(self) -> str:
-        """Description of the transform in words."""
+        """Say in words what the transform does."""
         return f"resized{' and centre-cropped' if self.crops else ''} to {self.width} x {self.height}"
 
     def cameras(self, cameras: Cameras) -> Cameras:
@@ -506,12 +519,12 @@ def limit_size(size: Size, side: int) -> Size:
 
 
 def resize_to(size: Size, to: Size) -> PhotoTransform:
-    """Make the transform that resizes photos to a size, width and height independently."""
+    """Make the transform that resizes photos to the size ``to``, width and height independently."""
     return PhotoTransform(*to, to[0] / size[0], to[1] / size[1])
 
 
 def resize_and_crop(size: Size, to: Size) -> PhotoTransform:
-    """Make the transform that resizes photos in proportion until they cover ``to``, and crops them at the centre."""
+    """Make the transform that resizes photos in proportion until they cover the size ``to``, and crops their centre."""
     scale = max(to[0] / size[0], to[1] / size[1])
     width, height = (max(least, round(length * scale)) for least, length in zip(to, size, strict=True))
     return PhotoTransform(*to, width / size[0], height / size[1], (width - to[0]) // 2, (height - to[1]) // 2)

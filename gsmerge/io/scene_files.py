@@ -42,16 +42,16 @@ from gsmerge.runtime.record import list_some
 from gsmerge.settings.reading import NONE
 from gsmerge.types import StrPath
 
-_CHECK_SCENE_FILE = LazyFunction("gsmerge.io.no_gaussians", "check_scene_file")
-_NO_GAUSSIANS = LazyFunction("gsmerge.io.no_gaussians", "no_gaussians")
-_HOLDS_VIEWS = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
-# The first of these files that exists and is no result is read. Without any, the folder's only .ply is read
+_check_scene_file = LazyFunction("gsmerge.io.no_gaussians", "check_scene_file")
+_no_gaussians = LazyFunction("gsmerge.io.no_gaussians", "no_gaussians")
+_holds_views = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
+# Places of a scene's .ply. The first file that exists and is no result is read, or else the folder's only .ply
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
-# Places of trained scenes, of INRIA and of gsplat. If a folder has several, the scene of the most steps is read
+# Places where INRIA and gsplat write trained scenes. Of several scenes, the scene after the most steps is read
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # folder where DepthSplat and its relatives write NAME.ply; the photos are in images/NAME
 IMAGE_PLACES = (
-    "images_resized",  # the photos as WorldMirror saw them; tall photos in its images/ are squeezed
+    "images_resized",  # photos as WorldMirror saw them; in its images/, tall photos are squeezed
     "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
     "keyframes/images",
 )  # fmt: skip
@@ -60,11 +60,11 @@ _OTHER_PICTURES = {"masks", "targets"}  # folders of pictures that are no photos
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
-# Ends of paths that programs give to all their scenes
+# Ends of paths that are equal in all scenes of a program, so that they do not name a scene
 _USUAL_END = re.compile(
     r"/(?:(?:exports/)?gs_ply/\d+|(?:point_cloud/iteration_\d+/)?point_cloud|ply/point_cloud_\d+|scene|gaussians)$"
 )
-# Words before the numbers of files that each have one view or one part of a scene
+# A file whose name has such a word before its number holds one view or one part of a scene
 _PARTS = {"view", "chunk", "part", "block", "tile"}
 _LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, see :func:`level_output`
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
@@ -77,22 +77,22 @@ _MAX_ENTRIES = 10_000  # most files and folders that a search below a folder lis
 class SceneFiles:
     """The files of a scene.
 
-    ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if it holds its cameras. ``images`` may be an ``.npz``
-    that holds images. For a ``.gsm`` both are the ``.gsm`` itself.
+    ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if the cameras are in it. ``images`` may be an ``.npz``
+    with images in it. For a ``.gsm`` both are the ``.gsm`` itself.
     """
 
     ply: Path
     cameras: Path | None
     images: Path | None
     masks: Path | None = None  # a folder
-    protect: Path | None = None  # a folder that the caller names, since it is never searched
+    protect: Path | None = None  # a folder of images of what has to stay sharp; only the caller can name it
     more: tuple[SceneFiles, ...] = ()  # other scenes that show the same place, each in a frame of its own
     parts: tuple[Path, ...] = ()  # all files of a scene in several files, ``ply`` first; empty for a single file
     num_copies: int = 0  # number of other files in the folder with the same bytes as ``ply``
     named: frozenset[str] = frozenset()  # names of the fields that the caller set, so that they are not searched
     photo_option: str = "--images"  # option with which the user names the folder of ``images``
-    # Options, with paths of photos, cameras and masks in the folder above that a scene without any could use. They are
-    # only noted, and never read
+    # Photos, cameras and masks that the scene lacks, and that lie in the folder above it: the option for each, and its
+    # path. They are named in a note, but never read
     above: tuple[tuple[str, Path], ...] = ()
     others: tuple[Path, ...] = ()  # further cameras, which are tried in turn if ``cameras`` do not fit
     below: bool = False  # True: ``others`` are in folders below, and are read only if photos show that they fit
@@ -105,20 +105,20 @@ class SceneFiles:
 
     @property
     def all_plys(self) -> tuple[Path, ...]:
-        """Paths of the files of Gaussians of all scenes of the same place, in the order of their rows."""
+        """Paths of the files of Gaussians of this scene and of ``more``, in the order of their rows."""
         return tuple(ply for files in (self, *self.more) for ply in files.plys)
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Paths of all files and folders that the scene is read from: Gaussians, cameras and pictures."""
+        """Paths of all files and folders from which the scene is read: Gaussians, cameras and pictures."""
         beside = (self.cameras, self.images, self.masks, self.protect, *self.others)
         return (*self.plys, *(path for path in beside if path is not None))
 
     @property
     def choices(self) -> list[SceneFiles]:
-        """The scene's files, once with each of the cameras that are tried, in the order of trials.
+        """Return the scene's files once for each of the cameras to try, in the order in which they are tried.
 
-        Cameras in folders below are tried only if one folder has them, since those of several may be of other scenes.
+        Cameras in folders below are tried only if all lie in one folder, since several folders may be other scenes.
         """
         if self.below and len({Path(os.path.relpath(path, self.root)).parts[0] for path in self.others}) > 1:
             return [self]
@@ -127,20 +127,23 @@ class SceneFiles:
         return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
 
     def describe_choice(self, cameras: Path | None) -> list[str]:
-        """Note which cameras are read; the note names others that were tried before, or COLMAP models beside them."""
-        paths = list(filter(None, (self.cameras, *self.others)))
+        """Return a list with a note that ``cameras`` are read and not others; empty if there were no others.
+
+        The others are cameras that were tried before, and COLMAP models beside the model that is read.
+        """
         if cameras is None or not self.others:
             return []
-        place, models = (
-            paths.index(cameras),
-            {path for path in filter(is_colmap, paths) if path.parent == cameras.parent},
-        )
-        shown = [cameras, *paths[:place], *(path for path in paths[place + 1 :] if {path, cameras} <= models)]
-        if len(shown) == 1 and not self.below:
+        paths = [path for path in (self.cameras, *self.others) if path is not None]
+        place = paths.index(cameras)
+        models = {path for path in filter(is_colmap, paths) if path.parent == cameras.parent}
+        rejected = [*paths[:place], *(path for path in paths[place + 1 :] if {path, cameras} <= models)]
+        if not rejected and not self.below:
             return []
-        first, *rest = (os.path.relpath(path, self.root) + f" ({count_images(path)} images)" for path in shown)
-        others = f", not from {list_some(rest)}" if rest else ""
-        text = f"cameras are read from {first}, since they fit the Gaussians{others}; --cameras names others"
+        chosen, *others = (
+            os.path.relpath(path, self.root) + f" ({count_images(path)} images)" for path in (cameras, *rejected)
+        )
+        contrast = f", not from {list_some(others)}" if others else ""
+        text = f"cameras are read from {chosen}, since they fit the Gaussians{contrast}; --cameras names others"
         return [text.replace(" (0 images)", "")]
 
     @property
@@ -150,7 +153,7 @@ class SceneFiles:
 
     @property
     def base(self) -> Path:
-        """Path from which the names of results are made: the file, or ``scene.ply`` for a folder of parts."""
+        """Path from which the names of results are made: the file, or ``scene.ply`` in the folder of several parts."""
         return self.ply.with_name("scene.ply") if self.parts else self.ply
 
     @property
@@ -183,7 +186,7 @@ def find_scene_files(
     protect: StrPath | None = None,
     within: StrPath | None = None,
 ) -> SceneFiles:
-    """Find a scene's files from its path; files that the caller names, or "none", are not searched.
+    """Find a scene's files from its path. Files that the caller names are not searched, and "none" leaves files out.
 
     These folders are searched in this order:
 
@@ -196,15 +199,15 @@ def find_scene_files(
     - for cameras, if none of these folders has any, the folders below the first of them.
 
     A folder that has Gaussians of its own is a scene, and no file in it belongs to another scene. Masks are searched
-    beside the photos that are read, and in the first two kinds of these folders.
+    beside the photos that are read, and in the first two of these groups of folders.
 
     In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
-    their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, but come last if they
-    may be those of another file. Of COLMAP's models in one place, the one with the most images comes first. Cameras
-    inside the ``.ply`` precede those beside it. If no place has cameras, the only file of any name that holds cameras
-    is taken. Without such a file, cameras of a program whose files are not read are taken, so that the reader says so.
-    Images inside the cameras' ``.npz`` take precedence over a folder, because the model saw these. A result of gsmerge
-    is taken as the scene only if a folder has nothing else.
+    their order. The cameras of a result, ``NAME.cameras.json``, come first, but last if they may belong to another
+    file. Of several COLMAP models in one place, the model with the most images comes first. Cameras inside the ``.ply``
+    precede cameras beside it. If no place has cameras, the only file that holds cameras is taken, whatever its name.
+    Without such a file, cameras of an unsupported program are taken, and their reader names the program. Images inside
+    the cameras' ``.npz`` precede a folder of images, because the networks saw the images inside. A result of gsmerge is
+    taken as the scene only if a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, if there are several to choose from, or if a named file does not exist.
@@ -219,15 +222,15 @@ def find_scene_files(
     _check_folders(masks=mask_path, protect=protect)
     if path.suffix.lower() == STATE_ENDING and not os.path.isdir(path):
         check_file(path)
-        own = path if cameras is None and _HOLDS_VIEWS(path) else None
-        photos = image_path or (own if images is None else None)
-        return SceneFiles(path, camera_path or own, photos, mask_path, protect, named=named)
+        own_views = path if cameras is None and _holds_views(path) else None
+        photos = image_path or (own_views if images is None else None)
+        return SceneFiles(path, camera_path or own_views, photos, mask_path, protect, named=named)
     plys = find_plys(path, camera_path) if os.path.isdir(path) else [path]
     ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
     for part in plys:
         check_file(part)
         if part.suffix.lower() in SEVERAL_USES:
-            _CHECK_SCENE_FILE(part)
+            _check_scene_file(part)
     own_roots, shared = _search_roots(path, ply, within)
     roots = [*own_roots, *shared]
     others, below = list[Path](), False
@@ -236,10 +239,10 @@ def find_scene_files(
     if images is None:
         image_path = _find_image_path(ply, camera_path, roots)
     if masks is None:
-        holders = filter((image_path or roots[0]).is_relative_to, roots)
-        nearest = max(holders, key=lambda root: len(root.parts), default=roots[0])
-        beside = nearest if images is None or image_path is None else image_path.parent
-        mask_path = _find_pictures("masks", MASK_PLACES, [beside, *own_roots], ply)
+        photo_roots = filter((image_path or roots[0]).is_relative_to, roots)
+        nearest = max(photo_roots, key=lambda root: len(root.parts), default=roots[0])
+        beside_photos = nearest if images is None or image_path is None else image_path.parent
+        mask_path = _find_pictures("masks", MASK_PLACES, [beside_photos, *own_roots], ply)
     parts = tuple(plys) if len(plys) > 1 else ()
     pictures = image_path, mask_path, protect
     files = SceneFiles(
@@ -250,25 +253,26 @@ def find_scene_files(
 
 
 def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, list[Path], bool]:
-    """Find the cameras of a scene, by the precedence that :func:`find_scene_files` states; None if there are none.
+    """Return the cameras of a scene or None, a list of further cameras, and whether these are in folders below.
 
-    Also return a list of further cameras, and whether these are in folders below the scene. Folders below are searched
-    only if there are no cameras beside the scene.
+    The order of cameras is that of :func:`find_scene_files`. Folders below the scene are searched only if there are no
+    cameras beside it.
     """
     of_result = result_cameras(ply)
-    if of_result is not None and _count_signs(ply) == 2:
+    if of_result is not None and _rate_camera_file(ply) == 2:
         return of_result, [], False
-    known = dict.fromkeys(
+    beside = dict.fromkeys(
         path for root in roots for path in list_cameras(root) if not _is_in_other_scene(path, root, ply)
     )
-    # Most cameras that are tried in turn, and most folders below a scene that are searched for them
-    max_cameras, max_folders = 8, 100
-    cameras = [*islice(known, max_cameras)] or [*filter(None, map(find_other_cameras, roots))][:1]
+    max_cameras = 8  # most cameras of a scene that are tried
+    cameras = [*islice(beside, max_cameras)] or [*filter(None, map(find_other_cameras, roots))][:1]
     if cameras:
         return cameras[0], cameras[1:], False
+    max_folders = 100  # most folders below a scene that are searched for cameras
     folders = list_folders(roots[0])[:max_folders]
     below = dict.fromkeys(p for top, _ in folders for p in list_cameras(top) if not _is_in_other_scene(p, top, ply))
-    return next(filter(None, map(find_unread, roots)), of_result), [*islice(below, max_cameras)], bool(below)
+    unread = next(filter(None, map(find_unread, roots)), None)
+    return unread or of_result, [*islice(below, max_cameras)], bool(below)
 
 
 def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
@@ -279,21 +283,21 @@ def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> 
 
 
 def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], ply: Path) -> Path | None:
-    """Find the first of the ``places`` in ``roots`` that has pictures, none of them of another scene."""
+    """Find the first of the ``places`` in ``roots`` that has pictures, but none of another scene; None without any."""
     folders = [(root, f) for root in roots for place in places if can_be_listed(f := root / place, option)]
-    # If a folder has several scenes, each may have its own folder of pictures
+    # If a folder has several scenes, each may have its own folder of pictures, with the name of the scene
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
     for root, folder in [*((root, folder / name) for root, folder in folders for name in names), *folders]:
-        holders = {picture.parent for picture in list_images(folder)}
-        if holders and not any(_is_in_other_scene(holder, root, ply) for holder in holders):
+        picture_folders = {picture.parent for picture in list_images(folder)}
+        if picture_folders and not any(_is_in_other_scene(place, root, ply) for place in picture_folders):
             return folder
     return None
 
 
 def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
-    """Return whether a path is, or lies in, a folder below ``root`` that has Gaussians, but not ``ply``.
+    """Return whether a path belongs to another scene than ``ply``.
 
-    Such a folder is a scene, to which all its files belong.
+    A folder below ``root`` that has Gaussians, but not ``ply``, is another scene, with all files in it.
     """
     folders = [place for place in (path, *path.parents) if place != root and place.is_relative_to(root)]
     scenes = [_plys_in(place) or other_plys(place / SCENES_PLACE) for place in folders if place.is_dir()]
@@ -301,7 +305,7 @@ def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
 
 
 def can_be_listed(folder: Path, option: str) -> bool:
-    """Return whether a path is a folder; SceneError, which names the ``option``, for a folder that is not readable."""
+    """Return whether a path is a folder; SceneError for an unreadable folder, with a remedy that names ``option``."""
     try:
         os.scandir(folder).close()
     except (FileNotFoundError, NotADirectoryError):
@@ -313,10 +317,10 @@ def can_be_listed(folder: Path, option: str) -> bool:
 
 
 def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Path], ...]:
-    """Find the photos, cameras and masks that a scene lacks in the folder above its own folders, ``roots``.
+    """Search the folder above a scene's own folders ``roots`` for the photos, cameras and masks that the scene lacks.
 
     Files of a neighbouring scene do not count. Masks count only if they have the names of the scene's photos. Returns
-    each option with its path.
+    the paths, each with its option.
     """
     folder = min(filter(Path(os.path.realpath(files.ply)).is_relative_to, roots), default=roots[0]).parent
     places = dict[str, Path | None]()
@@ -335,33 +339,34 @@ def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Pa
 
 
 def _search_roots(path: Path, ply: Path, within: StrPath | None) -> tuple[list[Path], list[Path]]:
-    """List a scene's own folders, and those that other scenes may share with it; see :func:`find_scene_files`."""
-    base = path if ply != path else ply.parent
+    """List a scene's own folders, and folders that other scenes may share with it; see :func:`find_scene_files`."""
+    given_folder = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
-    own = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
+    program_folders = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
-        own = [folder.parent.parent]
-    own = [Path(os.path.realpath(base)), folder, *own, *_list_between(folder, Path(os.path.realpath(path)))]
+        program_folders = [folder.parent.parent]
+    own = [Path(os.path.realpath(given_folder)), folder, *program_folders]
+    own += _list_between(folder, Path(os.path.realpath(path)))
     above = _list_between(folder, Path(os.path.realpath(within or folder)))
-    # Files beside a scene of a usual name belong to it; folders of other files are shared
+    # A folder above that has a scene with a usual name is not shared, since its files belong to that scene
     shared = [Path(os.path.realpath(ply)).parent, *(place for place in above if named_ply(place) is None)]
     return list(dict.fromkeys(own)), [place for place in dict.fromkeys(shared) if place not in own]
 
 
 def _check_folders(**folders: Path | None) -> None:
-    """Raise SceneError if a path is no folder; the names of the arguments are the options."""
+    """Raise SceneError if a path is no folder. Each keyword is the option that named the path."""
     for option, path in folders.items():
         if path is not None and not path.is_dir():
             raise SceneError(path, f"expected a folder of pictures for --{option}, found a file", "name its folder")
 
 
 def _list_between(folder: Path, top: Path) -> list[Path]:
-    """List the folders above a folder up to ``top``, the nearest first."""
+    """List the folders above a folder up to ``top``, the nearest first; empty if ``top`` is not above it."""
     return [above for above in folder.parents if above.is_relative_to(top)] if folder.is_relative_to(top) else []
 
 
 def scene_title(ply: Path) -> str:
-    """Return a scene's name for a page: that of its file, or of its folder if its program names all files alike."""
+    """Return a scene's name for a page, from its file, or from its folder if its program names all files alike."""
     path = ply.absolute().with_name(ply.stem.removesuffix(".compact")).as_posix()
     return Path(_USUAL_END.sub("", path)).name or ply.stem
 
@@ -369,20 +374,21 @@ def scene_title(ply: Path) -> str:
 def result_cameras(ply: Path) -> Path | None:
     """Find the cameras that gsmerge wrote beside a result; None if there are none.
 
-    A level of detail without cameras has those of the result to which it belongs. Cameras do not belong to a ``.ply``
-    of another program if a result beside it has the same name, such as ``scene.sog`` beside ``scene.ply``.
+    A level of detail without cameras has the cameras of the result to which it belongs. If a ``.ply`` of another
+    program has a result of the same name beside it, such as ``scene.sog`` beside ``scene.ply``, the cameras belong to
+    the result.
     """
     names = ply.name, _LEVEL.sub("", ply.name)
     beside = (viewer_cameras_path(ply.with_name(name)) for name in names)
     cameras = next((path for path in beside if path.is_file()), None)
-    return None if cameras is None or not _count_signs(ply) else cameras
+    return None if cameras is None or not _rate_camera_file(ply) else cameras
 
 
-def _count_signs(ply: Path) -> int:
-    """Count the signs, 0 to 2, that ``NAME.cameras.json`` has the cameras of the file called NAME.
+def _rate_camera_file(ply: Path) -> int:
+    """Rate how surely ``NAME.cameras.json`` has the cameras of the file called NAME: 2 is sure, 0 is no.
 
-    One sign is that gsmerge wrote the file. The other is that no other file of Gaussians has this name. A result has
-    both, and so has a file of another format than ``.ply``, whose header does not say what it is.
+    A ``.ply`` gets one point if gsmerge wrote it, and one if no file of another format has its name. A result gets
+    both. A file of another format gets both as well, since its header does not say what it is.
     """
     if find_format(ply).ending != ".ply" or header_content(ply) == "result":
         return 2
@@ -391,7 +397,7 @@ def _count_signs(ply: Path) -> int:
 
 
 def named_path(path: StrPath | None) -> Path | None:
-    """Return the path that a caller named; None for None and "none", SceneError if it does not exist."""
+    """Return a path that the caller named, None for None and "none"; SceneError if the path does not exist."""
     if path is None or path == NONE:
         return None
     if not os.path.exists(path):
@@ -403,38 +409,36 @@ def named_path(path: StrPath | None) -> Path | None:
 
 
 def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
-    """Find the files of a folder's only scene; several files are its parts, in order.
+    """Find the file of a folder's only scene, or the files of all its parts in order.
 
     If all files have the same bytes, only the first is returned. Errors are those of :func:`find_scene_files`.
     """
     plys = list_plys(folder)
-    if len(plys) == 1:
-        return plys
     if not plys:
-        raise _NO_GAUSSIANS(folder)
-    places = {path.parent for path in plys}
-    if _are_copies(plys):
+        raise _no_gaussians(folder)
+    if len(plys) == 1 or _are_copies(plys):
         return plys[:1]
-    parts = _order_parts(folder, plys, cameras or find_cameras(folder)) if len(places) == 1 else None
+    in_one_folder = len({path.parent for path in plys}) == 1
+    parts = _order_parts(folder, plys, cameras or find_cameras(folder)) if in_one_folder else None
     if parts is None:
         raise _several_scenes(folder, plys)
     return parts
 
 
 def _are_copies(plys: Sequence[Path]) -> bool:
-    """Return whether numbered files have the same bytes, as Flash3D writes one for each view that it renders."""
+    """Return whether numbered files have the same bytes. Flash3D writes such a file for each view that it renders."""
     with suppress(OSError):
         return _are_numbered(plys) and all(filecmp.cmp(plys[0], path, shallow=False) for path in plys[1:])
     return False
 
 
 def _are_numbered(plys: Sequence[Path]) -> bool:
-    """Return whether files are in one folder and their names end in numbers."""
+    """Return whether all files are in one folder and have names that end in numbers."""
     return len({path.parent for path in plys}) == 1 and all(_NUMBERED.fullmatch(path.name) for path in plys)
 
 
 def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
-    """Make the error of a folder with several files, which may be scenes, or moments or parts of one scene."""
+    """Make the error for a folder with several files of Gaussians, with the commands for scenes, moments and parts."""
     places = {path.parent for path in plys}
     start = places.pop() if len(places) == 1 else folder
     problem = f"expected one .ply file in the folder, found {len(plys)}"
@@ -472,16 +476,16 @@ def list_plys(folder: Path) -> list[Path]:
 
 
 def _plys_in(folder: Path) -> list[Path]:
-    """List the file with a usual name in a folder, or else all its other files that may be scenes."""
+    """List the files in a folder that may be its scene: the file with a usual name, or else all others."""
     named = named_ply(folder)
     return other_plys(folder) if named is None else [named]
 
 
 def list_folders(folder: Path) -> list[tuple[Path, list[str]]]:
-    """List a folder and those below it, down to a limited depth, each with the names of its files, the nearest first.
+    """List a folder and the folders below it, each with the names of its files. The nearest come first.
 
-    These folders are left out: scenes, which have Gaussians of their own, and what is below them; masks; held-out
-    views; and folders with too many entries.
+    The depth is limited. Folders of masks and of held-out views, and folders with too many entries, are left out. So
+    are scenes, which are folders with Gaussians of their own, and all folders below scenes.
     """
     return [(place, names) for place, names in _walk_down(folder, links=True) if names is not None]
 
@@ -489,61 +493,61 @@ def list_folders(folder: Path) -> list[tuple[Path, list[str]]]:
 def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | None]]:
     """List folders as :func:`list_folders` does, and also scenes, which have None in place of the names of files.
 
-    ``links``: True follows links to folders, and leaves out folders with too many entries. False lists nothing at all
-    if there are too many entries.
+    With ``links``, links to folders are followed, and folders with too many entries are left out. Without, too many
+    entries give an empty list.
     """
-    found, places, num_entries = list[tuple[Path, list[str] | None]](), [(folder, 0)], 0
+    folders, places, num_entries = list[tuple[Path, list[str] | None]](), [(folder, 0)], 0
     max_depth = 3  # most levels of folders that are searched below a folder without a scene
     for place, depth in places:  # the loop appends to this list
         with suppress(OSError), os.scandir(place) as scan:
             if depth and _plys_in(place):
-                found.append((place, None))
+                folders.append((place, None))
                 continue
             entries = sorted(islice(scan, _MAX_ENTRIES + 1 - num_entries), key=lambda entry: entry.name)
-            if num_entries + len(entries) > _MAX_ENTRIES and not links:
-                return []
             if num_entries + len(entries) > _MAX_ENTRIES:
-                continue
+                if links:
+                    continue
+                return []
             num_entries += len(entries)
-            inner = [entry.name for entry in entries if entry.is_dir(follow_symlinks=links)]
-            found.append((place, [entry.name for entry in entries if entry.is_file()]))
-            shown = {name for name in inner if name[0] != "."} - _OTHER_PICTURES if depth < max_depth else ()
-            places += [(place / name, depth + 1) for name in sorted(shown)]
-    return found
+            folders.append((place, [entry.name for entry in entries if entry.is_file()]))
+            inner = {entry.name for entry in entries if entry.is_dir(follow_symlinks=links)}
+            searched = {name for name in inner if name[0] != "."} - _OTHER_PICTURES if depth < max_depth else ()
+            places += [(place / name, depth + 1) for name in sorted(searched)]
+    return folders
 
 
 def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
-    """Return files that are views or parts of one scene, ordered by number; None if they are several scenes.
+    """Order files by number if each is a view or a part of one scene; return None if they are several scenes.
 
-    They are of one scene if their names say so, or if there are as many cameras as files. Files that hold cameras are
-    several scenes, each in its own frame. SceneError if a part is missing.
+    Files belong to one scene if their names say so, or if there are as many cameras as files. Files that hold cameras
+    are several scenes, since each has its own frame. SceneError if a part is missing.
     """
     matches = [_NUMBERED.fullmatch(path.name) for path in plys]
-    names = {match[1].lower() if match else "" for match in matches}
-    numbers = {int(match[2]): path for match, path in zip(matches, plys, strict=True) if match}
-    if len(names) > 1 or len(numbers) < len(plys):
+    stems = {match[1].lower() if match else "" for match in matches}  # names without their numbers
+    path_of = {int(match[2]): path for match, path in zip(matches, plys, strict=True) if match}
+    if len(stems) > 1 or len(path_of) < len(plys):
         return None
-    ordered = sorted(numbers)
-    if re.split(r"[-_. ]", names.pop())[-1] in _PARTS:
-        missing = next((low + 1 for low, high in pairwise(ordered) if high > low + 1), None)
+    numbers = sorted(path_of)
+    if re.split(r"[-_. ]", stems.pop())[-1] in _PARTS:
+        missing = next((low + 1 for low, high in pairwise(numbers) if high > low + 1), None)
         if missing is not None:
-            first, last = (numbers[ordered[place]].name for place in (0, -1))
+            first, last = path_of[numbers[0]].name, path_of[numbers[-1]].name
             problem = f"expected all parts from {first} to {last}, found no part with the number {missing}"
             raise SceneError(folder, problem, "add the missing part, or name one of the files")
-    elif plys[0].parent.name == SCENES_PLACE or not _has_camera_each(plys, cameras):
+    elif plys[0].parent.name == SCENES_PLACE or not _has_camera_for_each(plys, cameras):
         return None
-    return None if any(map(_has_own_camera, plys)) else [numbers[number] for number in ordered]
+    return None if any(map(_has_own_camera, plys)) else [path_of[number] for number in numbers]
 
 
 def _has_own_camera(path: Path) -> bool:
-    """Return whether a ``.ply`` holds its camera; False if that is damaged."""
+    """Return whether a ``.ply`` holds its camera; False if the camera is damaged."""
     with suppress(SceneError):  # the reader of the file reports the damage
         return read_sharp_camera(path) is not None
     return False
 
 
-def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
-    """Return whether files have equally many Gaussians, and there is one camera for each file."""
+def _has_camera_for_each(plys: Sequence[Path], cameras: Path | None) -> bool:
+    """Return whether all files have equally many Gaussians, and ``cameras`` has a camera for each file."""
     if cameras is None or len({header_counts(path) for path in plys}) > 1:
         return False
     with suppress(SceneError):
@@ -552,7 +556,7 @@ def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
 
 
 def named_ply(folder: Path) -> Path | None:
-    """Find the scene with a usual name in a folder, or else the trained scene of the most steps; None without any."""
+    """Find the scene with a usual name in a folder, or else the scene trained with the most steps; None without any."""
     for place in PLY_PLACES:
         if (folder / place).is_file() and _is_scene(folder / place):
             return folder / place
@@ -563,9 +567,9 @@ def named_ply(folder: Path) -> Path | None:
 
 
 def other_plys(folder: Path) -> list[Path]:
-    """List the ``.ply`` files directly in a folder that may be scenes, since they are neither results nor point clouds.
+    """List the ``.ply`` files in a folder, not below it, that are neither results nor point clouds.
 
-    If there are none, list the only file of another format.
+    If there are none, list the only file of another format that may have Gaussians.
     """
     plys = natural_order(folder.glob("[!.]*.ply"))
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
@@ -574,6 +578,6 @@ def other_plys(folder: Path) -> list[Path]:
 
 
 def _is_scene(path: Path) -> bool:
-    """Return whether a ``.ply`` may be a scene, because neither name nor header shows a result or a point cloud."""
+    """Return whether a ``.ply`` may be a scene: neither its name nor its header shows a result or a point cloud."""
     is_other = path.name in _POINT_CLOUDS or _RESULT.search(path.name)
     return not is_other and header_content(path) == "Gaussians"

@@ -1,4 +1,4 @@
-"""Read safetensors files into memory, not mapped: a mapped file that becomes shorter would end the process."""
+"""Read safetensors files into memory. Mapping would be unsafe, since a mapped file that shrinks ends the process."""
 
 from __future__ import annotations
 
@@ -19,28 +19,27 @@ _NUMPY_TYPES = {  # names of types in the file -> NumPy's types
 def read_tensors(
     path: Path, what: str, remedy: str, *, arrays: bool = True
 ) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """Read the metadata of a safetensors file, and its arrays by name; no arrays with ``arrays=False``.
+    """Read the metadata of a safetensors file, and its arrays by name unless ``arrays`` is False.
 
-    SceneError if it is another file, or becomes shorter while it is read. The error names ``what`` as the expected
-    file, and has the ``remedy``.
+    SceneError if the file has another format, or becomes shorter while it is read. The error says that ``what`` was
+    expected, and has the ``remedy``.
     """
     budget = read_budget(path)
     try:
         with path.open("rb") as file:
-            header_size = 8  # bytes of the first number, which is the length of the header
+            header_size = 8  # bytes of the number at the start, which is the length of the header
             length_bytes = file.read(header_size)
             length = int.from_bytes(length_bytes, "little")
             if not 0 < length <= budget.file_bytes:
                 raise ValueError("no header of a safetensors file")
             header_bytes = file.read(length)
-            # Bytes of memory for the description of each array, and copies of the file in memory while it is read
-            array_memory, copies = 1800, 3
-            budget.check_memory(array_memory * header_bytes.count(b"{") + copies * budget.file_bytes, "arrays")
+            description_bytes, copies = 1800, 3  # memory for the description of an array; copies of the file in memory
+            budget.check_memory(description_bytes * header_bytes.count(b"{") + copies * budget.file_bytes, "arrays")
             header = parse_json(header_bytes.decode("utf-8"), budget)
             metadata = (header.get("__metadata__") if isinstance(header, dict) else None) or {}
             if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
                 raise ValueError("metadata that is not text")
-            del header
+            del header  # before the arrays need the memory
             tensors = {
                 name: np.frombuffer(tensor["data"], _NUMPY_TYPES[tensor["dtype"]]).reshape(tensor["shape"])
                 for name, tensor in (deserialize(length_bytes + header_bytes + file.read()) if arrays else ())

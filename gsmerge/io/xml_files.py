@@ -1,7 +1,7 @@
-"""Read XML within the budget of its file: without entities and namespaces, and with only some attributes.
+"""Read XML files within a budget of memory: without entities and namespaces, and with only some attributes.
 
-The parser of Python's library may take far more memory than the file has bytes. It copies the address of a namespace
-into each tag's name, and a million attributes of one tag take thirty times their bytes.
+The parser of Python's library may take far more memory than the file has bytes. The parser copies the address of a
+namespace into the name of each tag, and needs thirty times the bytes of a tag with a million attributes.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from gsmerge.io.bounds import read_budget, read_text
 
 
 def read_xml(path: Path, attributes: Collection[str]) -> Element:
-    """Read an XML file, whose elements keep only ``attributes``; SceneError if it is no XML, or too large.
+    """Read an XML file. Its elements keep only ``attributes``, and names keep the prefixes of their namespaces.
 
-    Names keep the prefixes of their namespaces. A document type is refused, since its entities could make a short text
+    SceneError if the file is no XML or too large, or if it has a document type, whose entities could make a short text
     endless.
     """
     text, builder, parser = read_text(path), TreeBuilder(), expat.ParserCreate()

@@ -24,12 +24,12 @@ from gsmerge.values.arguments import check_arguments
 def extend_state(
     state: State | None, scene: Scene, settings: Mapping[str, Any], *, progress: Progress | None = None
 ) -> tuple[State, BatchReport]:
-    """Add a batch of views to a copy of a state, or begin a state (None); return the new state and the report.
+    """Add a batch of views to a copy of ``state``, or to a new state if it is None; return the state and the report.
 
-    ``settings`` change those of a draft, which are the default; if each Gaussian has a pixel, the default has no fit.
-    With ``recipe="paper"`` the first batch begins a state of Feature Gaussians, and later batches use its networks.
-    Raises ValueError if a setting is unknown, out of range, or impossible for the state or the scene, and SceneError if
-    the scene seems to have another frame of coordinates than the state.
+    ``settings`` are those of the batch. By default the effort is "draft", and a scene whose Gaussians have pixels gets
+    no fit. With ``recipe="paper"`` the first batch begins a state of Feature Gaussians, and later batches use its
+    networks. Raises ValueError if a setting is unknown, out of range, or impossible for the state or the scene. Raises
+    SceneError if the scene seems to have another frame of coordinates than the state.
     """
     about = {} if state is None else dict(state.about)
     scene_before, features = (None, None) if state is None else (state.scene, state.features)
@@ -41,8 +41,8 @@ def extend_state(
         options = batch_settings({"recipe": "paper", "effort": "default"} | dict(settings))
         content["features"], report = extend_features(features, scene, *options, progress=progress)
     else:
-        usual = {"fit": "none"} if scene.has_own_pixels else {}  # the fit follows when the state is compacted
-        options = batch_settings(usual | dict(settings))
+        defaults = {"fit": "none"} if scene.has_own_pixels else {}  # the fit follows when the state is compacted
+        options = batch_settings(defaults | dict(settings))
         content["scene"], report = extend(scene_before, scene, *options, progress=progress)
     about |= {"batches": [*about.get("batches", []), report.numbers]}
     about |= {"pictures": sorted({*about.get("pictures", []), report.pictures})}
@@ -52,14 +52,14 @@ def extend_state(
 class Compactor:
     """Compact views that arrive in batches.
 
-    Each batch is compacted when it is added. The state keeps its Gaussians and cameras, and the pictures of at most
-    ``max_views`` views in all. They form a scene from which ``compact`` makes results. With ``recipe="paper"`` the
-    state keeps Feature Gaussians instead, which are matched and merged across batches (paper section 4.5, "Online
-    reconstruction"), and ``decode`` makes results with any K.
+    Each batch is compacted when it is added. The state keeps the Gaussians of all batches, and cameras and pictures of
+    at most ``max_views`` views. ``compact`` makes results from this scene. With ``recipe="paper"`` the state keeps
+    Feature Gaussians instead, which are matched and merged across batches (paper section 4.5, "Online reconstruction").
+    ``decode`` then makes results with any K.
 
     Args:
-        **settings: Settings of the batches by name, those of :class:`gsmerge.CompactOptions` and of
-            :class:`gsmerge.settings.extend.ExtendOptions`: ``Compactor(budget="3%", max_views=16)``.
+        **settings: Settings of the batches by name, as in ``Compactor(budget="3%", max_views=16)``. They are those of
+            :class:`gsmerge.CompactOptions` and of :class:`gsmerge.settings.extend.ExtendOptions`.
 
     Raises:
         ValueError: If a setting is unknown or out of range.
@@ -113,7 +113,7 @@ class Compactor:
         """Add a batch of views in the same frame of coordinates; see :func:`gsmerge.states.extend.extend`.
 
         Raises:
-            SceneError: If the pictures of the batch do not show the earlier Gaussians, without ``other_world=True``.
+            SceneError: If the pictures of the batch do not show the earlier Gaussians; ``other_world=True`` allows it.
         """
         self._state, report = extend_state(self._state, as_scene(scene), self._settings, progress=progress)
         return report
@@ -133,8 +133,8 @@ class Compactor:
         """Decode Feature Gaussians in the world frame.
 
         Args:
-            **settings: ``k``: Gaussians per group, 1 to 4, or ``"mixed"``; further settings of
-                :class:`gsmerge.settings.stages.DecodeOptions`.
+            **settings: Settings of :class:`gsmerge.settings.stages.DecodeOptions`, such as ``k``, which is the number
+                of Gaussians per group, 1 to 4, or ``"mixed"``.
 
         Raises:
             ValueError: If there was no batch yet, a setting is wrong, or the state has results.

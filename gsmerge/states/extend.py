@@ -25,13 +25,13 @@ from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
-# A "world" is a frame of coordinates. The colours of the foremost Gaussians differ from new pictures of them. This
-# difference, divided by that from random pixels, is about 1 if the pictures are of another world. Above this ratio the
-# worlds differ. Over batches of 15 captures the ratio is at most .87 in the same world and .92 to 1.08 in another one.
-# Nothing is decided if chance might have put a ratio on the other side.
+# A "world" is a frame of coordinates. The colours of the earlier Gaussians in front are compared with the new pictures
+# of them. The difference is divided by the difference from random pixels. In batches of 15 captures this ratio was at
+# most .87 in the same world, and .92 to 1.08 in another world, so that above this limit the worlds differ. A ratio that
+# chance may have put on its side of the limit decides nothing.
 WORLD_RATIO = 0.9
 SAME_WORLD, ANOTHER_WORLD, UNKNOWN_WORLD = "the same", "another", "not known"  # results of comparing two worlds
-BATCH = "batch"  # place of an error in messages until the file is known
+BATCH = "batch"  # path in an error about a batch, until the caller puts in the path of its file
 NOT_COMPARED = (
     "the pictures of this batch show too little of the earlier Gaussians to say whether both are in the same world"
 )
@@ -46,17 +46,17 @@ class BatchReport:
     num_new: int  # Gaussians that the batch became; superpixels in a state of Feature Gaussians
     num_gaussians: int  # Gaussians, or Feature Gaussians, of the state afterwards
     num_kept: int  # views whose pictures the state keeps afterwards
-    pictures: str  # pictures that the batch is fitted to: "photos", or what stands in for them
+    pictures: str  # pictures to which the batch is fitted: "photos", or the name of what stands in for photos
     views: Mapping[str, str]  # names in the batch, by names in the state, of its views whose pictures the state keeps
     sh_degree: int  # of the batch's Gaussians
     seconds: Mapping[str, float]  # wall time of each stage
-    choices: Mapping[str, Any]  # decisions of the stages; `world` says whether the batch is in that of earlier batches
+    choices: Mapping[str, Any]  # decisions of the stages; `world` compares the world of the batch with earlier batches
     notes: tuple[str, ...]  # warnings, one sentence each
     options: Mapping[str, Any]  # all settings, by their names in reports
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """The part of the report that a state keeps."""
+        """The facts of the report that a state stores."""
         omitted = ("seconds", "choices", "notes", "options")
         return {name: value for name, value in asdict(self).items() if name not in omitted}
 
@@ -71,30 +71,33 @@ def extend(
 ) -> tuple[Scene, BatchReport]:
     """Compact a batch of views, and add it to the results of earlier batches, which have to be in the same world.
 
-    ``before`` are the earlier results; None for the first batch. Poses and exposures of the batch are not changed.
-    Returns a scene of all results, whose rows are no pixels, and the report. The scene has the views that are kept, at
-    the size of the first batch's views. Each has its corrected photo, or what stands in for it. Raises ValueError if a
-    setting is impossible for the scene, and SceneError if the scene seems to be in another world.
+    ``before`` has the earlier results; it is None for the first batch. Poses and exposures of the batch do not change.
+    Returns a scene with the Gaussians of all batches, and the report. Rows of the scene do not belong to pixels. The
+    scene keeps views at the size of the first batch's views, each with the picture to which its batch was fitted.
+    Raises ValueError if a setting is impossible for the scene, and SceneError if the scene seems to be in another
+    world.
     """
     options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
-        views, world, parts = _keep_pictures(prepared), UNKNOWN_WORLD, []
+        batch_views = _keep_pictures(prepared)
+        world, parts = UNKNOWN_WORLD, []
         if before is not None:
-            world = compare_worlds(before.gaussians, views, prepared.input_scene.gaussians.means)
+            world = compare_worlds(before.gaussians, batch_views, prepared.input_scene.gaussians.means)
             refuse_other_world(world, extend_options)
             parts = [before.gaussians]
         result = compact_prepared(prepared, method, options)
-    notes = [text for text in result.report.notes if text != result.report.worse]  # that note is for final results
+    # A note that the result is worse than its input is for final results
+    notes = [text for text in result.report.notes if text != result.report.worse]
     notes += [NOT_COMPARED] if before is not None and world == UNKNOWN_WORLD else []
     parts.append(result.gaussians.numpy())
     num_higher = max(part.shN.shape[1] for part in parts)
-    gaussians, names = Gaussians.concat([pad_harmonics(part, num_higher) for part in parts]), views.names
-    if before is not None:
-        views = _join_views(before, views)
-    new_names = views.names[len(views) - len(names) :]
-    joined = replace(subset(views, choose_distant_views(views.cameras, extend_options.max_views)), gaussians=gaussians)
+    gaussians = Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
+    views = batch_views if before is None else _join_views(before, batch_views)
+    new_names = views.names[len(views) - len(batch_views.names) :]  # names of the batch's views in the state
+    kept_views = subset(views, choose_distant_views(views.cameras, extend_options.max_views))
+    joined = replace(kept_views, gaussians=gaussians)
     report = BatchReport(
         num_views=len(scene),
         num_input=scene.num_gaussians,
@@ -102,7 +105,7 @@ def extend(
         num_gaussians=len(gaussians),
         num_kept=len(joined),
         pictures=prepared.reference.name,
-        views={new: name for new, name in zip(new_names, names, strict=True) if new in joined.names},
+        views={new: name for new, name in zip(new_names, batch_views.names, strict=True) if new in joined.names},
         sh_degree=result.gaussians.sh_degree,
         seconds=result.report.seconds,
         choices=result.report.choices | {"world": world},
@@ -113,18 +116,18 @@ def extend(
 
 
 def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
-    """Compare the world of new views with that of the Gaussians ``before``.
+    """Compare the world of new views with the world of the Gaussians ``before``.
 
     Returns SAME_WORLD, ANOTHER_WORLD or UNKNOWN_WORLD. In the same world the pictures show the earlier Gaussians,
-    except where the batch's Gaussians, at ``means [n,3]``, hide them. In another world the colours differ from the
-    pictures as much as from random pixels.
+    except where Gaussians of the batch, with their ``means [n,3]``, hide them. In another world the pictures are as
+    unlike these Gaussians as random pixels are.
     """
     if not len(views):
         return UNKNOWN_WORLD
-    rows, hiding = np.isfinite(np.asarray(before.means)).all(1), means[np.isfinite(means).all(1)]
+    is_finite, hiding = np.isfinite(np.asarray(before.means)).all(1), means[np.isfinite(means).all(1)]
     pictures = photo_array(views.images)
     sample_gaussians = 10_000  # earlier Gaussians that are compared with new views
-    check = check_cameras(before, rows, views.cameras, pictures, sample_gaussians, foremost=True, hiding=hiding)
+    check = check_cameras(before, is_finite, views.cameras, pictures, sample_gaussians, foremost=True, hiding=hiding)
     margin = CHANCE_ERRORS * check.ratio_error
     if check.num_compared < NORMAL_SAMPLES or not abs(check.color_ratio - WORLD_RATIO) > margin:
         return UNKNOWN_WORLD
@@ -139,19 +142,20 @@ def refuse_other_world(world: str, options: ExtendOptions) -> None:
 
 
 def _keep_pictures(prepared: Prepared) -> Scene:
-    """Return a scene of the input's views, each once, with their pictures and without Gaussians."""
+    """Return a scene without Gaussians, which has each view of the input once, with the picture for its fit."""
     input_scene, no_gaussians = prepared.input_scene, prepared.input_scene.gaussians[:0]
-    if prepared.reference.placed:  # placed views do not belong to the scene
+    if prepared.reference.placed:  # the input has no views
         return Scene(no_gaussians, input_scene.cameras, None, None, input_scene.names)
-    first_views = np.unique(camera_kinds(input_scene.cameras), return_index=True)[1]
-    views = sorted(first_views.tolist())
+    # Layers of a view have equal cameras, and only the first layer is kept
+    first_layers = np.unique(camera_kinds(input_scene.cameras), return_index=True)[1]
+    views = sorted(first_layers.tolist())
     images = prepared.scene.images[[prepared.repeated[view] for view in views]]
     cameras = in_float64(input_scene.cameras[views])
     return Scene(no_gaussians, cameras, images, None, tuple(input_scene.names[view] for view in views))
 
 
 def _join_views(before: Scene, batch: Scene) -> Scene:
-    """Append a batch's views to those ``before``, at the size of these; see :func:`append_names` for their names."""
+    """Append the views of a batch to those ``before``, whose size they get. Names are those of :func:`append_names`."""
     if len(batch) == 0 or len(before) == 0:
         return before if len(batch) == 0 else batch
     size = before.cameras.width, before.cameras.height
@@ -170,7 +174,7 @@ def _join_views(before: Scene, batch: Scene) -> Scene:
 
 
 def append_names(before: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Append the ``names`` of views to those ``before``, and return all; a name in use gets a number in front."""
+    """Append ``names`` of views to the names ``before``, and return all. A name in use gets a number in front."""
     all_names = list(before)
     for name in names:
         numbered = (f"{number}-{name}" for number in range(2, len(all_names) + 3))
@@ -181,9 +185,9 @@ def append_names(before: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, 
 def choose_distant_views(cameras: Cameras, count: int) -> list[int]:
     """Choose at most ``count`` views that are far apart, in rising order.
 
-    The first view is chosen, and then always the view that is farthest from all chosen views.
-    The distance of two views is the distance of their centres, as a share of the widest extent of all centres, plus the
-    distance of their directions.
+    The first view is chosen first. Each next view is the farthest from all chosen views. The distance of two views is
+    the distance of their centres, as a share of the widest extent of all centres, plus the distance of their
+    directions.
     """
     if len(cameras) <= count:
         return list(range(len(cameras)))
@@ -194,7 +198,7 @@ def choose_distant_views(cameras: Cameras, count: int) -> list[int]:
     distances = camera_distances(replace(cameras, viewmats=viewmats))
     chosen = [0][:count]
     while len(chosen) < count:
-        nearest = distances[chosen].min(0)
-        nearest[chosen] = -1
-        chosen.append(int(np.argmax(nearest)))
+        chosen_distances = distances[chosen].min(0)  # of each view, from the nearest chosen view
+        chosen_distances[chosen] = -1
+        chosen.append(int(np.argmax(chosen_distances)))
     return sorted(chosen)

@@ -64,7 +64,7 @@ class ViewSamples:
 
 @dataclass(frozen=True, eq=False)
 class FeatureState:
-    """Feature Gaussians of all views so far; the frame is that of the first batch."""
+    """Feature Gaussians of all views so far, in the canonical frame of the first batch."""
 
     merged: FeatureGaussians  # g groups after merging, in the canonical frame; later batches are matched with these
     refined: FeatureGaussians  # the same g groups after the refiner; the heads decode these
@@ -88,10 +88,10 @@ class FeatureState:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _JoinContext(NetworkContext):
-    """The networks' inputs for groups of a batch and a state together; ``cameras`` are those of all views.
+    """Networks and their inputs, for the groups of a state and of a batch together; ``cameras`` has all views.
 
-    Members of earlier batches are not stored. In place of its members, a Feature Gaussian lists the rows of the parts
-    from which it was pooled. A part is a group of the state or of the batch.
+    A state does not store the members of its groups. Feature Gaussians are therefore pooled from parts in place of
+    members, and list the rows of these parts. A part is a group of the state or of the batch.
     """
 
     samples: ViewSamples  # of all views
@@ -114,7 +114,7 @@ class _JoinContext(NetworkContext):
         return describe_features(features, views, num_members, stats, self.cameras)
 
     def summarise_parts(self, features: FeatureGaussians) -> tuple[np.ndarray, np.ndarray]:
-        """Find the view ``[g]`` with most of the weight of each Feature Gaussian, and its number of members ``[g]``."""
+        """Return the view ``[g]`` with most of each Feature Gaussian's weight, and its number of members ``[g]``."""
         num_views, rows = len(self.cameras), features.members
         owners = np.repeat(np.arange(len(features)), np.diff(features.starts))  # the Feature Gaussian of each part
         pairs, pair_ids = np.unique(owners * num_views + self.part_views[rows], return_inverse=True)
@@ -131,8 +131,8 @@ def extend_features(
 ) -> tuple[FeatureState, BatchReport]:  # fmt: skip
     """Add a batch of views to a state, or begin one (None); see :func:`gsmerge.states.extend.extend`.
 
-    Returns the new state and the report. Raises UsageError if the settings ask for a budget, for a fit, or for other
-    networks than those of the state, or if the harmonics have another degree.
+    Returns the new state and the report. Raises UsageError if the settings ask for a budget, for a fit, or for networks
+    other than those of the state, or if the degrees of the harmonics of the scene and of the state differ.
     """
     _check_options(options)
     options = options.with_settings(ONE_PIECE)
@@ -148,14 +148,14 @@ def extend_features(
         features, members, _, context = encode_views(prepared, plan, None)
         assert isinstance(context, NetworkContext)
         samples = sample_fronts(members, prepared_scene.cameras, state)
-        corners = scene_saliency(prepared_scene.images)
+        pixel_saliency = scene_saliency(prepared_scene.images)
         if state is None:
             merged = merge(features, match(features, plan.match), context)
-            saliency = group_saliency(merged, members, corners)
+            saliency = group_saliency(merged, members, pixel_saliency)
             extended = _refine_groups(merged, context, saliency, samples, prepared.frame)
         else:
             _check_degree(state, scene)
-            saliency = group_saliency(features, members, corners)
+            saliency = group_saliency(features, members, pixel_saliency)
             extended = _join_batch(state, features, saliency, context, samples, plan.match)
     numbers = {"num_views": len(prepared_scene), "num_input": scene.num_gaussians, "num_new": len(features)}
     notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == UNKNOWN_WORLD else [])]
@@ -169,7 +169,7 @@ def extend_features(
 
 
 def _check_options(options: CompactOptions) -> None:
-    """Raise UsageError for settings that do not apply to Feature Gaussians in batches: a budget, a fit and others."""
+    """Raise UsageError for settings that Feature Gaussians in batches do not support, such as a budget or a fit."""
     for name in options.compact_only:
         raise UsageError(f"{name}: not possible for Feature Gaussians in batches; use compact on the whole scene")
     if options.budget.budget is not None:
@@ -196,9 +196,9 @@ def _view_names(state: FeatureState | None, prepared: Prepared) -> tuple[str, ..
 
 
 def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
-    """Return how the world of a canonical scene compares with that of a state; see :func:`compare_worlds`.
+    """Compare the world of a scene with that of a state, both in the canonical frame; see :func:`compare_worlds`.
 
-    Raises SceneError if it is another one, unless the options allow it.
+    Raises SceneError if the scene is in another world, unless the options allow this.
     """
     if state is None:
         return UNKNOWN_WORLD
@@ -219,9 +219,9 @@ def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
 
 
 def sample_fronts(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
-    """Sample the foremost Gaussian at the centre of each cell of a grid in every view; the grid is that of a state.
+    """Sample the foremost Gaussian at the centre of each cell of a grid, in every view.
 
-    Without a state, the cells of the grid are squares of a fixed size.
+    The grid has as many cells as that of the ``state``. Without a state its cells are squares of a fixed size.
     """
     sample_step = 8  # pixels between samples of a view along each axis
     new_shape = -(-cameras.height // sample_step), -(-cameras.width // sample_step)
@@ -229,8 +229,8 @@ def sample_fronts(members: Members, cameras: Cameras, state: FeatureState | None
     rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
     columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)
     pixels = (rows[:, None] * cameras.width + columns).reshape(-1)
-    ids = (np.arange(len(cameras))[:, None] * (cameras.width * cameras.height) + pixels).reshape(-1)
-    ids = members.fronts.reshape(-1)[ids]
+    pixel_ids = (np.arange(len(cameras))[:, None] * (cameras.width * cameras.height) + pixels).reshape(-1)
+    ids = members.fronts.reshape(-1)[pixel_ids]  # rows of the foremost Gaussians, -1 for none
     means, sh0 = members.means[ids], members.sh0[ids, 0]
     usable = (ids >= 0) & np.isfinite(means).all(1) & np.isfinite(sh0).all(1) & np.isfinite(members.opacities[ids])
     grid = len(cameras), height, width
@@ -244,7 +244,7 @@ def sample_fronts(members: Members, cameras: Cameras, state: FeatureState | None
 def _refine_groups(
     merged: FeatureGaussians, context: NetworkContext, saliency: np.ndarray, samples: ViewSamples, frame: Frame
 ) -> FeatureState:  # fmt: skip
-    """Refine merged Feature Gaussians, and return the state that has them and the inputs of the heads about them."""
+    """Refine merged Feature Gaussians, and return a state with both, and with the heads' inputs for each group."""
     refined = context.refine(merged)
     with stage("decode"):
         described = context.describe(refined)
@@ -271,38 +271,38 @@ def _join_batch(
 
     ``features``, ``saliency``, ``context`` and ``samples`` are those of the batch. Views of the state come first.
     """
-    size, members = (state.cameras.width, state.cameras.height), context.members
+    size = state.cameras.width, state.cameras.height
     cameras = concat_cameras(state.cameras, resize_cameras(context.cameras, *size))
     views = features.views + len(state.cameras)
     parts = FeatureGaussians.concat([state.merged, _without_members(replace(features, views=views))])
-    samples = ViewSamples.concat([state.samples, samples])
-    rows = np.arange(len(parts))
-    parts = replace(parts, starts=np.arange(len(parts) + 1), members=rows.astype(np.int32))
-    num_members = np.concatenate([state.num_members, np.diff(features.starts)])
+    # Each part lists its own row, so that merging lists the rows of the parts
+    parts = replace(parts, starts=np.arange(len(parts) + 1), members=np.arange(len(parts)).astype(np.int32))
+    part_members = np.concatenate([state.num_members, np.diff(features.starts)])
+    all_samples = ViewSamples.concat([state.samples, samples])
     join_context = _JoinContext(
-        networks=context.networks, members=members, cameras=cameras, seed=context.seed, samples=samples,
-        part_views=np.concatenate([state.views, views]), part_members=num_members,
+        networks=context.networks, members=context.members, cameras=cameras, seed=context.seed, samples=all_samples,
+        part_views=np.concatenate([state.views, views]), part_members=part_members,
         part_weights=np.asarray(parts.weights),
     )  # fmt: skip
     merged = merge(parts, _match_parts(parts, len(state), options), join_context)
     part_saliency = np.concatenate([state.saliency, saliency])
-    merged_saliency = _mean_of_parts(merged, part_saliency, num_members.astype(np.float64))
-    return _refine_groups(merged, join_context, merged_saliency, samples, state.frame)
+    merged_saliency = _mean_of_parts(merged, part_saliency, part_members.astype(np.float64))
+    return _refine_groups(merged, join_context, merged_saliency, all_samples, state.frame)
 
 
 def _mean_of_parts(merged: FeatureGaussians, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the mean ``[g]`` of ``values [p]`` over the parts of each Feature Gaussian, with ``weights [p]``."""
+    """Return the weighted mean ``[g]`` of ``values [p]`` over the parts of each Feature Gaussian."""
     owners = np.repeat(np.arange(len(merged)), np.diff(merged.starts))
     weights, values = weights[merged.members], values[merged.members]
     return np.bincount(owners, weights * values, len(merged)) / np.bincount(owners, weights, len(merged))
 
 
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -> Matches:
-    """Match the Feature Gaussians of a batch with each other, as in a scene, and with those of the state.
+    """Match the Feature Gaussians of a batch with each other, as in a scene, and with those of a state.
 
     The first ``num_old`` of the ``parts`` are those of the state. Clusters of the two matchings are joined if they
-    share a part. In the matching with the state, the state counts as one view and the batch as another, so that each
-    part is compared with its nearest neighbours on the other side.
+    share a part. For the matching with the state, all parts of the state count as one view, and all parts of the batch
+    as another. Each part is thus compared with its nearest neighbours in the other set.
     """
     rows = np.arange(len(parts))
     across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options).clusters
@@ -310,11 +310,12 @@ def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -
     batch_extinctions = np.where(rows < num_old, 0, parts.extinctions)
     within = match(replace(parts, views=batch_views, extinctions=batch_extinctions), options)
     neighbors = np.stack([_first_members(across), _first_members(within.clusters)], 1)
-    return Matches(*connected_components(neighbors, np.ones(neighbors.shape), 0.5))
+    # All scores are above the threshold, so that all neighbours are connected
+    return Matches(*connected_components(neighbors, np.ones(neighbors.shape), threshold=0.5))
 
 
 def _first_members(clusters: np.ndarray) -> np.ndarray:
-    """Return the first part ``[p]`` that is in the same cluster as each part; ``clusters [p]`` are their numbers."""
+    """Return for each part the row ``[p]`` of the first part of its cluster; ``clusters [p]`` has cluster numbers."""
     _, first_rows, cluster_ids = np.unique(clusters, return_index=True, return_inverse=True)
     return first_rows[cluster_ids]
 
@@ -325,7 +326,7 @@ def _without_members(features: FeatureGaussians) -> FeatureGaussians:
 
 
 def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
-    """Decode a state into ``k`` Gaussians per group, or by saliency with a mixed K; return them in the world frame.
+    """Decode a state into ``k`` Gaussians per group in the world frame; with a mixed K, saliency decides their number.
 
     Raises UsageError if the networks' heads make fewer Gaussians, or if ``k_rule`` needs the members of the groups.
     """
@@ -339,7 +340,7 @@ def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
         counts = counts_by_saliency(state.saliency, options)
     children, parents = repeat_groups(state.refined, counts)
     described = make_group_features(state.refined, state.views, state.group, state.cameras)
-    no_members = gaussian_members(children[:0], np.zeros(0, np.float32))
+    no_members = gaussian_members(children[:0], np.zeros(0, np.float32))  # the heads read none
     context = NetworkContext(state.networks, no_members, state.cameras)
     gaussians = decode_gaussians(children, parents, described, context)
     gaussians = gaussians[gaussians.opacities >= options.min_opacity]

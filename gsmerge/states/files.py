@@ -46,23 +46,23 @@ def extend_file(
     dry_run: bool = False,
     tried: State | None = None,
 ) -> tuple[dict[str, Any], State]:
-    """Add a batch of views to the state in a file, or to a new file; return report (plain JSON types) and new state.
+    """Add a batch of views to the state in a file, which is made if it is missing; return the report and the new state.
 
-    The file is replaced at the end, but not if anything fails. Another process that extends it waits. If the state
-    already has the batch, it is left out, with a note. Raises SceneError if a file cannot be read or written, or if the
-    batch seems to be in another world. Raises UsageError if a setting is unknown, out of range, or impossible for the
-    state or the scene.
+    The report has plain JSON types. The file is replaced at the end, and only if nothing fails. Other processes that
+    extend the same file wait. A batch that the state already has is left out, with a note. Raises SceneError if a file
+    cannot be read or written, or if the batch seems to be in another world. Raises UsageError if a setting is unknown,
+    out of range, or impossible for the state or the scene.
 
     Args:
         path: The file of the state.
         files: The files of the batch.
         settings: See :class:`gsmerge.Compactor`.
         opacity: How opacities are stored in the batch's file.
-        hints: Facts about the batch's file that it does not have itself.
-        progress: Called as the batch is compacted.
+        hints: Facts about the batch's file that the file does not state.
+        progress: Called while the batch is compacted.
         seconds_before: Wall times of the caller's earlier steps, by name.
         dry_run: Write nothing.
-        tried: The state of an earlier dry run, used in place of the file's.
+        tried: The state that an earlier dry run returned, used in place of the file's state.
     """
     try:
         batch_settings(settings)
@@ -70,30 +70,30 @@ def extend_file(
         raise UsageError(str(error)) from error
     with nullcontext() if dry_run else lock_state(path):
         start = perf_counter()
-        state, read = tried or (load_state(path) if os.path.exists(path) else None), list_files(files)
-        content, mode = content_hash(read), common_mode(read)
-        document = {**document_head(), "input": {"path": str(files.ply), "content": content}, "dry_run": dry_run}
+        state, paths = tried or (load_state(path) if os.path.exists(path) else None), list_files(files)
+        batch_hash, mode = content_hash(paths), common_mode(paths)
+        document = {**document_head(), "input": {"path": str(files.ply), "content": batch_hash}, "dry_run": dry_run}
         batches = [] if state is None else state.about["batches"]
-        contents = [batch.get("content", batch.get("sha256")) for batch in batches]  # sha256: of versions before 0.6
-        if state is not None and content in contents:
-            number = contents.index(content) + 1
+        known_hashes = [batch.get("content", batch.get("sha256")) for batch in batches]  # "sha256" before version 0.6
+        if state is not None and batch_hash in known_hashes:
+            number = known_hashes.index(batch_hash) + 1
             note = f"{files.ply}: left out, since the same files are batch {number} of {path.name} already"
             return document | {"repeated": True, "state": _state_facts(path, state), **note_entries([note])}, state
         load_end = perf_counter()
-        load = read_input(files, opacity=opacity, hints=hints, hashed=True)
+        loaded = read_input(files, opacity=opacity, hints=hints, hashed=True)
         read_end = perf_counter()
         try:
-            state, report = extend_state(state, load.scene, settings, progress=progress)
+            state, report = extend_state(state, loaded.scene, settings, progress=progress)
         except SceneError as error:
             raise (SceneError(files.ply, error.problem, error.remedy) if error.path == BATCH else error) from error
-        state = _record_source(state, content, load.comments)
+        state = _record_source(state, batch_hash, loaded.comments)
         extend_end = perf_counter()
         if not dry_run:
             save_state(path, state, overwrite=True, mode=mode)
         seconds = {**(seconds_before or {}), "load": load_end - start, "read": read_end - load_end, **report.seconds}
         seconds["other"] = extend_end - read_end - sum(report.seconds.values())
         facts = {name: fact for name, fact in asdict(report).items() if name not in ("seconds", "notes", "options")}
-        document["input"] |= load.recognised
+        document["input"] |= loaded.recognised
         document |= {
             **facts,
             "repeated": False,
@@ -101,36 +101,36 @@ def extend_file(
             "options": dict(report.options),
             **seconds_document(seconds | {"write": perf_counter() - extend_end}),
             "peak_memory_bytes": peak_memory(),
-            **note_entries([*load.notes, *report.notes, *doubt_changed(load.stats)]),
+            **note_entries([*loaded.notes, *report.notes, *doubt_changed(loaded.stats)]),
         }
         return document, state
 
 
 def lock_state(path: Path) -> AbstractContextManager[bool]:
-    """Return a context in which only one process at a time works with the file of a state."""
+    """Return a context that only one process at a time can enter for the file of a state."""
     path = Path(os.path.realpath(path))
-    if not path.parent.is_dir():  # a new state in a new folder, which is made with the file
+    if not path.parent.is_dir():  # no other process can have a state in a folder that does not exist
         return nullcontext(True)
     return lock_file(path.with_name(f".gsmerge-{digest({'name': path.name})[:16]}.lock"))
 
 
-def _record_source(state: State, content: str, comments: Sequence[str]) -> State:
-    """Return a state that records the hash ``content`` of its last batch's files, and comments for its results."""
+def _record_source(state: State, batch_hash: str, comments: Sequence[str]) -> State:
+    """Return a state that stores the hash of its last batch's files, and ``comments`` of these files for results."""
     *earlier, last = state.about["batches"]
-    last = last | {"content": content}
+    last = last | {"content": batch_hash}
     all_comments = list(dict.fromkeys([*state.about.get("comments", []), *comments]))
     return replace(state, about={**state.about, "batches": [*earlier, last], "comments": all_comments})
 
 
 def _state_facts(path: Path, state: State) -> dict[str, Any]:
-    """Return the part of a report about the file of a state; after a dry run the file may not exist."""
+    """Return the facts of a report about the file of a state, which may not exist after a dry run."""
     num_bytes = path.stat().st_size if path.exists() else 0
     return {"path": str(path), "bytes": num_bytes, "num_batches": len(state.about["batches"])}
 
 
 def batch_line(document: Mapping[str, Any]) -> str:
     """Summarise the report of :func:`extend_file` in one line."""
-    state, would = document["state"], "would be " * document["dry_run"]
+    state, would = document["state"], "would be " if document["dry_run"] else ""
     if document["repeated"]:
         return f"{state['path']}: {would}unchanged, {count_words(state['num_batches'], 'batch')}"
     size = f", {human_bytes(state['bytes'])}; {seconds_line(document)}"
@@ -138,7 +138,7 @@ def batch_line(document: Mapping[str, Any]) -> str:
     return (
         f"{state['path']}: {would}batch {state['num_batches']}, {document['num_views']} views,"
         f" {document['num_input']:,} -> {document['num_new']:,} Gaussians; {document['num_gaussians']:,} in all"
-        f"{world if would else size}"
+        f"{world if document['dry_run'] else size}"
     )
 
 
@@ -150,10 +150,10 @@ def decode_file(
     dry_run: bool = False,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Decode the Feature Gaussians in a ``.gsm`` into an output, with cameras in or beside it; return the report.
+    """Decode the Feature Gaussians in a ``.gsm``, write the Gaussians and the cameras, and return the report.
 
-    With ``dry_run`` nothing is written. Raises SceneError if a file cannot be read or written, and UsageError for a K
-    that the networks do not make.
+    The output ``out`` has the cameras inside or beside it. With ``dry_run`` nothing is written. Raises SceneError if a
+    file cannot be read or written, and UsageError for a K that the networks do not make.
     """
     start, out, state = perf_counter(), outputs.result, load_state(path)
     features, batches = state.features, state.about["batches"]

@@ -1,4 +1,4 @@
-"""Write and read the file of a state, which has results with views, or Feature Gaussians of ``recipe=paper``."""
+"""Write and read the file of a state, which has either results and views, or Feature Gaussians of ``recipe=paper``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _MAX_MEMBERS = (1 << 40) - 1  # most Gaussians of a group; a larger number is da
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is kept of several batches of views: results in a scene with views, or Feature Gaussians."""
+    """All batches of views so far, as a scene of results with views, or as Feature Gaussians."""
 
     about: Mapping[str, Any]  # facts in plain JSON types; `batches` has the figures of each batch
     scene: Scene | None = None  # None in a state of Feature Gaussians
@@ -53,7 +53,7 @@ class State:
 def save_state(path: StrPath, state: State, *, overwrite: bool = False, mode: int = 0o666) -> None:
     """Write a state to a file, completely or not at all; SceneError if the file exists or cannot be written.
 
-    ``mode`` has the most rights that a new file gets, see :func:`gsmerge.io.atomic.common_mode`.
+    ``mode``: the most rights of a new file; see :func:`gsmerge.io.atomic.common_mode`.
     """
     if state.scene is not None:
         write_scene(path, state.scene, state.about, overwrite=overwrite, mode=mode)
@@ -76,7 +76,7 @@ def save_state(path: StrPath, state: State, *, overwrite: bool = False, mode: in
 
 
 def load_state(path: StrPath) -> State:
-    """Read a state from a file; no code in the file is executed.
+    """Read a state from a file. No code in the file is executed.
 
     Raises SceneError if the file is missing or damaged, has another format or version, lacks an array, or has numbers
     out of range.
@@ -89,19 +89,19 @@ def load_state(path: StrPath) -> State:
     if file.header["kind"] == FEATURES:
         return State(about, features=_read_features(file))
     scene = load_scene(path).scene
-    if len(scene.gaussians) == len(file.arrays["means"]):  # keep the bits, since load_scene rounds scales
+    if len(scene.gaussians) == len(file.arrays["means"]):  # take the stored numbers, since load_scene rounds scales
         scene = replace(scene, gaussians=Gaussians(*(file.arrays[f.name] for f in fields(Gaussians))))
     return State(about, scene)
 
 
 def holds_features(path: Path) -> bool:
-    """Return whether a ``.gsm`` holds a state of Feature Gaussians, not results; SceneError if it cannot be read."""
+    """Return whether a ``.gsm`` holds Feature Gaussians and not results; SceneError if the file cannot be read."""
     return bool(read_header(path)["kind"] != SCENE)
 
 
 def _read_features(file: GsmFile) -> FeatureState:
     """Read Feature Gaussians, and check type, shape and range of every array."""
-    weights = _read_networks(file)
+    networks = _read_networks(file)
     unit = file.header.get("unit")
     if not isinstance(unit, float) or not 0 < unit < MAX_NUMBER:
         raise file.error(f"unit: expected a length above 0 and below {MAX_NUMBER:g}, found {unit!r:.40}")
@@ -110,14 +110,14 @@ def _read_features(file: GsmFile) -> FeatureState:
     num_higher = file.array("merged.shN", np.float32, g, None, 3).shape[1]
     if num_higher not in NUM_HIGHER:
         raise file.error(f"merged.shN: expected {NUM_HIGHER} harmonics, found {num_higher}")
-    shapes: dict[str, tuple[int, ...]] = {
-        "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (num_higher, 3), "latents": (weights.options.latent,),
+    shapes: dict[str, tuple[int, ...]] = {  # of the columns that have more than one number per group
+        "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (num_higher, 3), "latents": (networks.options.latent,),
     }  # fmt: skip
     columns = {name: _read_numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in FEATURE_COLUMNS}
     merged = FeatureGaussians(
         **columns,
         views=_read_whole_numbers(file, "merged.views", g, -1, num_views),
-        starts=np.zeros(g + 1, np.int64),
+        starts=np.zeros(g + 1, np.int64),  # the file stores no members
         members=np.zeros(0, np.int32),
     )
     corrected = {name: _read_numbers(file, f"refined.{name}", g, *shapes.get(name, ())) for name in CORRECTED}
@@ -131,7 +131,7 @@ def _read_features(file: GsmFile) -> FeatureState:
         group=_read_numbers(file, "group", g, GROUP_COLUMNS),
         cameras=cameras,
         frame=Frame(file.finite("origin", np.float64, 3), unit),
-        networks=weights,
+        networks=networks,
         checkpoint=str(file.header.get("checkpoint")),
         names=stored_names(file, num_views),
     )
@@ -147,7 +147,7 @@ def _read_networks(file: GsmFile) -> NetworkWeights:
 
 
 def _read_cameras(file: GsmFile) -> Cameras:
-    """Read the cameras of a state; SceneError if a pose, intrinsics or the size are impossible."""
+    """Read the cameras of a state; SceneError if poses, intrinsics or the size are impossible."""
     cameras = stored_cameras(file)
     for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
         check_camera(file.path, str(view), viewmat, K)
@@ -156,7 +156,7 @@ def _read_cameras(file: GsmFile) -> Cameras:
 
 
 def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
-    """Read the samples of all views."""
+    """Read the Gaussians that were sampled in all views; see :class:`ViewSamples`."""
     height, width = file.array("samples.opacities", np.float32, num_views, None, None).shape[1:]
     if 0 in (height, width):
         raise file.error("samples.opacities: expected pixels of every view, found none")
@@ -166,7 +166,7 @@ def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
 
 
 def _read_numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
-    """Return a float32 array of a file; SceneError if it has numbers that would overflow later."""
+    """Return a float32 array of a file; SceneError for numbers so large that later steps would overflow."""
     array = file.array(name, np.float32, *shape)
     largest = 1e37  # largest absolute value; float32 ends at 3e38
     if not (np.abs(array).max(initial=0) <= largest):  # NaN fails too
@@ -175,7 +175,7 @@ def _read_numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
 
 
 def _read_whole_numbers(file: GsmFile, name: str, count: int, start: int, end: int) -> np.ndarray:
-    """Return an array ``[count]`` of a file, whole numbers from ``start`` to below ``end``; SceneError for others."""
+    """Return whole numbers ``[count]`` of a file; SceneError unless all are from ``start`` to below ``end``."""
     array = file.array(name, np.int64, count)
     if count and not start <= int(array.min()) <= int(array.max()) < end:
         raise file.error(f"{name}: expected numbers from {start} to {end - 1}, found others")

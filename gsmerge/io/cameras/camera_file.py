@@ -19,14 +19,14 @@ from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
 from gsmerge.values.arguments import check_arguments
 
-# Largest number in poses and intrinsics, largest side of an image, and smallest focal length, in pixels. No camera
-# exceeds these limits, and other numbers would overflow in later steps
+# Largest number in poses and intrinsics, largest side of an image, and smallest focal length, in pixels. Real cameras
+# keep these limits, and numbers beyond them would overflow in later steps
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # turns OpenGL's camera axes (y up, z backward) to OpenCV's (y down, z forward)
 
-# A principal point is in the middle if its double differs by at most these pixels from the image's size
+# A principal point is in the middle if twice its coordinates differ by at most these pixels from the image's size
 CENTRED_PX = 1e-3
-PATCH_SIDE = 14  # the sides of vision transformers' inputs are multiples of it, in pixels
+PATCH_SIDE = 14  # pixels; sides of vision transformers' inputs are multiples of this
 _WHOLE_PX = 1e-3  # a side counts as whole if it differs from a whole number by less than these pixels
 MAX_NORMALISED_FOCAL = 10.0  # longest focal length in sides of the image; a longer one is in pixels
 
@@ -44,8 +44,9 @@ COEFFICIENTS = {  # names of the coefficients of each model of lens, in order
     "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
-# Smallest share of an undistorted photo's pixels that lie within the photo. A lens with k1 = 1 / r^2, where r is half
-# of the image's diagonal, is stronger than any real lens, and a third of its undistorted photo still lies within
+# Smallest share of an undistorted photo's pixels that lie within the photo; with a smaller share, the coefficients are
+# wrong. A lens with k1 = 1 / r^2, where r is half of the image's diagonal, is stronger than any real lens. Even of its
+# undistorted photo, a third lies within
 _MIN_INSIDE = 0.25
 
 
@@ -55,24 +56,24 @@ class Lens:
 
     name: str  # as the camera file calls the model
     model: Literal["perspective", "fisheye"]  # as ``cv2.undistort`` (radial, tangential), or ``cv2.fisheye``
-    coefficients: tuple[float, ...]  # values of the first of COEFFICIENTS; those of all others are 0
+    coefficients: tuple[float, ...]  # values of COEFFICIENTS in their order; values that are left out at the end are 0
 
 
 def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients: Sequence[float]) -> Lens | None:
-    """Make a lens; return None for a pinhole, which is a perspective lens without distortion."""
+    """Make a lens; None for a pinhole, which is a perspective lens without distortion."""
     return Lens(name, model, tuple(coefficients)) if model == "fisheye" or any(coefficients) else None
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFile:
-    """The c cameras of a file, in its order."""
+    """The c cameras of a file, in the order of the file."""
 
     path: str  # the file or folder
     viewmats: np.ndarray  # ``[c,4,4]`` world to camera, OpenCV axes, float64
     Ks: np.ndarray  # ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5)
     widths: np.ndarray  # ``[c]`` int64, pixels; 0 if unknown, 1 if unknown and the intrinsics are relative to it
-    heights: np.ndarray  # likewise
-    names: tuple[str, ...]  # image names as the file gives them
+    heights: np.ndarray  # ``[c]`` int64, as widths
+    names: tuple[str, ...]  # names of the images in the file
     source: str  # name of the format
     convention: Convention = W2C_OPENCV  # how the format stores poses
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty if the file holds no images
@@ -80,9 +81,10 @@ class CameraFile:
     lenses: tuple[Lens | None, ...] = ()  # of each camera, None for a pinhole; empty if all are pinholes
     masks: Mapping[str, str] = field(default_factory=dict)  # name of an image -> name of its mask
     has_intrinsics: bool = True  # False: the file has only poses, and `Ks` are placeholders
-    # Size of the photos, and the transform that gives them the cameras' size; None before the photos are known
+    # Size of the photos, and the transform from this size to that of the cameras. None before the photos are known
     photo_map: tuple[Size, PhotoTransform] | None = None
-    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for none; None unless cameras were estimated from rows
+    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each Gaussian, -1 for none. None unless the cameras were estimated
+    # from the order of the Gaussians' rows
     pixel_ids: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -93,7 +95,10 @@ class CameraFile:
 
 
 def drop_repeats(file: CameraFile) -> CameraFile:
-    """Drop views with name, pose and intrinsics of an earlier view; keep all if the file has images or pixel ids."""
+    """Drop views that have the name, pose and intrinsics of an earlier view.
+
+    If the file has images or pixel ids, all views are kept, since these belong to views by their numbers.
+    """
     keys = [
         (name, viewmat.tobytes(), K.tobytes())
         for name, viewmat, K in zip(file.names, file.viewmats, file.Ks, strict=True)
@@ -101,23 +106,15 @@ def drop_repeats(file: CameraFile) -> CameraFile:
     first_views = sorted({key: view for view, key in reversed(list(enumerate(keys)))}.values())
     if len(first_views) == len(file) or len(file.images) or file.pixel_ids is not None:
         return file
-    return replace(
-        file,
-        viewmats=file.viewmats[first_views],
-        Ks=file.Ks[first_views],
-        widths=file.widths[first_views],
-        heights=file.heights[first_views],
-        names=tuple(file.names[view] for view in first_views),
-        lenses=tuple(file.lenses[view] for view in first_views) if file.lenses else (),
-    )
+    return select_views(file, first_views)
 
 
 class StoredView(NamedTuple):
-    """One camera of a file, in the convention of the file."""
+    """One camera of a file, as the file stores it."""
 
     name: str  # of its image
     pose: np.ndarray  # 3x4 or 4x4, in the file's convention
-    # ``[3,3]`` intrinsics: of all views in pixels, or of all views divided by the image's size, or of all views None
+    # ``[3,3]`` intrinsics in pixels, or divided by the image's size, or None. All views of a file have the same kind
     K: np.ndarray | None
     size: tuple[int, int] = (0, 0)  # (width, height), pixels; 0 where unknown
     lens: Lens | None = None  # None for a pinhole
@@ -137,19 +134,20 @@ def make_camera_file(
     images: PhotoArrays = (),
     order: str = "auto",
 ) -> CameraFile:
-    """Make a camera file from poses in any convention: convert them to OpenCV world-to-camera, and check them.
+    """Check the views of a file, and convert them to a camera file with OpenCV world-to-camera poses.
 
-    If the intrinsics of all views are so small that they must be divided by the image's size, they become pixels.
-    ``images [c,h,w,3]`` and the ``order`` of rows are those that the file holds. SceneError if there is no camera, a
-    number is infinite or too large, a rotation is not orthonormal, or a focal length is not positive.
+    Intrinsics that are divided by the image's size are converted to pixels. They are recognised by being small in all
+    views. ``images [c,h,w,3]`` are images inside the file, and ``order`` is the order of rows that it states.
+    SceneError if there is no camera, a number is infinite or too large, a rotation is not orthonormal, or a focal
+    length is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
     check_camera_count(path, len(views))
     lacks_intrinsics = all(view.K is None for view in views)
-    if lacks_intrinsics:  # placeholders, which the checks accept
-        sides = [float(max(view.size)) or 1.0 for view in views]
-        views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, sides, strict=True)]
+    if lacks_intrinsics:  # the checks need some intrinsics
+        focals = [float(max(view.size)) or 1.0 for view in views]
+        views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, focals, strict=True)]
     poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
     for i, view in enumerate(views):
         poses[i, :3] = _check_pose(path, view)
@@ -180,7 +178,7 @@ def make_camera_file(
 
 
 def _check_pose(path: StrPath, view: StoredView) -> np.ndarray:
-    """Return the first three rows ``[3,4]`` of a pose; SceneError if it has another shape than 3x4 or 4x4."""
+    """Return the first three rows ``[3,4]`` of a view's pose; SceneError unless the pose is 3x4 or 4x4."""
     pose = np.asarray(view.pose, np.float64)
     if pose.shape not in ((3, 4), (4, 4)):
         raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
@@ -188,19 +186,19 @@ def _check_pose(path: StrPath, view: StoredView) -> np.ndarray:
 
 
 def _check_lens(path: StrPath, view: StoredView) -> None:
-    """Raise SceneError if a coefficient of a view's lens is too large."""
+    """Raise SceneError if a coefficient of a view's lens is far too large."""
     if view.lens is None:
         return
-    max_coefficient = 1e6  # of a lens; undistorting photos checks the effect of smaller coefficients
+    max_coefficient = 1e6  # smaller coefficients are checked by their effect, when photos are undistorted
     for name, coefficient in zip(COEFFICIENTS[view.lens.model], view.lens.coefficients, strict=False):
-        if not abs(coefficient) <= max_coefficient:  # also for NaN
+        if not abs(coefficient) <= max_coefficient:  # also refuses NaN
             problem = f"expected a lens coefficient {name} within +-{max_coefficient:g}, found {coefficient:g}"
             text = f"view {view.name}: {problem} ({view.lens.name})"
             raise SceneError(path, text, "correct it, or undistort the images first")
 
 
 def check_camera_count(path: StrPath, count: int) -> None:
-    """Raise SceneError if a file has more cameras than the limit, before anything is allocated for each."""
+    """Raise SceneError if a file has too many cameras. Readers call it before they allocate memory for each camera."""
     if count > MAX_VIEWS:
         raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found more")
 
@@ -212,7 +210,10 @@ def missing_intrinsics(path: StrPath) -> SceneError:
 
 
 def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """Multiply intrinsics that are relative to the image size by that size; an unknown size counts as 1 x 1."""
+    """Convert intrinsics that are divided by the image size to pixels; return them with the sizes.
+
+    An unknown size becomes 1 x 1. Intrinsics in pixels are returned unchanged.
+    """
     is_relative = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
     is_relative &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
     # In a picture of a few pixels, a focal length in pixels is as small as a relative one
@@ -249,9 +250,9 @@ def is_orthonormal(axes: np.ndarray) -> bool:
 
 def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -> None:
     """Raise SceneError if intrinsics ``[3,3]`` in pixels do not fit an image of (width, height)."""
-    if min(size) <= 1:  # not known
+    if min(size) <= 1:  # the size is not known
         return
-    # Largest focal length and principal point, in units of the longer side of the image
+    # Largest focal length and principal point, as multiples of the longer side of the image
     max_focal_sides, max_centre_sides = 1e5, 1e3
     for quantity, pixels, max_sides in (
         ("a focal length", max(K[0, 0], K[1, 1]), max_focal_sides),
@@ -278,7 +279,7 @@ def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
 
 
 def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFile:
-    """Return cameras whose stored poses are read in another convention."""
+    """Return the cameras that the file has if its poses are stored in another convention."""
     stored = from_viewmats(camera_file.viewmats, camera_file.convention)
     return replace(camera_file, viewmats=to_viewmats(stored, convention), convention=convention)
 
@@ -304,10 +305,11 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> CameraFile:
-    """Set the size of cameras without a size to twice their principal point, if photos clearly have another size.
+    """Give cameras without a size the size that is twice their principal point, if the photos have another size.
 
-    ``size`` is (width, height) of the photos. Cameras stay unchanged if the new size has not the shape of the photos.
-    Fractional sides are rounded to multiples of ``PATCH_SIDE``, since the inputs of networks have such sides.
+    ``size`` is (width, height) of the photos. Cameras stay unchanged if twice the principal point has another aspect
+    ratio than the photos, or nearly the same size. Sides with a fraction are rounded to multiples of ``PATCH_SIDE``,
+    since the inputs of networks have such sides.
     """
     if size is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file
@@ -324,10 +326,10 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
 
 @check_arguments
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
-    """Convert to cameras of one image size (width, height) in pixels; None: the file's size.
+    """Convert to cameras of one image ``size`` (width, height) in pixels, by default the size in the file.
 
-    Intrinsics for another size are scaled, each axis by itself. SceneError if no size is given and the cameras of the
-    file have no size or several, or if a lens is not a pinhole.
+    Intrinsics for another size are scaled, each axis by itself. SceneError if a lens is no pinhole, or if no ``size``
+    is given and the file has no size or several sizes.
 
     Example:
         >>> gsmerge.to_cameras(gsmerge.read_cameras("demo/transforms.json")).Ks.shape
@@ -358,10 +360,10 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 
 
 def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFile, PhotoArrays, list[str]]:
-    """Undistort photos, and make their cameras pinholes with the same intrinsics; also return a note.
+    """Undistort photos, and replace their cameras by pinholes with the same intrinsics; return both, with a note.
 
-    SceneError if a lens has distortion but photos are missing or of another shape, or if most of an undistorted photo
-    would lie outside of the photo.
+    SceneError if a lens has distortion and there are no photos, or photos of another aspect ratio. SceneError also if
+    most of an undistorted photo would lie outside of the photo.
     """
     if not camera_file.lenses:
         return camera_file, photos, []
@@ -389,17 +391,18 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
 
 
 def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
-    """Return the share of an undistorted photo's pixels that lie within the photo, measured on a grid."""
-    grid = 32  # pixels on each side of the grid on which the share is measured
+    """Return the share of an undistorted photo's pixels that lie within the photo, measured on a coarse grid."""
+    grid = 32  # pixels of each side of the grid
     grid_K = K * np.array([grid / size[0], grid / size[1], 1.0])[:, None]
     maps = _rectify_maps(grid_K, lens, (grid, grid))
-    return float(np.all([(axis >= -0.5) & (axis <= grid - 0.5) for axis in maps], 0).mean())
+    return float(np.all([(positions >= -0.5) & (positions <= grid - 0.5) for positions in maps], 0).mean())
 
 
 def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> PhotoArrays:
-    """Return the photos that pinholes with the same intrinsics would take; pixels outside repeat the nearest ones.
+    """Return the photos that pinholes with the same intrinsics would take.
 
-    ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` are for their size, with the top-left pixel's centre at (0.5, 0.5).
+    Pixels outside of a photo repeat its nearest pixels. ``Ks [c,3,3]`` are for the size of the ``photos``, uint8
+    ``[h,w,3]``, with the top-left pixel's centre at (0.5, 0.5).
     """
 
     def undistort(view: int, photo: np.ndarray) -> np.ndarray:
@@ -414,19 +417,19 @@ def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens 
 
 
 def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each pixel of a pinhole image is in the image of the lens: x and y, each ``[h,w]`` float32."""
+    """Return where each pixel of a pinhole image lies in the image of the lens: x and y, each ``[h,w]`` float32."""
     centred = K.astype(np.float64).copy()
     centred[:2, 2] -= 0.5  # OpenCV has the top-left pixel's centre at (0, 0)
     coefficients = np.pad(lens.coefficients, (0, len(COEFFICIENTS[lens.model]) - len(lens.coefficients)))
-    make = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
-    x, y = make(centred, coefficients.astype(np.float64), np.eye(3), centred, size, cv2.CV_32FC1)
+    make_maps = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
+    x, y = make_maps(centred, coefficients.astype(np.float64), np.eye(3), centred, size, cv2.CV_32FC1)
     return x, y
 
 
 def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: float) -> list[dict[str, Any]]:
-    """List for each view its name, its rotation in degrees, and the shift of its centre as a share of ``depth``.
+    """List for each view its name, its rotation in degrees, and its shift as a share of ``depth``.
 
-    ``start`` and ``end`` are viewmats ``[v,4,4]``; ``depth`` is that of the scene, in the same unit.
+    ``start`` and ``end`` are viewmats ``[v,4,4]`` before and after. ``depth`` is the scene's depth in their unit.
     """
     degrees, distances = pose_changes(start, end)
     shifts = distances / depth if depth > 0 else distances
@@ -437,16 +440,15 @@ def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: 
 
 
 def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
-    """Describe the mean and the largest of the moves of :func:`list_moves` in words."""
-    angles, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
-    mean, largest = (
-        f"{reduce(angles):.2g} degrees and {100 * reduce(shifts):.3g} % of the depth" for reduce in (np.mean, max)
-    )
+    """Describe in words the mean and the largest rotation and shift of :func:`list_moves`."""
+    angles, shifts = [move["degrees"] for move in moves], [move["shift"] for move in moves]
+    mean = f"{np.mean(angles):.2g} degrees and {100 * np.mean(shifts):.3g} % of the depth"
+    largest = f"{max(angles):.2g} degrees and {100 * max(shifts):.3g} % of the depth"
     return f"{mean} on average, {largest} at most"
 
 
 def make_similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
-    """Make the map X' = scale (matrix [X; 1]) of a matrix ``[3,4]``; SceneError if it is no similarity."""
+    """Make the similarity X' = scale (matrix [X; 1]) of a matrix ``[3,4]``; SceneError if the map is no similarity."""
     R = matrix[:3, :3]
     is_similarity = is_orthonormal(R) and determinant(R) >= 0 and 0 < scale < MAX_NUMBER
     if not is_similarity or not np.all(np.abs(matrix) < MAX_NUMBER):

@@ -1,4 +1,4 @@
-"""Hold what camera readers take and return: a file whose content is read once, and cameras as it states them."""
+"""Classes for what camera readers take and return, and functions that convert the numbers in files of cameras."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class CameraSource:
 
     @property
     def object(self) -> dict[str, Any]:
-        """Parsed content of a JSON file that holds one object; empty for other files."""
+        """Parsed content of a JSON file that holds one object; empty for any other JSON file."""
         return self.json if isinstance(self.json, dict) else {}
 
     @property
     def first(self) -> dict[str, Any]:
-        """First entry of a JSON file that holds a list of objects; empty for other files."""
+        """First entry of a JSON file that holds a list of objects; empty for any other JSON file."""
         entries = self.json if isinstance(self.json, list) else []
         return entries[0] if entries and all(isinstance(entry, dict) for entry in entries) else {}
 
@@ -50,7 +50,7 @@ class CameraSource:
 
 
 def check_objects(path: Path, entries: Sequence[Any], place: str = "the file") -> None:
-    """Raise SceneError with the number of the first entry of a JSON list that is no object."""
+    """Raise SceneError if an entry of a JSON list is no object; the error has the number of the first such entry."""
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
             found = "a list" if isinstance(entry, list) else json.dumps(entry)
@@ -63,12 +63,12 @@ class StoredCameras(NamedTuple):
     views: list[StoredView]
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
     order: str = "auto"  # order of the Gaussians' rows
-    convention: Convention | None = None  # the convention that the numbers show; None: that of the format
+    convention: Convention | None = None  # convention of the poses if it differs from that of the format
 
 
 @contextmanager
 def number_errors(path: Path, expected: str) -> Iterator[None]:
-    """Convert errors of the block about missing keys and wrong values to a SceneError that begins with ``expected``."""
+    """Convert the block's errors about missing keys and wrong values to a SceneError that begins with ``expected``."""
     try:
         yield
     except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError) as error:
@@ -91,7 +91,7 @@ def to_array(values: Any) -> np.ndarray:
 
 
 def convert_value(function: Callable[[Any], Any], key: str, value: Any) -> Any:
-    """Convert the value of a key by ``function``; if it is wrong, ValueError that begins with the key."""
+    """Convert the value of a key by ``function``; ValueError, which begins with the key, if the value is wrong."""
     try:
         return function(value)
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:

@@ -1,4 +1,4 @@
-"""Read the cameras of COLMAP models, as text or binary; points, rigs and frames are not read."""
+"""Read the cameras of COLMAP models in text or binary files. Points, rigs and frames are not read."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.first_bytes import read_start
 
-# Camera model -> its number of parameters, in the order of ids. The first parameters are focal lengths, then the
-# principal point
+# Camera model -> its number of parameters, in the order of COLMAP's ids. The first parameters are one or two focal
+# lengths and the principal point
 _NUM_PARAMS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
@@ -41,9 +41,9 @@ _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
 
 def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
-    """Read the views of a COLMAP model in the order of its images; ``suffix``: ``.bin`` or ``.txt``.
+    """Read the views of a COLMAP model in the order of its images, from files with the ``suffix`` .bin or .txt.
 
-    SceneError if the model is damaged, or if a camera model or a camera is unknown.
+    SceneError if the model is damaged, has a camera model that is not read, or lacks the camera of an image.
     """
     folder = source.path
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
@@ -68,7 +68,10 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
 
 
 def count_images(folder: Path) -> int:
-    """Count the images of a COLMAP model by its header, or by its lines if text has no header; 0 if it is damaged."""
+    """Count the images of a COLMAP model; 0 if it is damaged.
+
+    The count stands in the header. In a text file without a header, the images are counted.
+    """
     with suppress(OSError, ValueError, struct.error, SceneError):
         if (folder / "images.bin").is_file():
             (count,) = struct.unpack("<Q", read_start(folder / "images.bin", 8))
@@ -80,12 +83,12 @@ def count_images(folder: Path) -> int:
 
 
 def _read_numbers(file: BinaryIO, form: str) -> tuple[Any, ...]:
-    """Read the next numbers of a file by their ``struct`` format; struct.error at the end of the file."""
+    """Read the next numbers of a file by their ``struct`` format; struct.error if the file ends before."""
     return struct.unpack(form, file.read(struct.calcsize(form)))
 
 
 def _read_name(file: BinaryIO) -> str:
-    """Read a name, which ends with a zero byte; ValueError if it has no end."""
+    """Read a name that ends with a zero byte; ValueError if no zero byte follows."""
     name = b""
     name_part = 64  # bytes of a name that are read at a time
     while b"\0" not in name:
@@ -98,33 +101,32 @@ def _read_name(file: BinaryIO) -> str:
     return text.decode("utf-8")
 
 
-def _pose(numbers: list[float]) -> np.ndarray:
+def _make_pose(numbers: list[float]) -> np.ndarray:
     """Make a pose ``[3,4]`` from a quaternion wxyz and a translation."""
     if not np.isfinite(numbers).all():
         raise ValueError("a pose that is not finite")
-    quat = np.array(numbers[:4]) / max(1e-12, *map(abs, numbers[:4]))
-    entries = rotation_entries(*quat / max(float(np.linalg.norm(quat, axis=0)), 1e-12))
-    rotation = np.reshape(entries, (3, 3))
+    quat = np.array(numbers[:4]) / max(1e-12, *map(abs, numbers[:4]))  # so that the norm does not overflow
+    rotation = np.reshape(rotation_entries(*quat / max(float(np.linalg.norm(quat, axis=0)), 1e-12)), (3, 3))
     return np.concatenate([rotation, np.array(numbers[4:7])[:, None]], 1)
 
 
 def _make_view(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> StoredView:
-    """Make a view of a camera, without name and pose; SceneError if the camera model is not supported."""
+    """Make a view of a camera, yet without a name and a pose; SceneError if the camera model is not supported."""
     if model not in _PERSPECTIVE_MODELS | _FISHEYE_MODELS:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
         raise SceneError(path, problem, "undistort the images first")
-    one_focal = model in _ONE_FOCAL
-    K = make_pinhole(params[0], *params[:3]) if one_focal else make_pinhole(*params[:4])
-    distortion = params[3 if one_focal else 4 : _NUM_PARAMS[model]]
+    num_intrinsics = 3 if model in _ONE_FOCAL else 4  # the rest are coefficients of the lens
+    K = make_pinhole(params[0], *params[:3]) if model in _ONE_FOCAL else make_pinhole(*params[:4])
+    distortion = params[num_intrinsics : _NUM_PARAMS[model]]
     lens = make_lens(model, "fisheye" if model in _FISHEYE_MODELS else "perspective", distortion)
-    return StoredView("", np.eye(4), K, size if lens else _size_of(K, size), lens)
+    return StoredView("", np.eye(4), K, size if lens else _size_for_intrinsics(K, size), lens)
 
 
-def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the image size that intrinsics belong to: the stored size, or the size of WorldMirror 1's input.
+def _size_for_intrinsics(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
+    """Return the image size to which intrinsics belong: the stored size, or the size of WorldMirror 1's input.
 
-    WorldMirror 1 writes intrinsics for its input, but the size of the photos. Twice the principal point is then the
-    size of the input: whole numbers, clearly smaller than the photos, in the same ratio.
+    WorldMirror 1 stores the size of the photos, but intrinsics for its input. Twice the principal point is then the
+    size of the input. It has whole numbers, is clearly smaller than the photos, and has their aspect ratio.
     """
     sides = 2 * K[:2, 2]
     ratio_x, ratio_y = sides / np.maximum(size, 1)
@@ -136,7 +138,7 @@ def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
 
 
 def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
-    """Read ``cameras.bin``: the id of each camera -> its view, without name and pose."""
+    """Read ``cameras.bin``. Return a view without name and pose for each camera, by the camera's id."""
     (count,) = _read_numbers(file, "<Q")
     check_camera_count(path, count)
     cameras = {}
@@ -149,7 +151,7 @@ def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
 
 
 def _binary_images(path: Path, file: BinaryIO) -> list[_Image]:
-    """Read ``images.bin``, and skip the points of each image."""
+    """Read the name, camera and pose of each image in ``images.bin``, and skip its points."""
     (count,) = _read_numbers(file, "<Q")
     check_camera_count(path, count)
     images = []
@@ -157,10 +159,11 @@ def _binary_images(path: Path, file: BinaryIO) -> list[_Image]:
         _, *numbers, camera = _read_numbers(file, "<i7di")
         name = _read_name(file)
         (num_points,) = _read_numbers(file, "<Q")
-        if file.tell() + 24 * num_points > os.fstat(file.fileno()).st_size:
+        points_end = file.tell() + 24 * num_points  # a point has 24 bytes: x, y and an id
+        if points_end > os.fstat(file.fileno()).st_size:
             raise ValueError("early end of file")
-        file.seek(24 * num_points, os.SEEK_CUR)
-        images.append((name, camera, _pose(numbers)))
+        file.seek(points_end)
+        images.append((name, camera, _make_pose(numbers)))
     return images
 
 
@@ -170,7 +173,7 @@ def _has_content(line: str) -> bool:
 
 
 def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
-    """Parse the lines of ``cameras.txt``; the result is that of :func:`_binary_cameras`."""
+    """Parse the lines of ``cameras.txt``. Return what :func:`_binary_cameras` returns."""
     cameras: dict[int, StoredView] = {}
     for line in filter(_has_content, lines):
         check_camera_count(path, len(cameras) + 1)
@@ -183,10 +186,10 @@ def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
 
 
 def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredView]) -> list[_Image]:
-    """Parse the lines of ``images.txt``; the result is that of :func:`_binary_images`.
+    """Parse the lines of ``images.txt``. Return what :func:`_binary_images` returns.
 
-    The line of an image has a pose, and a name that may have spaces. A line of points follows it, unless a program that
-    rewrote the file dropped all lines of points, or the empty ones.
+    The line of an image has a pose, and a name that may have spaces. A line of points follows. Programs that rewrite
+    the file may drop all lines of points, or the empty lines.
     """
     images: list[_Image] = []
     after_image = False
@@ -198,18 +201,21 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredV
         _, *numbers, camera, name = line.split(maxsplit=9)
         if len(numbers) != 7:
             raise ValueError("expected a rotation and a position")
-        images.append((name.strip(), int(camera), _pose([float(x) for x in numbers])))
+        images.append((name.strip(), int(camera), _make_pose([float(x) for x in numbers])))
         after_image = True
     return images
 
 
 def _lists_points(line: str, cameras: Mapping[int, StoredView]) -> bool:
-    """Return whether the line after an image lists its points, each as x, y and an id, and is no other image."""
-    start = line.split(maxsplit=9)
-    if len(start) < 3 or not all(_WHOLE_NUMBER.fullmatch(number) for number in start[2:9:3]):
+    """Return whether the line after an image lists its points, each as x, y and an id, and is no other image.
+
+    The line of an image has ten words: its id, a quaternion, a translation, the id of a camera, and a name.
+    """
+    words = line.split(maxsplit=9)
+    if len(words) < 3 or not all(_WHOLE_NUMBER.fullmatch(point_id) for point_id in words[2:9:3]):
         return False
-    if len(start) < 10 or not _WHOLE_NUMBER.fullmatch(start[0]) or int(float(start[8])) not in cameras:
+    if len(words) < 10 or not _WHOLE_NUMBER.fullmatch(words[0]) or int(float(words[8])) not in cameras:
         return True
-    quat = np.array(start[1:5], np.float64)
+    quat = np.array(words[1:5], np.float64)
     not_unit = 0.05  # four numbers are no quaternion if their norm differs from 1 by more than this
     return bool(abs(np.sqrt((quat * quat).sum()) - 1) > not_unit)

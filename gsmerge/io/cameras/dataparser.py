@@ -1,4 +1,4 @@
-"""Read how programs moved cameras into the Gaussians' world: by nerfstudio's map, or by an offset of surveys."""
+"""Read how programs moved cameras into the Gaussians' world: by the map of nerfstudio, or by the offset of a survey."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from gsmerge.io.cameras.camera_file import MAX_NUMBER, make_similarity
 from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number
 from gsmerge.kernels.matrices import invert, matmul
 
-DATAPARSER = "dataparser_transforms.json"  # nerfstudio's name of the file with its map
-# Three numbers that are alone in a line, an element or brackets
+DATAPARSER = "dataparser_transforms.json"  # name of nerfstudio's file with its map
+# An offset: three numbers that stand alone in a line, an element or brackets
 _OFFSET = re.compile(r"(?:^|[>:=(])\s*N[\s,;]+N[\s,;]+N\s*(?:$|[<)])".replace("N", r"([-+]?\d+\.?\d*)"), re.MULTILINE)
 
 
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
-    """Read the similarities that nerfstudio, or a survey, may have applied to the cameras; the caller tries them.
+    """Return the similarities by which nerfstudio or a survey may have moved the cameras. The caller tries them.
 
     Nerfstudio's ``dataparser_transforms.json`` has the map from the world of the capture into that of the Gaussians:
-    X' = scale (transform [X; 1]). If a ``transforms.json`` has an ``applied_transform`` (and ``applied_scale``), its
-    poses have been moved by this already, so a second candidate first undoes it. Without nerfstudio's file, offsets of
-    surveys are read. SceneError if nerfstudio's map is not a rotation, a shift and a positive scale.
+    X' = scale (transform [X; 1]). The poses of a ``transforms.json`` with an ``applied_transform`` (and
+    ``applied_scale``) have been moved by it already, so a second candidate undoes this first. If nerfstudio's file is
+    missing, offsets of surveys are read. SceneError if nerfstudio's map is not a rotation, a shift and a positive
+    scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
@@ -48,16 +49,16 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
 
 
 def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
-    """Return moves by the offsets that surveys subtract from coordinates, in metres.
+    """Read the offsets that surveys subtract from coordinates, in metres, and return moves of the cameras by them.
 
-    An offset is three numbers that are alone in a line or element of a small file. Metashape and CloudCompare write it
-    into text files, and DJI Terra into metadata.xml. There is a move in both directions for each offset, since it may
-    be missing in the cameras or in the Gaussians.
+    An offset is three numbers that stand alone in a line or element of a small file. Metashape and CloudCompare write
+    offsets into text files, and DJI Terra into metadata.xml. Either the cameras or the Gaussians may lack the offset.
+    Therefore each offset gives two moves, in opposite directions.
     """
-    offset_endings, max_offsets = (".txt", ".xml", ".xyz"), 8  # endings of files with offsets; most files that are read
-    paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in offset_endings})
+    endings, max_files = (".txt", ".xml", ".xyz"), 8  # of files that may have an offset, and how many of these are read
+    paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in endings})
     small = [path for path in paths if path.is_file() and os.access(path, os.R_OK) and path.stat().st_size <= 1 << 12]
-    matches = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:max_offsets]]
+    matches = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:max_files]]
     offsets = {tuple(map(float, numbers.groups())): name for name, numbers in matches if numbers is not None}
     return [
         Similarity(
@@ -70,7 +71,7 @@ def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
 
 
 def _to_square(values: Any) -> np.ndarray:
-    """Convert the rows of a matrix 3x4 or 4x4 to ``[4,4]``, whose last row is 0 0 0 1; ValueError for others."""
+    """Convert the rows of a 3x4 or 4x4 matrix to ``[4,4]`` with the last row 0 0 0 1; ValueError for other matrices."""
     matrix = to_array(values)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.all(np.abs(matrix) < MAX_NUMBER):
         raise ValueError(f"found shape {list(matrix.shape)}, or numbers that are not finite")

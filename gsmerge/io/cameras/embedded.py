@@ -1,4 +1,4 @@
-"""Read the camera that SHARP writes into its ``.ply`` as elements."""
+"""Read the camera that SHARP writes into the elements of its ``.ply``."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first vers
 
 
 def read_sharp(source: CameraSource) -> StoredCameras | None:
-    """Read the camera of SHARP in a ``.ply``, with the size of the grid of Gaussians; None without one.
+    """Read the camera of SHARP in a ``.ply``; None if it has no such camera.
 
-    The grid is square, because SHARP stretches photos of any shape to a square. SceneError if the numbers of the camera
-    are damaged.
+    The size of the view is that of the grid of Gaussians. The grid is square, because SHARP stretches photos of any
+    shape to a square. SceneError if the numbers of the camera are damaged.
     """
     if find_format(source.path).read is not PLY.read:
         return None

@@ -1,4 +1,4 @@
-"""List the places of camera files, and the programs whose cameras are not read, with the export to use instead."""
+"""List the places of camera files. Also list programs whose cameras are not read, with the export to use instead."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ _REALITY = "RealityScan or RealityCapture", "export its registration as COLMAP, 
 _OPENMVS = "{}InterfaceCOLMAP of OpenMVS make a COLMAP model of it"
 _ODM = "ODM", "name its opensfm/reconstruction.json"
 _OPENMVG = "OpenMVG", "openMVG_main_openMVG2Colmap makes a COLMAP model of it"
-# Cameras in earlier places are preferred, and of the COLMAP models that match a pattern, the one with the most images.
-# A model directly in the folder comes last, because Depth Anything 3 writes one there at the photos' own size
+# Cameras in earlier places are preferred. Of several COLMAP models that match a pattern, the model with the most images
+# is preferred. A model in the folder itself comes last, because Depth Anything 3 writes a model for photos of full size
+# there
 CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
     "cameras.json", "camera_params.json", "sparse/*", "sparse", "colmap/sparse/*", "colmap",
@@ -45,7 +46,7 @@ CAMERA_PLACES = (
     "camera_poses.txt", "keyframes/corrected_cameras", "keyframes/cameras", "reconstruction.json",
     "opensfm/reconstruction.json", "cameras.xml", "[0-9]*", ".",
 )  # fmt: skip
-# The first row that matches a file counts
+# If several rows match a file, the first of them names its program
 PROGRAMS = (
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
     Foreign("*.psx *.psz", "Metashape", "File > Export > Export Cameras writes the .xml that is read"),
@@ -93,23 +94,23 @@ PROGRAMS = (
 
 
 def check_program(place: Path) -> None:
-    """Raise SceneError, with the export to use instead, if a path is or contains a file of :data:`PROGRAMS`."""
+    """Raise SceneError, with the export to use instead, for a file of :data:`PROGRAMS`, or a folder that has one."""
     if (path := find_unread(place)) is not None:
-        foreign = next(foreign for foreign in PROGRAMS if _is_of(path, foreign))
+        foreign = next(foreign for foreign in PROGRAMS if _is_file_of(path, foreign))
         problem = f"expected cameras of a supported format, found those of {foreign.program}"
         raise SceneError(path, problem, foreign.remedy)
 
 
 def find_unread(place: Path) -> Path | None:
-    """Find a file of :data:`PROGRAMS`: the path itself, or one below this folder, but not in the folder of a scene."""
+    """Find a file of :data:`PROGRAMS`: the path itself, or a file below it, but not in the folder of another scene."""
     paths = (path for depth in range(_DEPTH) for path in place.glob("*/" * depth + "[!.]*"))
     files = sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]
     scenes = {p.parent for p in files if p.suffix == ".ply" and p.parent != place and header_content(p) == "Gaussians"}
     files = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES and scenes.isdisjoint(path.parents)]
-    return next((path for foreign in PROGRAMS for path in files if _is_of(path, foreign)), None)
+    return next((path for foreign in PROGRAMS for path in files if _is_file_of(path, foreign)), None)
 
 
-def _is_of(path: Path, foreign: Foreign) -> bool:
+def _is_file_of(path: Path, foreign: Foreign) -> bool:
     """Return whether a path is a file of a program, by its name and its first bytes."""
     has_name = any(map(path.match, foreign.files.split())) and path.is_file()
     return has_name and re.search(foreign.start, read_start(path).decode("latin-1"), re.MULTILINE) is not None

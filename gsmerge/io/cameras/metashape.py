@@ -19,7 +19,7 @@ _ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component
 
 
 def list_metashape_cameras(source: CameraSource) -> list[Entry]:
-    """List the cameras of the largest component, each with the values of its sensor."""
+    """List the cameras of the component with the most cameras, each with the values of its sensor."""
     path = source.path
     root, cameras = _largest_component(path)
     sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
@@ -44,14 +44,14 @@ def _sensor_values(sensor: Element) -> dict[str, Any]:
     calibrations = sensor.findall("calibration")
     if not calibrations:
         raise ValueError("no calibration")
-    calibration = max(calibrations, key=lambda entry: entry.get("class") == "adjusted")
+    calibration = max(calibrations, key=lambda entry: entry.get("class") == "adjusted")  # else the first
     sizes = [*calibration.findall("resolution"), *sensor.findall("resolution")]
     if not sizes:
         raise ValueError("no resolution")
     size = sizes[0].attrib
     numbers = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution"}
     values: dict[str, Any] = {key: numbers[key] for key in ("cx", "cy", "k1", "k2", "k3", "k4") if key in numbers}
-    # p1 and p2 are OpenCV's p2 and p1
+    # Metashape's p1 is OpenCV's p2, and its p2 is OpenCV's p1
     values |= {opencv: numbers[key] for key, opencv in (("p1", "p2"), ("p2", "p1")) if key in numbers}
     fx, fy = numbers["f"] + numbers.get("b1", 0), numbers["f"]
     values |= {"width": float(size["width"]), "height": float(size["height"]), "fx": fx, "fy": fy}
@@ -59,7 +59,7 @@ def _sensor_values(sensor: Element) -> dict[str, Any]:
 
 
 def _largest_component(path: Path) -> tuple[Element, list[Element]]:
-    """Parse a file; return its root, and the cameras with a pose in the component that has most of these."""
+    """Parse a file. Return its root, and the cameras with poses in the component that has most of them."""
     root = read_xml(path, _ATTRIBUTES)
     cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
     check_camera_count(path, len(cameras))

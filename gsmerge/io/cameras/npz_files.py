@@ -1,9 +1,11 @@
 """Read cameras from ``.npz`` files: ``results.npz`` of Depth Anything 3, and ``views.npz`` of any model.
 
-A user whose model saves no cameras can write ``views.npz`` while it runs (``examples/04_dump_views.py``). It has
-``c2w [v,4,4]`` (or 3x4; OpenCV axes), ``K [v,3,3]`` (pixels of the processed images, or divided by their size),
-``images [v,h,w,3]`` as the network saw them (uint8, or float in [0, 1]; also ``[v,3,h,w]``), and ``order``, which is
-the order of the rows of the ``.ply`` if it is known.
+A user whose model saves no cameras can write ``views.npz`` while it runs (``examples/04_dump_views.py``). Its arrays:
+
+- ``c2w``: poses ``[v,4,4]`` or ``[v,3,4]``, camera to world, OpenCV axes.
+- ``K``: intrinsics ``[v,3,3]`` in pixels of ``images``, or divided by their size. They may be missing.
+- ``images``: ``[v,h,w,3]`` or ``[v,3,h,w]`` as the network saw them, uint8 or float in [0, 1].
+- ``order``: order of the rows of the ``.ply``. It may be missing.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.photo_files import PhotoArrays
 from gsmerge.runtime.threads import quiet_warnings
 
-# Names of arrays in the files of several programs; those of Lyra 2's scripts end with one of three words
+# Names of arrays in the files of several programs. Names in files of Lyra 2 end with one of three words
 _LYRA = ("recon_sampled", "da3", "da3_pred")
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
@@ -42,33 +44,33 @@ def is_da3(path: Path) -> bool:
 
 
 def read_da3(source: CameraSource) -> StoredCameras:
-    """Read the cameras of an npz, and its images if it has any; poses are 3x4 or 4x4, world to camera.
+    """Read the cameras of an ``.npz`` of Depth Anything 3, and its images if it has any.
 
-    Intrinsics are in pixels. If they are divided by the size, or are for another image size, as after a COLMAP export
-    in the same call, they are scaled to the images or depth maps. The function also reads ``cameras.npz`` of Lyra 2,
-    and the outputs of VGGT (``extrinsic``, world to camera) and AnySplat (camera to world, intrinsics divided by the
-    size, in a batch of one). SceneError if the file cannot be read or lacks an array.
+    Poses are 3x4 or 4x4, world to camera. Intrinsics are in pixels. If they are divided by the size, or are for another
+    size, they are scaled to the images or depth maps. A COLMAP export in the same call of the model leaves intrinsics
+    for another size. Files of Lyra 2 (``cameras.npz``), VGGT and AnySplat are also read. Poses of AnySplat are camera
+    to world, its intrinsics are divided by the size, and its arrays are a batch of one. SceneError if the file cannot
+    be read or lacks an array.
     """
     path = source.path
-    size_names = () if holds_images(path) else _DEPTHS  # only the shape of depth maps is used
+    size_names = () if holds_images(path) else _DEPTHS  # without images, the shape of depth maps gives the size
     arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *size_names})
     poses, Ks, images, depths = (
         next((arrays[name] for name in names if name in arrays), None)
         for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS)
     )
     if poses is None:
-        raise _missing_arrays(path, [n for n, a in (("extrinsics", poses), ("intrinsics", Ks)) if a is None], arrays)
+        raise _missing_arrays(path, ["extrinsics", *(["intrinsics"] if Ks is None else [])], arrays)
     poses = poses[0] if poses.ndim == 4 and len(poses) == 1 else poses
     Ks = Ks[0] if Ks is not None and Ks.ndim == 4 and len(Ks) == 1 else Ks
     _check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
-    photos: PhotoArrays = ()
-    pixels = depths  # an array whose shape gives the size of the views
-    if images is not None:
-        photos = pixels = _as_images(path, images, len(poses))
+    images = None if images is None else _as_images(path, images, len(poses))
+    photos: PhotoArrays = () if images is None else images
+    sized = depths if images is None else images  # an array whose shape has the size of the views
     Ks = None if Ks is None else Ks.astype(np.float64)
     width = height = 0
-    if pixels is not None and pixels.ndim >= 3 and min(pixels.shape[1:3]) > 0:
-        height, width = pixels.shape[1:3]
+    if sized is not None and sized.ndim >= 3 and min(sized.shape[1:3]) > 0:
+        height, width = sized.shape[1:3]
         Ks = None if Ks is None else _at_size(Ks, width, height)
     elif Ks is not None:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
@@ -77,7 +79,7 @@ def read_da3(source: CameraSource) -> StoredCameras:
     return StoredCameras(_make_views(poses, Ks, (width, height)), photos)
 
 
-def read_dump(source: CameraSource) -> StoredCameras:
+def read_views_npz(source: CameraSource) -> StoredCameras:
     """Read the cameras and images of a ``views.npz``; SceneError if an array other than ``K`` is missing."""
     path = source.path
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
@@ -94,18 +96,18 @@ def read_dump(source: CameraSource) -> StoredCameras:
 
 
 def holds_images(path: Path) -> bool:
-    """Return whether an npz holds images; False if it cannot be read."""
+    """Return whether an ``.npz`` holds images; False if the file cannot be read."""
     return not array_names(path).isdisjoint(_IMAGES)
 
 
 def holds_poses(path: Path) -> bool:
-    """Return whether an npz holds poses and intrinsics; False if it cannot be read."""
+    """Return whether an ``.npz`` holds poses and intrinsics; False if the file cannot be read."""
     names = array_names(path)
     return {"c2w", "K"} <= names or not (names.isdisjoint(_EXTRINSICS) or names.isdisjoint(_INTRINSICS))
 
 
 def _missing_arrays(path: Path, missing: list[str], arrays: dict[str, np.ndarray]) -> SceneError:
-    """Make the error of an npz with other ``arrays``, in which those called ``missing`` are missing."""
+    """Make the error for an ``.npz`` that has the ``arrays``, but lacks those with the names ``missing``."""
     return SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
 
 
@@ -115,16 +117,16 @@ def _make_views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int])
 
 
 def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tuple[str, str]) -> None:
-    """Raise SceneError unless arrays are c poses and intrinsics ``[c,3,3]`` of finite numbers.
+    """Raise SceneError unless two arrays are c poses, 3x4 or 4x4, and intrinsics ``[c,3,3]``, of finite numbers.
 
-    ``names``: what the two arrays are called in errors.
+    ``names``: names of the two arrays in errors.
     """
     Ks = np.zeros((*poses.shape[:1], 3, 3)) if Ks is None else Ks
     for name, array in zip(names, (poses, Ks), strict=True):
         if array.dtype.kind not in "fiu":
             raise SceneError(path, f"expected numbers in {name}, found {array.dtype}")
-    is_list = poses.ndim == 3 and len(poses) > 0 and poses.shape[1:] in ((3, 4), (4, 4))
-    if not is_list or Ks.shape != (len(poses), 3, 3):
+    are_poses = poses.ndim == 3 and len(poses) > 0 and poses.shape[1:] in ((3, 4), (4, 4))
+    if not are_poses or Ks.shape != (len(poses), 3, 3):
         raise SceneError(path, f"expected {names[0]} and {names[1]}, found {poses.shape} and {Ks.shape}")
     check_camera_count(path, len(poses))
     max_intrinsic = 1e12  # pixels; the comparison also refuses NaN and infinity
@@ -135,7 +137,7 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tu
 def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
     """Convert images ``[c,h,w,3]`` or ``[c,3,h,w]``, as uint8 or in [0, 1], to ``[c,h,w,3]`` uint8.
 
-    NaN become black. ``count``: the number of poses. SceneError if the images have another number or shape.
+    NaN becomes black. SceneError if there are not ``count`` images, one for each pose, or if they have another shape.
     """
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
@@ -154,28 +156,28 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Scale intrinsics to an image size, if they are for another size.
+    """Scale intrinsics to an image size, if they are divided by the size or are for another size.
 
-    The networks assume that the principal point is in the middle, so twice this point is the size of the intrinsics.
+    The networks assume that the principal point is in the middle. Twice this point is thus the size for which the
+    intrinsics are.
     """
     size = np.array([width, height])
     least_centre = 1e-9  # smaller principal points are raised to this, since they divide below
-    ratio = 2 * np.maximum(Ks[:, :2, 2], least_centre) / size
-    normalised = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 0, 2] < 2) & (width > 10)
-    max_ratio_difference, min_size_difference = 0.03, 0.1  # relative, of the ratios of two axes, and of two sizes
-    # If the ratios of both axes are equal and not 1, intrinsics are for another size. Otherwise the principal point is
-    # not in the middle
-    are_equal = np.abs(ratio[:, 0] / ratio[:, 1] - 1) < max_ratio_difference
-    other_size = are_equal & (np.abs(ratio[:, 0] - 1) > min_size_difference)
+    ratios = 2 * np.maximum(Ks[:, :2, 2], least_centre) / size  # size of the intrinsics, divided by that of the images
+    is_normalised = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 0, 2] < 2) & (width > 10)
+    # If the ratios of both axes are equal, but are not 1, the intrinsics are for another size. If they differ from each
+    # other, the principal point is not in the middle
+    max_axis_difference, min_size_difference = 0.03, 0.1  # relative
+    are_equal = np.abs(ratios[:, 0] / ratios[:, 1] - 1) < max_axis_difference
+    is_for_other_size = ~is_normalised & are_equal & (np.abs(ratios[:, 0] - 1) > min_size_difference)
     scaled = Ks.copy()
-    scaled[normalised, :2] *= size[:, None]
-    other_size &= ~normalised
-    scaled[other_size, :2] /= ratio[other_size, :, None]
+    scaled[is_normalised, :2] *= size[:, None]
+    scaled[is_for_other_size, :2] /= ratios[is_for_other_size, :, None]
     return scaled
 
 
 def array_names(path: Path) -> frozenset[str]:
-    """List the names of the arrays in an ``.npz``; empty if it cannot be read."""
+    """List the names of the arrays in an ``.npz``; empty if the file cannot be read."""
     try:
         if not path.is_file() or not zipfile.is_zipfile(path):
             return frozenset()
@@ -186,7 +188,7 @@ def array_names(path: Path) -> frozenset[str]:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read arrays from an ``.npz`` by name; names that it lacks are left out.
+    """Read arrays from an ``.npz`` by name. Names that the file lacks are left out.
 
     SceneError if the file cannot be read, if an array holds anything but numbers and text, or if the arrays take more
     memory than the file allows.
@@ -212,7 +214,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """Read one array; SceneError if its type is not read, or if its shape does not fit to its bytes."""
+    """Read an array of an ``.npz``; SceneError if it has no numbers or text, or too few bytes for its shape."""
     name, (shape, dtype) = info.filename, _read_header(archive.open(info))
     if dtype.kind not in _KINDS:
         kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
@@ -234,7 +236,7 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def read_matrices(path: Path) -> np.ndarray | None:
-    """Read matrices ``[c,4,4]`` from a ``.npy``; None if it holds other arrays, or numbers that are not finite."""
+    """Read matrices ``[c,4,4]`` from a ``.npy``; None if it holds another array, or numbers that are not finite."""
     with suppress(Exception):  # a damaged file may make the library raise any error
         size, (shape, dtype) = check_file(path), _read_header(path.open("rb"))
         if dtype.kind == "f" and shape[1:] == (4, 4) and 0 < math.prod(shape) * dtype.itemsize <= size:

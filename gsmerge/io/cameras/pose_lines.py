@@ -1,4 +1,4 @@
-"""Read text files with a pose in each line, as DA3-Streaming and VGGT-Long write them, and intrinsics beside them."""
+"""Read text files of DA3-Streaming and VGGT-Long, which have a pose in each line, and the intrinsics beside them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _POSE_COLUMNS = (12, 16)  # possible counts of numbers in a line with a pose
 
 
 def lists_poses(path: Path) -> bool:
-    """Return whether the first line with content in a text file is a pose."""
+    """Return whether the first line of a text file that is not empty is a pose."""
     with suppress(OSError, ValueError, SceneError):
         first = next(filter(str.strip, read_lines(path)), "")
         return len(np.array(_words(first), np.float64)) in _POSE_COLUMNS
@@ -27,17 +27,17 @@ def lists_poses(path: Path) -> bool:
 
 
 def read_poses(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a text file, each line of which lists the 12 or 16 numbers of a pose, row by row.
+    """Read the cameras of a text file. Each of its lines has the 12 or 16 numbers of a pose, row by row.
 
-    The file :data:`INTRINSICS` beside it may have intrinsics in one line for all views, or in a line for each. The size
-    of the views is unknown. SceneError if a line has another count of numbers.
+    The file :data:`INTRINSICS` beside it may have one line of intrinsics for all views, or a line for each view. The
+    size of the views is unknown. SceneError if a line has another count of numbers.
     """
     path, intrinsics = source.path, source.path.parent / INTRINSICS
     poses = _parse(path, read_lines(path), _POSE_COLUMNS)
     Ks: list[np.ndarray | None] = [None]
     if intrinsics.is_file():
-        intrinsic_columns = (4,)  # fx, fy, cx, cy, pixels
-        Ks = [make_pinhole(*row) for row in _parse(intrinsics, read_lines(intrinsics), intrinsic_columns)]
+        # A line has fx, fy, cx and cy in pixels
+        Ks = [make_pinhole(*row) for row in _parse(intrinsics, read_lines(intrinsics), lengths=(4,))]
     if len(Ks) not in (1, len(poses)):
         raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(Ks)}")
     pairs = zip(poses, repeat(Ks[0]) if len(Ks) == 1 else Ks, strict=False)
@@ -45,9 +45,9 @@ def read_poses(source: CameraSource) -> StoredCameras:
 
 
 def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[np.ndarray]:
-    """Parse lines of numbers, and skip empty lines; ``lengths``: the possible counts of numbers in a line.
+    """Parse lines of numbers, and skip empty lines. ``lengths`` are the possible counts of numbers in a line.
 
-    SceneError with the number of the line if one is wrong.
+    SceneError, which says the number of the line, if a line is wrong.
     """
     rows: list[np.ndarray] = []
     for number, line in enumerate(lines, 1):
@@ -65,5 +65,5 @@ def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[n
 
 
 def _words(line: str) -> list[str]:
-    """Split a line into words, at most one more than the largest count of numbers; the last word is then the rest."""
+    """Split a line into words. If it has more words than a pose has numbers, the last word is the rest of the line."""
     return line.split(maxsplit=_POSE_COLUMNS[-1])

@@ -1,4 +1,4 @@
-"""List the views of programs that write them into several lists or files: OpenSfM, Polycam and WorldMirror."""
+"""List the views of OpenSfM, Polycam and WorldMirror, which write the values of a view into several lists or files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsmerge.io.image_names import natural_key, natural_order
 
 
 def list_shots(source: CameraSource) -> list[Entry]:
-    """List the views of OpenSfM's largest reconstruction, which it calls shots, each with its camera."""
+    """List the views of OpenSfM's largest reconstruction, each with its camera. OpenSfM calls views shots."""
     with number_errors(source.path, "expected reconstructions of 'cameras' and 'shots'"):
         largest = max(source.json, key=lambda entry: len(entry["shots"]))
         shots, cameras = dict(largest["shots"]), largest["cameras"]
@@ -25,14 +25,13 @@ def list_shots(source: CameraSource) -> list[Entry]:
             if shot["camera"] not in cameras:
                 problem = f"view {name}: expected one of the 'cameras' in 'camera', found {shot['camera']!r}"
                 raise SceneError(source.path, problem)
-        entries = [Entry(shot, cameras[shot["camera"]], name) for name, shot in shots.items()]
-        if not all(isinstance(entry.shared, dict) for entry in entries):
+        if not all(isinstance(cameras[shot["camera"]], dict) for shot in shots.values()):
             raise TypeError("found a camera that is no object")
-        return entries
+        return [Entry(shot, shared=cameras[shot["camera"]], name=name) for name, shot in shots.items()]
 
 
 def list_keyframes(source: CameraSource) -> list[Entry]:
-    """List the views in a folder of Polycam. Each has a file, with a key for each number of its pose."""
+    """List the views in a folder of Polycam. Each view has a file, with a key for each number of its pose."""
     paths, entries = natural_order(source.path.glob("*.json")), list[Entry]()
     check_camera_count(source.path, len(paths))
     for path in paths:
@@ -44,10 +43,10 @@ def list_keyframes(source: CameraSource) -> list[Entry]:
 
 
 def join_matrices(source: CameraSource) -> list[Entry]:
-    """List WorldMirror's views, whose matrices have the same ``camera_id`` in two lists, extrinsics and intrinsics.
+    """List WorldMirror's views from the lists of extrinsics and intrinsics, in which a view has the same ``camera_id``.
 
-    ``camera_id`` is the stem of the image's name, or a number. Views are in the order of the numbers, or of names in
-    the file's order. SceneError if one of the lists lacks a view.
+    ``camera_id`` is a number, or the stem of the image's name. Views with numbers are sorted by the numbers. Views with
+    names keep the order of the file. SceneError if one of the lists lacks a view.
     """
     poses, Ks = (_matrices_by_id(source, key) for key in ("extrinsics", "intrinsics"))
     if poses.keys() != Ks.keys():
@@ -59,7 +58,7 @@ def join_matrices(source: CameraSource) -> list[Entry]:
 
 
 def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
-    """Return the matrices of the list ``key`` by their ``camera_id``; the last of equal ids counts."""
+    """Return the matrices of the list ``key`` by their ``camera_id``. If ids are equal, the last matrix is taken."""
     entries: Sequence[Mapping[str, Any]] = source.object[key]
     if not isinstance(entries, list):
         raise SceneError(source.path, f"expected {key!r} to be a list, found something else")
@@ -69,7 +68,7 @@ def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
 
 
 def set_centred_size(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
-    """Set the size of views to twice their principal point, if that is whole and equal in all views."""
+    """Set the size of all views to twice their principal point, if this is whole and equal in all views."""
     sides = 2 * np.array([view.K for view in views])[:, :2, 2].reshape(-1, 2) if views else np.zeros((0, 2))
     first_size = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
     are_centred = len(sides) > 0 and bool((np.abs(sides - first_size) <= CENTRED_PX).all())

@@ -1,4 +1,4 @@
-"""Read cameras from a path: find the file in a folder, and the format of the file."""
+"""Read cameras from a path: find their file in a folder, and recognise its format."""
 
 from __future__ import annotations
 
@@ -42,20 +42,25 @@ def list_cameras(folder: Path) -> Iterator[Path]:
 
 
 def _is_camera_folder(folder: Path) -> bool:
-    """Return whether a folder itself is cameras, such as a COLMAP model."""
+    """Return whether a folder is one set of cameras in several files, such as a COLMAP model."""
     return any(row.recognise(CameraSource(folder)) for row in CAMERA_FORMATS if not row.ending)
 
 
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find the only file in a folder that can be read as cameras, whatever its name.
+    """Find the only file in a folder that can be read as cameras, whatever its name; None if there are several or none.
 
-    None if there are several files of cameras, or none.
+    Intrinsics beside poses, and cameras that gsmerge wrote for viewers, are not searched.
     """
-    files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _CANDIDATE_ENDINGS)
-    files = [path for path in files if path.name != INTRINSICS and not path.name.endswith(ENDING)]
-    max_candidates = 16  # most files in a folder that are searched for cameras
-    files = [path for path in files if path.is_file()][:max_candidates]
-    files = [path for path in files if holds_cameras(path)]
+    candidates = [
+        path
+        for path in sorted(folder.glob("[!.]*"))
+        if path.suffix in _CANDIDATE_ENDINGS
+        and path.name != INTRINSICS
+        and not path.name.endswith(ENDING)
+        and path.is_file()
+    ]
+    max_candidates = 16  # most files of a folder that are searched for cameras
+    files = [path for path in candidates[:max_candidates] if holds_cameras(path)]
     return files[0] if len(files) == 1 else None
 
 
@@ -79,10 +84,10 @@ def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
 
     Args:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
-        folder: Folder of the Gaussians, where Long-LRM writes how it moved the cameras; None: the cameras' own folder.
+        folder: Folder of the Gaussians, where Long-LRM writes how it moved the cameras. By default the cameras' folder.
 
     Raises:
-        SceneError: If there are no cameras, a file is damaged or incomplete, or a lens is of an unknown kind.
+        SceneError: If there are no cameras, if a file is damaged or incomplete, or if a camera model is not supported.
 
     Example:
         >>> cameras = gsmerge.read_cameras("demo/transforms.json")
@@ -94,17 +99,17 @@ def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
     source = CameraSource(path, folder)
     format_ = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
     if format_ is None:
-        if isinstance(entries := source.json if ending == ".json" else None, list):
-            check_objects(path, entries)
+        if ending == ".json" and isinstance(source.json, list):
+            check_objects(path, source.json)
         raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
     return format_.cameras(source)
 
 
 def _resolve(path: Path) -> Path:
-    """Return the camera file that a path means, or the folder of the cameras if their format has several files.
+    """Return the camera file to which a path leads, or the folder of the cameras if their format has several files.
 
-    A folder means the camera file in it. A file of a COLMAP model or of keyframes means its folder. SceneError if there
-    are no cameras.
+    A folder leads to the camera file in it. A file of a COLMAP model or of Polycam's keyframes leads to its folder.
+    SceneError if there are no cameras.
     """
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
@@ -114,11 +119,11 @@ def _resolve(path: Path) -> Path:
             check_program(path)
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
         path = camera_path
-    return path if path.is_dir() else _folder_of(path) or path
+    return path if path.is_dir() else _find_whole(path) or path
 
 
-def _folder_of(path: Path) -> Path | None:
-    """Return the folder of a model or of keyframes if a file is part of it; None for any other file."""
+def _find_whole(path: Path) -> Path | None:
+    """Return the folder of the COLMAP model or the keyframes of which a file is a part; None for any other file."""
     check_program(path)
     check_file(path)
     if path.suffix == ".json":
@@ -132,7 +137,7 @@ def _folder_of(path: Path) -> Path | None:
 
 
 def read_sharp_camera(path: Path) -> CameraFile | None:
-    """Read the camera that SHARP writes into its ``.ply``; None without one."""
+    """Read the camera that SHARP writes into its ``.ply``; None if the file has no camera."""
     source = CameraSource(path)
     return SHARP_PLY.cameras(source) if SHARP_PLY.recognise(source) else None
 

@@ -1,4 +1,4 @@
-"""Read the views of a file by its declared layout, a :class:`ViewLayout`."""
+"""Read the views of a file by a :class:`ViewLayout`, which declares the keys of their values."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from gsmerge.kernels.elementary import cos, sin
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's "distortion_params"
 _COEFFICIENTS = (*_DISTORTION, "k5", "k6")
-# Names of camera models with distortion, and of all models that are read besides OPENCV_FISHEYE
+# Camera models with distortion, and all models that are read, without OPENCV_FISHEYE
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PINHOLE_OR_OPENCV = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
 _FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length follows
 
 
 def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
-    """Read the cameras of a file by its layout; if a value is missing or wrong, SceneError names file, view and key."""
+    """Read the cameras of a file by its layout. If a value is missing or wrong, SceneError names file, view and key."""
     entries = layout.views(source) if callable(layout.views) else _list_entries(source, layout.views)
-    shared: dict[int, dict[str, Any]] = {}  # id of an object -> its values, which views share and which may be large
+    shared: dict[int, dict[str, Any]] = {}  # id of an object that views share -> its values, converted only once
     cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
     for i, entry in enumerate(entries):
         names = (entry.values[key] for key in _alternatives(layout.name) if entry.values.get(key) not in (None, ""))
@@ -62,7 +62,7 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
 
 
 def _list_entries(source: CameraSource, key: str) -> list[Entry]:
-    """List the views under a key of a file's object; for the key "", the file itself is the list."""
+    """List the views under a ``key`` of a JSON object. With the key "", the whole file is the list."""
     views = source.object.get(key) if key else source.json
     place = repr(key) if key else "the file"
     if not isinstance(views, list):
@@ -73,17 +73,17 @@ def _list_entries(source: CameraSource, key: str) -> list[Entry]:
 
 
 def _alternatives(key: Key) -> tuple[str, ...]:
-    """Return the keys of a :data:`Key`, the most preferred first."""
+    """Return all names of a :data:`Key`, the most preferred first."""
     return (key,) if isinstance(key, str) else key
 
 
 def _find_value(values: Mapping[str, Any], key: Key) -> Any:
-    """Return the value of the first alternative of a key that has a value; None if no alternative has a value."""
+    """Return the value of a key, under the first of its names that has a value; None if no name has a value."""
     return next((values[name] for name in _alternatives(key) if values.get(name) is not None), None)
 
 
 def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None:
-    """Raise SceneError if a view lacks keys that the layout requires, and name them."""
+    """Raise SceneError, which names the keys, if a view lacks keys that the layout requires."""
     missing: list[Key] = [key for key in layout.pose.keys if entry.values.get(key) is None]
     for key in layout.required_keys:
         if _find_value(entry.values, key) is None and _find_value(entry.shared, key) is None:
@@ -94,11 +94,11 @@ def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None
 
 
 def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert the intrinsics, size and lens in the values of a view, or of the object that views share.
+    """Convert intrinsics, size and lens from the ``values`` of a view, or from values that several views share.
 
-    The result has the keys of ``number_keys``, "K" for a matrix, and "mask". For a lens it has "model", "is_fisheye",
-    "distortion_params" and the coefficients. Keys are left out if the file has no value. Errors are those of
-    :func:`convert_value`.
+    The result has the names of ``number_keys``, "K" for a matrix, and "mask". For a lens it also has "model",
+    "is_fisheye", "distortion_params" and the coefficients. Names are left out if the file has no value. Errors are
+    those of :func:`convert_value`.
     """
     keys = layout.number_keys | ({name: name for name in _COEFFICIENTS} if layout.lens else {})
     camera: dict[str, Any] = {}
@@ -136,9 +136,9 @@ def _two_numbers(values: Any) -> tuple[float, float]:
 def _with_size(
     path: Path, name: str, layout: ViewLayout, values: dict[str, Any], size_of: Callable[[Path], Size]
 ) -> dict[str, Any]:
-    """Return the values of a view, with the size of its image if intrinsics need a size that the file may lack.
+    """Return the values of a view. If the intrinsics need a size and the file has none, read it from the view's image.
 
-    ``size_of`` returns the size of an image. SceneError if intrinsics or the size are missing.
+    ``size_of`` returns the size of an image. SceneError if the intrinsics or the image are missing.
     """
     keys = layout.number_keys
     if not any(key in values for key in _FOCAL):
@@ -157,7 +157,7 @@ def _with_size(
 
 
 def _intrinsics(path: Path, name: str, layout: ViewLayout, values: Mapping[str, Any]) -> np.ndarray:
-    """Return the intrinsics ``[3,3]`` of a view in pixels; if the layout's unit is "pixels", they stay as they are."""
+    """Return the intrinsics ``[3,3]`` of a view, converted to pixels from the unit and origin of the layout."""
     width, height = values.get("w", 0.0), values.get("h", 0.0)
     if isinstance(layout.K, Matrix):
         K = values["K"]
@@ -177,15 +177,15 @@ def _intrinsics(path: Path, name: str, layout: ViewLayout, values: Mapping[str, 
 
 
 def _focal(values: Mapping[str, float], axis: str, side: float) -> float:
-    """Return the focal length along an axis, if need be from the angle of view; 0 if the file has neither.
+    """Return the focal length along an axis, or compute it from the angle of view; 0 if the file has neither.
 
-    ``side``: the image's size along the axis, in pixels.
+    ``side``: pixels of the image along the axis.
     """
     if f"f{axis}" in values:
         return values[f"f{axis}"]
     if f"angle_{axis}" in values:
         half = 0.5 * values[f"angle_{axis}"]
-        with np.errstate(all="ignore"):  # an angle of 0 has no finite focal length, which is refused later
+        with np.errstate(all="ignore"):  # an angle of 0 gives an infinite focal length, which is refused later
             return float(0.5 * side * cos(half) / sin(half))
     return 0.0
 
@@ -195,7 +195,7 @@ _CUT_PANORAMAS = "cut pinhole pictures out of the 360-degree panoramas first, as
 
 
 def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
-    """Return the lens of a view; None for a pinhole, SceneError for a camera model that is not read."""
+    """Return the lens of a view; None for a pinhole, SceneError for a camera model that is not supported."""
     model = values.get("model", "PINHOLE")
     params = {key: values.get(key, 0.0) for key in _COEFFICIENTS}
     if not any(params.values()):
@@ -204,8 +204,8 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
         return make_lens("OPENCV_FISHEYE", "fisheye", [params[key] for key in ("k1", "k2", "k3", "k4")])
     ambiguous = next((key for key in ("k4", "k5", "k6") if params[key]), None)
     if model not in _PINHOLE_OR_OPENCV or ambiguous is not None:
-        reason = f"lens distortion {ambiguous}, which formats understand differently"
-        found = f"camera model {model}" if ambiguous is None else reason
+        distortion = f"lens distortion {ambiguous}, which formats understand differently"
+        found = f"camera model {model}" if ambiguous is None else distortion
         problem = f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {found}"
         is_panorama = any(part in model.lower() for part in _PANORAMAS)
         raise SceneError(path, problem, _CUT_PANORAMAS if is_panorama else "undistort the images first")

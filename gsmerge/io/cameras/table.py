@@ -1,4 +1,4 @@
-"""The table of camera formats: how to recognise a file, how it stores its views, and its convention of poses.
+"""The table of camera formats: how a file is recognised, how it stores its views, and what its poses mean.
 
 Files with a key for each value are read by their :class:`ViewLayout`, and files of other formats by a function.
 """
@@ -39,7 +39,7 @@ class CameraFormat:
     recognise: Callable[[CameraSource], bool] = lambda _: True  # is called only for files with the ending
 
     def cameras(self, source: CameraSource) -> CameraFile:
-        """Read the cameras of a file; SceneError if it is damaged or incomplete."""
+        """Read the cameras of a file; SceneError if the file is damaged or incomplete."""
         stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
         convention = stored.convention or self.convention
         return make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
@@ -56,21 +56,21 @@ def _holds_model(folder: Path, suffix: str) -> bool:
 
 
 def is_keyframes(folder: Path) -> bool:
-    """Return whether a folder holds the cameras of Polycam's keyframes, each in a ``.json``."""
+    """Return whether a folder holds the cameras of Polycam, each in a ``.json``."""
     first_file = min(folder.glob("[!.]*.json"), default=folder)
     return first_file.is_file() and f'"{KEYFRAME}"'.encode() in read_start(first_file)
 
 
 def _has_views_with(source: CameraSource, key: str) -> bool:
-    """Return whether a JSON file has a list ``views`` of objects, any of which has the key."""
+    """Return whether a JSON file has a list ``views`` of objects, and at least one of these has the ``key``."""
     views = source.object.get("views")
     return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any(key in v for v in views)
 
 
-_ARRAY_NAMES, _IS_DA3 = _lazy("npz_files.array_names"), _lazy("npz_files.is_da3")
-_READ_COLMAP, _READ_DA3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3")
+_array_names, _is_da3 = _lazy("npz_files.array_names"), _lazy("npz_files.is_da3")
+_READ_COLMAP, _read_da3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3")
 _LISTS_POSES = _lazy("pose_lines.lists_poses")
-_READ_STATE = LazyFunction("gsmerge.io.formats.gsm", "read_views")
+_read_state_views = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 
 _TRANSFORMS_JSON = ViewLayout(
     views="frames",
@@ -141,7 +141,7 @@ SHARP_PLY = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
     "pixels of the photo", lambda file: read_sharp(file) is not None,
 )  # fmt: skip
-# Rows are tried in this order; a file is read by the first row that has its ending and recognises it
+# A file is read by the first of these rows that has the file's ending and recognises the file
 CAMERA_FORMATS = (
     CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(_READ_COLMAP, suffix=".bin"),
                  W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".bin")),
@@ -172,14 +172,14 @@ CAMERA_FORMATS = (
     CameraFormat("camera_params.json", "`camera_params.json` of WorldMirror", ".json", _WORLD_MIRROR,
                  C2W_OPENCV, "pixels", lambda file: {"extrinsics", "intrinsics"} <= file.object.keys()),
     CameraFormat("dump of a model", "`views.npz` ([below](#models-that-save-no-cameras))", ".npz",
-                 _lazy("npz_files.read_dump"), C2W_OPENCV, "pixels, or divided by the size; may be missing",
-                 lambda file: "c2w" in _ARRAY_NAMES(file.path)),
-    CameraFormat("DA3 npz", "`results.npz` of Depth Anything 3", ".npz", _READ_DA3,
+                 _lazy("npz_files.read_views_npz"), C2W_OPENCV, "pixels, or divided by the size; may be missing",
+                 lambda file: "c2w" in _array_names(file.path)),
+    CameraFormat("DA3 npz", "`results.npz` of Depth Anything 3", ".npz", _read_da3,
                  W2C_OPENCV, "pixels, or divided by the size; may be missing",
-                 lambda file: _IS_DA3(file.path)),
+                 lambda file: _is_da3(file.path)),
     CameraFormat("npz of poses", "`.npz` of what VGGT, or MapAnything or AnySplat (camera-to-world), returns",
-                 ".npz", _READ_DA3, W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
+                 ".npz", _read_da3, W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
     SHARP_PLY,
-    CameraFormat("state", "inside a `.gsm` of gsmerge extend", STATE_ENDING, _READ_STATE, W2C_OPENCV, "pixels"),
+    CameraFormat("state", "inside a `.gsm` of gsmerge extend", STATE_ENDING, _read_state_views, W2C_OPENCV, "pixels"),
 )  # fmt: skip
 CAMERA_ENDINGS = tuple(dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")))

@@ -1,4 +1,4 @@
-"""Classes that declare how a file stores its views: the keys of the pose, intrinsics, size and lens of each view.
+"""Classes that declare how a file stores its views, by the keys of their poses, intrinsics, sizes and lenses.
 
 The table of camera formats holds such declarations, and ``read_views.py`` reads files by them.
 """
@@ -16,14 +16,14 @@ from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, convert_value, to_array
 
-Key = str | tuple[str, ...]  # a key, or several keys; the first key with a value counts
+Key = str | tuple[str, ...]  # a key, or several names of one; the first name with a value is read
 
 
 class Entry(NamedTuple):
-    """One view as a file stores it, before its conversion."""
+    """One view as a file stores it, before it is converted."""
 
     values: Mapping[str, Any]  # values of this view alone
-    shared: Mapping[str, Any] = {}  # values of several views, such as those of one camera, for missing values
+    shared: Mapping[str, Any] = {}  # values that several views share, read where ``values`` have none
     name: str = ""  # name of its image, if no value has it
     path: Path | None = None  # the view's own file, if each view has a file
 
@@ -34,7 +34,7 @@ class Matrix:
 
     Args:
         key: The key.
-        shape: The matrix's shape, if a file may list its numbers without rows; None: files list rows.
+        shape: Shape of the matrix if a file may list its numbers without rows. None if files list its rows.
     """
 
     key: str
@@ -50,7 +50,7 @@ class Matrix:
         return np.asarray(convert_value(self._to_matrix, self.key, values[self.key]))
 
     def _to_matrix(self, value: Any) -> np.ndarray:
-        """Convert a value of the file to the matrix."""
+        """Convert the value that the file stores to the matrix."""
         array = to_array(value)
         return array if self.shape is None else array.reshape(self.shape)
 
@@ -61,20 +61,21 @@ def rotation_of_matrix(numbers: np.ndarray) -> np.ndarray:
 
 
 def rotation_of_vector(numbers: np.ndarray) -> np.ndarray:
-    """Return the rotation ``[3,3]`` about the direction of a vector ``[3]``, whose length is the angle in radians."""
+    """Return the rotation ``[3,3]`` about a vector ``[3]``, by its length as the angle in radians."""
     motion = np.concatenate([numbers.reshape(1, 3), np.zeros((1, 3))], 1)
     return motion_matrices(motion)[0, :3, :3]
 
 
 @dataclass(frozen=True, eq=False)
 class RotationAndShift:
-    """A pose ``[3,4]`` under two keys, one for its rotation and one for its last column.
+    """A pose ``[3,4]`` under two keys: one for its rotation, one for its last column.
 
     Args:
         rotation: Key of the rotation.
         shift: Key of the last column, which is the camera's centre if poses are camera-to-world.
-        to_matrix: Makes the rotation ``[3,3]`` from the numbers under its key: :func:`rotation_of_matrix`,
-            :func:`rotation_of_vector`, or :func:`gsmerge.geometry.transforms.quat_to_rotmat` for quaternions wxyz.
+        to_matrix: Function that makes the rotation ``[3,3]`` from the numbers under its key. It is
+            :func:`rotation_of_matrix`, :func:`rotation_of_vector`, or for quaternions wxyz
+            :func:`gsmerge.geometry.transforms.quat_to_rotmat`.
     """
 
     rotation: str
@@ -95,15 +96,15 @@ class RotationAndShift:
 
 @dataclass(frozen=True)
 class PinholeKeys:
-    """Intrinsics with a key for each number; views without an optional number have the defaults below.
+    """Intrinsics with a key for each number. If a view has no value for an optional key, a default is taken.
 
     Args:
-        fx: Key of the horizontal focal length. A view without it has square pixels.
-        fy: Key of the vertical focal length. A view without it has square pixels.
-        cx: Key of the principal point's x. A view without it has the principal point in the middle of the image.
-        cy: Key of the principal point's y, with the same default.
+        fx: Key of the horizontal focal length; by default it equals the vertical one.
+        fy: Key of the vertical focal length; by default it equals the horizontal one.
+        cx: Key of the principal point's x; by default the point is in the middle of the image.
+        cy: Key of the principal point's y; by default the point is in the middle of the image.
         angle_x: Key of the horizontal field of view in radians, for views without ``fx``; "" if there is none.
-        angle_y: Key of the vertical field of view, for views without ``fy``.
+        angle_y: Key of the vertical field of view in radians, for views without ``fy``; "" if there is none.
     """
 
     fx: Key
@@ -116,26 +117,26 @@ class PinholeKeys:
 
 @dataclass(frozen=True)
 class ViewLayout:
-    """The place of a file's list of views, and the keys of a view's values.
+    """Where a file has its list of views, and under which keys a view has its values.
 
-    A value of null counts as missing. If a view lacks a value other than its name and pose, the value of the object
-    with the list of views is taken.
+    A value of null counts as missing. If a view lacks a value other than its name and pose, the value is taken from the
+    object that has the list of views.
 
     Args:
         pose: The pose, in the convention of the format.
         K: The intrinsics: a key for each number, or a matrix ``[3,3]``.
-        views: Key of the list of views; "" if the file itself is the list; or a function that lists them.
+        views: Key of the list of views, "" if the whole file is the list, or a function that lists the views.
         name: Key of the image's name. Views without a name are called "view 0", "view 1" and so on.
         size: Keys of width and height in pixels, or the key of a list [height, width]; "" if the file has no size.
         unit: Unit of the intrinsics: a pixel, the image's width and height, or its larger side. If all intrinsics in
-            "pixels" are small, they count as shares of width and height, see :func:`make_camera_file`.
-        origin: The point of the image from which the principal point is measured: the upper left corner or the middle.
-        lens: Key of the camera model; the coefficients have the keys k1, k2 and so on. "": views are pinholes.
-        models: The program's names of camera models -> COLMAP's names; equal names are left out.
-        optional: Keys that a view may lack. A view without a size has the size of its image. If no view of the file
-            has a focal length, it is estimated later.
+            "pixels" are small, they are taken as shares of width and height, see :func:`make_camera_file`.
+        origin: Point from which the principal point is measured: the upper left corner or the middle of the image.
+        lens: Key of the camera model, "" if all views are pinholes. The keys of the coefficients are k1, k2 and so on.
+        models: The program's name of a camera model -> COLMAP's name. Names that are equal are left out.
+        optional: Keys that a view may lack. A size that is missing is read from the view's image. If no view of the
+            file has a focal length, it is estimated later.
         mask: Key of the name of the image's mask; "" if there is none.
-        finish: A function that completes the views from other content of the file or folder; None: nothing to add.
+        finish: Function that completes the views from other content of the file or folder; None if none is needed.
     """
 
     pose: Matrix | RotationAndShift
@@ -160,7 +161,7 @@ class ViewLayout:
 
     @property
     def required_keys(self) -> list[Key]:
-        """Keys of intrinsics, size and lens that each view must have, or the object that views share."""
+        """Keys of intrinsics, size and lens that must have a value in each view, or in the object that views share."""
         keys = [key for name, key in self.number_keys.items() if not name.startswith("angle")]
         keys += [self.K.key] if isinstance(self.K, Matrix) else []
         keys += [key for key in (self.size, self.lens) if isinstance(key, str) and key]

@@ -1,4 +1,4 @@
-"""Encode cameras for viewers: as INRIA's ``cameras.json``, and as settings of SuperSplat's viewer."""
+"""Encode cameras for viewers, as INRIA's ``cameras.json`` and as settings of SuperSplat's viewer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmerge.types import Cameras
 
 ENDING = ".cameras.json"
 TRACK = "gsmerge"  # name of the camera track in settings that gsmerge writes
-# Effects of SuperSplat's viewer, all disabled, with the numbers that its settings must have
+# Effects of SuperSplat's viewer, with the numbers that settings must have even if the effects are disabled
 _EFFECTS: dict[str, dict[str, Any]] = {
     "sharpness": {"amount": 0}, "bloom": {"intensity": 1, "blurLevel": 2},
     "grading": {"brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
@@ -37,12 +37,12 @@ def viewer_cameras_path(output: Path) -> Path:
 def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     """Return the text of cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers.
 
-    :func:`gsmerge.read_cameras` reads it. Viewers assume that the principal point is in the middle. If it is not, it is
-    written as ``cx`` and ``cy``, which viewers ignore.
+    :func:`gsmerge.read_cameras` reads this file. Viewers assume that the principal point is in the middle. A principal
+    point that is not there is written as ``cx`` and ``cy``, which viewers ignore.
     """
 
     def principal_point(K: np.ndarray) -> dict[str, float]:
-        """Return the entries of a principal point; empty if it is in the middle."""
+        """Return the entries of a principal point; empty if the point is in the middle."""
         centred = np.allclose(2 * K[:2, 2], (cameras.width, cameras.height), rtol=0, atol=CENTRED_PX)
         return {} if centred else {"cx": float(K[0, 2]), "cy": float(K[1, 2])}
 
@@ -59,7 +59,7 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
 
 
 def order_views(cameras: Cameras) -> list[int]:
-    """Return the numbers of the views, the one nearest to the median centre and the mean viewing direction first."""
+    """Order views by their distance from the median centre and the mean direction; return their numbers."""
     if len(cameras) == 0:
         return []
     centres, forward = camera_centres(cameras.viewmats), cameras.viewmats[:, 2, :3]
@@ -69,21 +69,22 @@ def order_views(cameras: Cameras) -> list[int]:
 
 
 def vertical_field(cameras: Cameras, view: int) -> float:
-    """Return the vertical field of a view in radians, rounded so that it is equal on every processor."""
+    """Return the vertical field of view in radians, rounded so that it is equal on every processor."""
     return round(2 * math.atan(cameras.height / (2 * float(cameras.Ks[view, 1, 1]))), 9)
 
 
 def is_own_settings(path: Path) -> bool:
-    """Return whether a file of settings is of :func:`viewer_settings`, by the name of its track."""
+    """Return whether gsmerge wrote a file of settings, as the name of its track shows."""
     return f'"{TRACK}"' in path.read_text(encoding="utf-8", errors="replace")
 
 
 def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
-    """Return the text of settings that tell SuperSplat's viewer where to look from (its ``settings.json``, version 2).
+    """Return the text of a ``settings.json``, version 2, which tells SuperSplat's viewer where to look from.
 
     The camera is the first of :func:`order_views`. Its target lies at the median depth of the ``means [n,3]`` in front
     of it. The viewer turns the scene by half a turn about z, and takes the field of view for that of the longer side.
-    Without a track its camera would move. The track here has two keys, which are both this view.
+    The settings have a camera track with two keys, both at this camera, because without a track the viewer would move
+    its camera.
     """
     view = order_views(cameras)[0]
     forward, centre = cameras.viewmats[view, 2, :3].astype(np.float64), cameras.centres[view].astype(np.float64)
@@ -102,10 +103,10 @@ def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
         "name": TRACK, "duration": 1, "frameRate": 1, "loopMode": "none", "interpolation": "spline", "smoothness": 1,
         "keyframes": keys,
     }  # fmt: skip
-    off = {name: {"enabled": False, **zeros} for name, zeros in _EFFECTS.items()}
+    effects = {name: {"enabled": False, **numbers} for name, numbers in _EFFECTS.items()}
     settings = {
         "version": 2, "tonemapping": "none", "highPrecisionRendering": False, "background": {"color": [0, 0, 0]},
-        "postEffectSettings": off, "animTracks": [track], "cameras": [{"initial": pose}], "annotations": [],
+        "postEffectSettings": effects, "animTracks": [track], "cameras": [{"initial": pose}], "annotations": [],
         "startMode": "animTrack",
     }  # fmt: skip
     return json.dumps(settings) + "\n"

@@ -73,7 +73,7 @@ def test_unknown_colmap_models_are_refused(
 def test_a_model_that_shrinks_while_it_is_read(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     """The message is one line. Reading mapped pages beyond the end would end the process by a signal."""
     write_colmap_binary(tmp_path, tiny)
-    path, make_pose = tmp_path / "images.bin", colmap._pose
+    path, make_pose = tmp_path / "images.bin", colmap._make_pose
     data = path.read_bytes()
     end = data.index(b"\0", 72) + 1  # of the first image's name; points follow it
     path.write_bytes(data[:end] + struct.pack("<Q", 50_000) + bytes(24 * 50_000) + data[end + 8 :])
@@ -82,7 +82,7 @@ def test_a_model_that_shrinks_while_it_is_read(tmp_path: Path, tiny: Tiny, monke
         os.truncate(path, 4096)
         return make_pose(numbers)
 
-    monkeypatch.setattr(colmap, "_pose", pose_then_cut)
+    monkeypatch.setattr(colmap, "_make_pose", pose_then_cut)
     with refuses(SceneError, tmp_path, "damaged", "images.bin"):
         read_cameras(tmp_path)
 
