@@ -19,7 +19,7 @@ from gsmerge.types import Cameras, Gaussians
 
 MOST_SCORED = 12  # a fit is scored on at most this many photos
 ENOUGH_PHOTOS = 6  # a survey needs no further photo of a Gaussian if the centre of the Gaussian is inside this many
-# A photo is added to a survey if more than this share of its Gaussians has fewer photos than ENOUGH_PHOTOS
+# A photo is added to a survey if more than this share of its Gaussians is inside fewer than ENOUGH_PHOTOS photos
 FEWER_SHARE = 0.03
 
 
@@ -35,7 +35,7 @@ class Survey:
     pixels: np.ndarray  # [n] float32 size of the finest pixel that shows the Gaussian, world units; inf if none does
 
     def visible(self, min_weight: float) -> np.ndarray:
-        """Return a mask ``[n]`` of Gaussians with a weight of at least ``min_weight``, or outside of all frustums."""
+        """Return a mask ``[n]`` of the Gaussians with a peak of at least ``min_weight``, or outside of all frustums."""
         return ~self.inside | (self.peaks >= min_weight)
 
     def __getitem__(self, rows: np.ndarray) -> Survey:
@@ -46,7 +46,7 @@ class Survey:
 def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
     """Draw Gaussians at the cameras of half-size photos, and measure what each photo shows of each Gaussian.
 
-    :func:`choose_photos` chooses the photos. The size of the finest pixel is that of a pixel of the largest photos.
+    :func:`choose_photos` chooses the photos. The sizes of pixels are those of the largest photos of the fit.
     """
     photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
@@ -76,7 +76,7 @@ def choose_photos(gaussians: Gaussians, photos: Photos) -> list[int]:
 
     A photo shows something new if many of its Gaussians are inside fewer than ``ENOUGH_PHOTOS`` of those chosen so far.
     """
-    sample_gaussians = 4096  # at most about twice this many Gaussians are looked at
+    sample_gaussians = 4096  # a sample of about this many Gaussians, at most twice as many, is projected
     means = gaussians.means[:: max(1, len(gaussians) // sample_gaussians)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
     inside = (depths > NEAR_PLANE) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
@@ -95,7 +95,7 @@ def choose_scored_photos(count: int) -> list[int]:
 
 
 def spread_views(count: int) -> list[int]:
-    """Return the indices of ``count`` views in an order whose first ones, however many, spread evenly over all."""
+    """Return the indices of ``count`` views in such an order that any number of the first is spread evenly over all."""
     # the order of the reversed bits of the numbers (van der Corput)
     return sorted(range(count), key=lambda view: f"{view:032b}"[::-1])
 
@@ -120,7 +120,7 @@ def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> flo
     options, views = run.job.options, choose_scored_photos(len(half))
     if not options.scored:
         return float("nan")
-    return holdout_psnr(images, half[views], [run.weights[view] for view in views], options.tuning.min_gain)
+    return holdout_psnr(images, half[views], [run.score_weights[view] for view in views], options.tuning.min_gain)
 
 
 def score_state(state: FitState, run: FitRun, half: Photos) -> float:
@@ -130,7 +130,7 @@ def score_state(state: FitState, run: FitRun, half: Photos) -> float:
 
 
 def photo_mses(gaussians: Gaussians, photos: Photos) -> np.ndarray:
-    """Return the mean squared error ``[v]`` of the render of each whole photo, raised above 0 so that it can divide."""
+    """Return the mean squared error ``[v]`` of the render of each whole photo, always above 0 for use as a divisor."""
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
         return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))

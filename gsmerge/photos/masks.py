@@ -103,7 +103,7 @@ class MaskFiles:
         return whole
 
     def _reduce(self, levels: np.ndarray, view: int) -> np.ndarray:
-        """Average the brightness of a mask over each pixel of the view."""
+        """Reduce a mask to the size of the view, by the mean of its ``levels`` in each pixel."""
         whole = cv2.resize(levels, self.stored, interpolation=cv2.INTER_NEAREST)
         shown = self.cut(view, whole[..., None].repeat(3, -1))[..., 0]
         size = self.cameras.width, self.cameras.height
@@ -120,8 +120,8 @@ def read_masks(
 ) -> tuple[Masks, list[str]]:
     """Read the masks of a scene's photos; return them and notes.
 
-    Masks that the cameras' file names are used rather than those beside the scene. ``stored`` and ``cut`` are those of
-    :class:`MaskFiles`. SceneError if masks are photos.
+    If the cameras' file names masks, these are used, and otherwise masks beside the scene. ``stored`` and ``cut`` are
+    fields of :class:`MaskFiles`. SceneError if masks are photos.
     """
     paths = photos.paths
     views = [view for view in range(len(camera_file)) if not paths or paths[view] is not None]  # with a photo
@@ -165,7 +165,7 @@ def _refuse_photos(
     """
     of_views = {view: mask for view, mask in enumerate(masks) if mask is not None}
     doubts = parallel_map(lambda view: _doubt_mask(of_views[view], photos, view), of_views)
-    if 2 * sum(doubts) > len(of_views):
+    if 2 * sum(doubts) > len(of_views):  # a single mask with an infinite doubt is enough
         doubtful = [of_views[view].name for view, doubt in zip(of_views, doubts, strict=True) if doubt]
         expected = f"expected black, white and grey pictures for --{option}, found {len(doubtful)} of {len(of_views)}"
         problem = f"{expected} that look like photos, {list_some(doubtful)}"
@@ -173,10 +173,10 @@ def _refuse_photos(
 
 
 def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
-    """Return whether a mask looks like a photo: infinity if it is one for certain, 1 if it may be one, 0 otherwise.
+    """Return infinity if a mask is a photo for certain, 1 if it may be a photo, and 0 otherwise.
 
-    A picture of several colours is a photo for certain. A grey picture may be one if it changes from pixel to pixel as
-    the photo of its view does. But if most of its pixels have one of two levels, it is a mask with soft edges.
+    A picture of several colours is a photo for certain. A grey picture may be a photo if it changes from pixel to
+    pixel as the photo of its view does. But if most of its pixels have one of two levels, it is a mask with soft edges.
     """
     picture = np.rint(decode_small(mask, OFFSET_PIXELS) * _WHITE)
     spread = np.ptp(picture, axis=-1)
@@ -229,7 +229,7 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
 
 
 def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], list[str]]:
-    """Find the mask of each view that a camera file names; return the masks and a note on files that are not there.
+    """Find the masks that a camera file names; return the mask of each view, and a note on masks that do not exist.
 
     SceneError for a file outside the folder of the cameras.
     """

@@ -39,11 +39,11 @@ def has_bars(scene: Scene) -> bool:
 def choose_part(
     scene: Scene, proposal: Proposal, camera_file: CameraFile, grid_fit: GridFit | None = None
 ) -> Proposal | None:
-    """Find the part of the proposed photos that shows the views, and return a proposal that uses it.
+    """Find the part of the proposed photos that shows the views, and return a proposal that uses this part.
 
-    None if no part fits better than whole photos, or if the best part does not explain the views either
-    (:meth:`Assigner.explain_most`). None also if photos differ in shape or have orientation tags. ``grid_fit`` is the
-    fit of whole photos to a grid whose cameras were estimated.
+    None if no part fits better than whole photos, or if even the best part does not look like the views
+    (:meth:`Assigner.explain_most`). None also if photos differ in shape or have orientation tags. ``grid_fit`` is how
+    whole photos were resized, if the cameras were estimated.
     """
     proposal = proposal.without_broken() or proposal
     named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
@@ -66,7 +66,7 @@ def choose_part(
 
     pictures, bars = zip(*parallel_map(read, range(len(photos))), strict=True)
     left, above, right, below = np.median(bars, 0).tolist()
-    inner = left, above, 1 - right, 1 - below
+    inner = left, above, 1 - right, 1 - below  # the part inside of bars
     shape = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
     fits: list[GridFit | PartFit] = [] if grid_fit is None else [grid_fit]
     if grid_fit is None:

@@ -1,9 +1,9 @@
 """Score how similar photos and pictures of views are, in units of the noise of wrong pairs.
 
-A photo and a view are a wrong pair if the photo does not show the view. A photo and a picture are compared by the
-correlation of their local contrast at two sizes. Exposure, white balance and soft colours hardly change it. Fisher's z
-of a correlation has the same spread for all values. Nearly all pairs of a scene are wrong, so the median absolute
-deviation of all z is the noise of wrong pairs.
+A photo and a view are a wrong pair if the photo does not show the view. The similarity of a photo and a picture is the
+correlation of their local contrast at two sizes. Exposure, white balance and soft colours hardly change it.
+Correlations are converted to Fisher's z, whose noise does not depend on its value. Nearly all pairs of a scene are
+wrong, so the median absolute deviation of all z is the noise of wrong pairs.
 """
 
 from __future__ import annotations
@@ -108,7 +108,10 @@ class Comparer:
 
 
 def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
-    """Make filters for photos that are stored turned by one of these numbers of quarter turns, mirrored or not."""
+    """Make filters for photos that are stored turned by any of the numbers ``quarters`` of quarter turns.
+
+    There is one filter for each view and number, and one more for the mirrored photo.
+    """
     orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
     products, weights, lengths = [], [], []
     for picture, weight in zip(small.pictures, small.weights, strict=True):
@@ -124,7 +127,7 @@ def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
 
 
 def _correlate(photos: Sequence[np.ndarray], filters: _Filters) -> np.ndarray:
-    """Return the correlations ``[p,v·t]`` of the contrast of photos with all filters."""
+    """Return the correlations ``[p,v·t]`` of the contrast of p photos with the filters of v views in t orientations."""
     contrast = np.stack([find_contrast(shrink_pictures(photo[None], *filters.size)[0]) for photo in photos])
     products = matmul(filters.products, contrast.reshape(len(photos), -1).T)
     squares = matmul(filters.weights, (contrast * contrast).sum(-1).reshape(len(photos), -1).T)

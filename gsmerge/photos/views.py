@@ -30,7 +30,7 @@ def even_views(num_views: int, count: int) -> list[int]:
 def scored_views(num_views: int) -> list[int]:
     """Return the ids of the views on which a whole scene is scored: all, or ``MAX_SCORED_VIEWS`` evenly spaced ones.
 
-    The unmerged input is rendered in each of them. With all views of a large scene this would take most of a run.
+    The limit saves time, because the unmerged input is rendered in each of these views.
     """
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
@@ -63,9 +63,9 @@ def camera_kinds(cameras: Cameras) -> np.ndarray:
 
 
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
-    """Return the ids of distinct views, which equal no earlier view, and for every view which of these it equals.
+    """Return the ids of the views that repeat no earlier view, and for every view the index in this list of its equal.
 
-    The second list has indices into the first. Two views are equal if camera, photo, masks and Gaussians are.
+    Two views are equal if their cameras, photos, masks and Gaussians are equal.
     """
     kinds = camera_kinds(scene.cameras)
     distinct, indices = list[int](), list[int]()
