@@ -13,8 +13,8 @@ from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 STREAMED_LEVELS = 3  # levels of detail of a lod-meta.json; the coarsest, a sixteenth of the Gaussians, loads at once
 LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the next finer one
 FEW_PIXELS = 1 << 18  # pixels of a few small photos
-# A scene has few Gaussians if it has less than this number per pixel of the photos, of which at most FEW_PIXELS pixels
-# count. The superpixels are then a share of the pixels, but at most this share of the Gaussians
+# A scene has few Gaussians if it has fewer than this number per pixel of its photos. At most FEW_PIXELS pixels count.
+# The number of superpixels is then a share of the pixels, but at most FEW times the number of Gaussians
 FEW = 0.5
 
 
@@ -24,9 +24,9 @@ def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int |
     ``num_input`` is the number that a share refers to, and ``sh_degree`` decides how many Gaussians a file holds.
     """
     device = DEVICES.get(str(options.budget))
-    if device is not None:  # a device only sets a limit, unless it is to be filled or the useful number is known
-        device_limit = num_input if options.fill else options.most
-        return None if device_limit is None else min(device, device_limit)
+    if device is not None:  # a device requests a number if the option says to fill it, or if the useful number is known
+        num_useful = num_input if options.fill else options.most
+        return None if num_useful is None else min(device, num_useful)
     if options.budget in (None, AUTO):
         return None
     limit = num_input if options.most is None else options.most
@@ -134,8 +134,8 @@ def count_limits(
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
     """Return the number of superpixels per view.
 
-    A share is a share of the pixels. If views have no Gaussians of their own, it is a share of the Gaussians if these
-    are fewer, unless the scene has only few Gaussians.
+    If the option is a share, it refers to the pixels. If views have no Gaussians of their own, and there are fewer
+    Gaussians than pixels, it refers to the Gaussians. In scenes of few Gaussians (:data:`FEW`) there are more.
     """
     per_view = count_for(segment, scene.height, scene.width)
     if scene.has_own_pixels or segment.per_view is not None:

@@ -21,7 +21,7 @@ MOSTLY = 0.5  # share of a pixel's opacity above which it shows mostly the insid
 
 
 def find_region(crop: str) -> Region:
-    """Return the region of a crop, in world units."""
+    """Return the region that the text of a crop describes, in world units."""
     shape, parsed = parse_crop(crop)
     numbers = np.array(parsed)
     if shape == "sphere":
@@ -47,8 +47,8 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
     if count == 0:
         remedy = "gsmerge inspect shows the extent of the scene"
         raise UsageError(f"crop: expected Gaussians of the scene in {crop}, found none; {remedy}")
-    reach = float(np.abs(region.middle).max() + region.half.max())
-    scene = replace(scene, region=replace(region, rounding=float(np.finfo(means.dtype).eps) * reach))
+    largest = float(np.abs(region.middle).max() + region.half.max())  # largest coordinate in the region
+    scene = replace(scene, region=replace(region, rounding=float(np.finfo(means.dtype).eps) * largest))
     if count == scene.num_gaussians:
         return scene
     note(f"crop: {count:,} of {scene.num_gaussians:,} Gaussians are inside; counts, fit and scores refer to these")
