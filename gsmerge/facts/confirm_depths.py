@@ -1,9 +1,9 @@
 """Scene with pixels -> the share of its depth that other views confirm, which predicts whether a fit can succeed.
 
-Each pixel's Gaussian is projected into the other views. The Gaussian in front there is projected back. If it returns
-near the pixel, at about the same depth, the depth of the pixel is confirmed. It is contradicted if more views see
-through it than confirm it, and alone if its position is outside of all other views. A pixel does not count if other
-views have no Gaussian at its position, for example beyond a crop.
+Each pixel's Gaussian is projected into the other views. The Gaussian in front at that place is projected back. If it
+returns near the pixel, at about the same depth, the other view confirms the pixel. A pixel is contradicted if more
+views see through its surface than confirm it, and alone if its position is outside of all other views. A pixel does not
+count if other views have no Gaussian at its position, for example beyond a crop.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ MOST_PER_PIXEL, FEWEST, SOUND_SHARE, WRONG_SHARE = 0.07, parse_share(SHARE), 0.7
 class Agreement:
     """Shares of a scene's pixels whose depth other views confirm or contradict, or that no other view sees."""
 
-    confirmed: float  # At least one view confirms the depth, and no more views see through it
+    confirmed: float  # A view confirms the depth, and no larger number of views sees through it
     contradicted: float  # More views see through it than confirm it
     alone: float  # No other view sees the position
     num_pixels: int = field(default=CONFIRM_PIXELS, compare=False)  # Number of sampled pixels that count

@@ -27,7 +27,7 @@ from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels
 # of its pixels shows mainly such Gaussians. In fifteen captures in voxels, at most .001 of the Gaussians are outside of
 # all views. Two of the four views of a narrow capture miss .02, and two of the five views of another one .006
 LEAST_OUTSIDE = 0.005
-SOURCES, STEPS_BACK = 4, 8  # most views beside which cameras are placed, and number of cameras for each that step back
+SOURCES, STEPS_BACK = 4, 8  # number of views beside which cameras are placed, and of steps back from each
 # Bounds of the steps: back as a share of the depth, rotation to the sides, and rotation up or down, both in degrees
 BESIDE_LOW, BESIDE_HIGH = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
 

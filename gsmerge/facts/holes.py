@@ -34,8 +34,8 @@ HOLE_OPACITY = 0.75  # opacity of the drawing below which a pixel is empty
 # is below the share NOTHING. It is in an empty part only if the mean opacity around it is below the share SPARSE
 NOTHING, SPARSE = 0.5, 0.25
 # A part stays empty if a square with the side LARGE_SIDE, a share of the picture's longer side, fits into it. All such
-# squares together must cover at least the share LARGE_AREA of the picture. A rim of RIM_PIXELS pixels of the part is
-# filled
+# squares together must cover at least the share LARGE_AREA of the picture. A rim of RIM_PIXELS pixels is taken off the
+# part
 LARGE_SIDE, LARGE_AREA, RIM_PIXELS = 1 / 12, 0.12, 2
 GAP_WIDTH = 1 / 53  # beside large empty parts, only gaps narrower than this share of the longer side are filled
 MOST_EMPTY = 0.5  # from this share of empty pixels on, the scene may be only a part of what the photos show
@@ -101,7 +101,7 @@ def _find_empty(opacity: np.ndarray, shown: np.ndarray, gap: int, *, is_cropped:
     if is_cropped:
         beside = np.ones((3, 3), np.uint8)  # a Gaussian never ends exactly between two pixels
         return np.asarray(cv2.erode((nothing & ~shown).astype(np.uint8), beside) > 0)
-    sparse = blur(opacity, gap / 4) < SPARSE * usual  # so edges of a scene that was cut out do not count
+    sparse = blur(opacity, gap / 4) < SPARSE * usual  # edges of a scene that was cut out are not sparse
     return large_parts(nothing & sparse)
 
 

@@ -1,10 +1,10 @@
 """Scene -> the scene with its cameras, and the Gaussians of their pixels, moved to poses at which the photos agree.
 
-Poses that a network predicts are wrong by some pixels. Its Gaussians have the same error, so every view agrees with
-itself but not with other views. The pixels of a view, at their depths, are projected into the photos of its neighbours.
-All poses are moved at once until the greys agree. This is direct image alignment (Engel et al., "Direct Sparse
-Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. If one step at the smallest size shows
-that the poses are right, the scene stays unchanged bit for bit.
+Poses that a network predicts are wrong by some pixels. The Gaussians of a view have the same error as its pose, so
+every view agrees with itself but not with other views. The pixels of a view, at their depths, are projected into the
+photos of its neighbours. All poses are moved at once until the greys agree. This is direct image alignment (Engel et
+al., "Direct Sparse Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. If one step at the
+smallest size shows that the poses are right, the scene stays unchanged bit for bit.
 
 Highlights move over their surfaces with the camera, and so look like wrong poses. The comparison therefore expects the
 changes of colour that the harmonics describe. New poses are kept only if the fine detail of the photos agrees no worse
@@ -42,11 +42,11 @@ POSE_PIXELS = 1500  # compared pixels of a view, those with the largest gradient
 # numbers are small, because scenes with right poses need this time, too
 FIRST_PIXELS, FIRST_STEPS = 600, 2
 POSE_NEIGHBOURS = 4  # number of other views with which a view is compared
-POSE_STEPS = 6  # most Gauss-Newton steps at each size
+POSE_STEPS = 6  # largest number of Gauss-Newton steps at each size
 TOGETHER = 16  # pairs of views that one task compares
 POSE_BLUR = 0.7  # blur of the photos, standard deviation in pixels
 # Detail of photos is finer than this blur, in pixels. Highlights are smooth. If new poses follow highlights, the detail
-# of surfaces agrees less than before. If it does so by more than CHANCE standard errors, the new poses are dropped
+# of surfaces agrees less than before. New poses are dropped if the loss is above CHANCE standard errors
 DETAIL, CHANCE = 2.0, 2.0
 # Errors of poses are assumed to have these standard deviations: PRIOR_TURN in radians, and PRIOR_SHIFT in canonical
 # units. PRIOR is the weight of this assumption
@@ -99,7 +99,7 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
     pairs = _choose_pairs(scene, views)
     sides = [side for side in SIDES if side < largest] or [largest]
-    min_side = 24  # least number of pixels of the shorter side at the first size; smaller photos say too little
+    min_side = 24  # pixels of the shorter side at the first size; smaller photos say too little
     if len(pairs) == 0 or shortest * sides[0] < min_side * largest:
         return None
     viewmats = start
@@ -132,7 +132,7 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
         points = scene.gaussians.means[rows[rows >= 0]].astype(np.float64)
         inside, _ = see_points(points, viewmats, Ks, anywhere, cameras.width, cameras.height, NEAR_PLANE, 1.0)
         seen_shares = inside.mean(1) if len(points) else np.zeros(len(inside))
-        cosines = matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3])  # of the viewing directions
+        cosines = matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3])  # between viewing directions
         overlap = seen_shares * cosines.clip(0)
         ranked = [int(i) for i in np.argsort(-overlap, kind="stable") if i != view and i in candidates]
         for neighbour in ranked[:POSE_NEIGHBOURS]:
@@ -261,7 +261,7 @@ def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:
 
 
 def _view_flows(level: _PhotoLevel, evidence: _Evidence) -> np.ndarray:
-    """Return the shift ``[v]``, in pixels, of the pixels of each view since the input: the median over its pairs."""
+    """Return by how many pixels ``[v]`` the points of each view have moved since the input, the median of its pairs."""
     flows = [evidence.flows[(level.pairs == view).any(1)] for view in range(len(level.first_viewmats))]
     return np.array([median(view_flows) if len(view_flows) else 0.0 for view_flows in flows])
 

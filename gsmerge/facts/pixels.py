@@ -57,7 +57,7 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
     step = max(1, len(g) // ESTIMATE_GAUSSIANS)
     units = measure_pixel_sizes(g.means[::step], homes[::step], cameras)
-    if by_distance:  # a sample of the Gaussians of a surface lies farther apart
+    if by_distance:  # the Gaussians of a sample are farther apart than all Gaussians
         units = np.minimum(units, find_nearest(g.means[::step], 1)[1][:, 0] / math.sqrt(step))
     if (g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units).mean() < FEWEST_HIDDEN:
         return scene

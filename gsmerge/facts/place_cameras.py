@@ -20,8 +20,8 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
-NUM_VIEWS = 24  # most cameras that are placed
-HELD_OUT = 8  # one in so many placed cameras is held out from the fit, for scores
+NUM_VIEWS = 24  # largest number of cameras that are placed
+HELD_OUT = 8  # every HELD_OUT-th placed camera is not used in the fit, but only for scores
 FITTED = 16  # cameras of each kind to which a scene without cameras is fitted; on a walk half as many
 CANDIDATE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
 AROUND_CAMERAS = 40  # candidate cameras around the scene
@@ -82,7 +82,8 @@ def place_inside(gaussians: Gaussians) -> Cameras | None:
     if viewer is None:
         return None
     size = int(np.clip(round(INSIDE_FIELD / (INSIDE_PIXEL * viewer.angle)), SMALLEST_PIXELS, LARGEST_PIXELS))
-    radii = viewer.free * power(np.arange(NUM_VIEWS) * GOLDEN / np.pi % 1, 1 / 3)  # spread evenly in the free ball
+    # cube roots, so that the cameras fill the empty ball evenly
+    radii = viewer.free_radius * power(np.arange(NUM_VIEWS) * GOLDEN / np.pi % 1, 1 / 3)
     eyes = viewer.place + radii[:, None] * spread_directions(NUM_VIEWS)[::-1]
     viewmats = np.stack(
         [_look_along(eye, direction) for eye, direction in zip(eyes, spread_directions(NUM_VIEWS), strict=True)]
@@ -226,7 +227,7 @@ def _square_intrinsics(size: int, field: float = FIELD) -> np.ndarray:
 
 def _robust_box(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centre ``[3]`` and half sides ``[3]`` of the box that contains most of the means ``[n,3]``."""
-    extent_quantiles = (0.05, 0.95)  # of the positions along each axis; the scene is assumed to lie in between
+    extent_quantiles = (0.05, 0.95)  # positions along each axis between which the scene is assumed to lie
     low, high = np.quantile(means, extent_quantiles, axis=0)
     half = (high - low) / 2
     widest = float(half.max()) if half.max() > 0 else 1.0

@@ -206,7 +206,7 @@ def _prepare_pictures(
         if not placed:  # if views were placed, another note has said this
             note(f"{reason}: renders of the scene itself are used instead{remedy}")
         scene, scored = draw_pictures(scene), every[: len(every) // HELD_OUT] if placed else every
-        shown = tuple(view for view in scored if scene.images[view].any())  # in an empty view any result is right
+        shown = tuple(view for view in scored if scene.images[view].any())  # any result is right in an empty view
         return Prepared(input_scene, scene, frame, Reference(RENDERS, shown or scored, placed), repeated, False)
     input_scene, moved = _with_photos(input_scene, scene, repeated), None
     if has_own:  # each view's Gaussians have the exposure and the pose of the view

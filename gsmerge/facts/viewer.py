@@ -32,7 +32,7 @@ class Viewer:
     """The viewer around whom a scene was made."""
 
     place: np.ndarray  # ``[3]``
-    free: float  # radius of the empty space around the place
+    free_radius: float  # radius of the empty space around the place
     angle: float  # median angle at which the viewer sees a Gaussian's standard deviation, radians
 
 

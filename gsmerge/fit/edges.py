@@ -74,7 +74,7 @@ def cut_state(state: FitState, edges: Edges) -> None:
     sizes = np.maximum(log(scales), state.min_sizes[rows, None])
     x[rows, :SIZE], x[rows, SIZE:QUAT], x[rows, QUAT:LOGIT] = means[rows], sizes, quats
     state.x0[rows, :SIZE] = means[rows]
-    state.x0[rows, SIZE:QUAT] = np.sort(state.x0[rows, SIZE:QUAT], 1)  # like the scales along the new axes
+    state.x0[rows, SIZE:QUAT] = np.sort(state.x0[rows, SIZE:QUAT], 1)  # in rising order, as along the new axes
     state.m[rows, :LOGIT] = 0  # because the momentum was along the old axes
     splats.means[rows], splats.scales[rows], splats.quats[rows] = means[rows], exp(x[rows, SIZE:QUAT]), quats
 

@@ -47,7 +47,7 @@ def fit_full(
     """
     fit = start_fit(gaussians, run, survey, fixed)
     while fit.step < fit.steps:
-        if fit.progress >= run.half_part:  # before the growth, because new halves score worse until they are fitted
+        if fit.progress >= run.half_part:  # before Gaussians are split, because new halves score worse
             score_fit(fit)
         renew_state(fit)
         take_step(fit)

@@ -1,9 +1,9 @@
 """Place views outside of the capture, from which a fit removes fog and veils.
 
-Photos do not show the space between their fields of view, nor the space close to other cameras, and a fit fills it with
-large Gaussians. A viewer who steps back sees these as fog where the input is empty, and as veils in front of the
-input's surfaces. So some steps of a fit draw the Gaussians from cameras behind, beside, above and below those of the
-photos, and compare their opacities and depths with those of the input.
+Photos do not show the space between their fields of view, nor the space close to other cameras. A fit fills these
+spaces with large Gaussians. A viewer who steps back sees them as fog where the input is empty, and as veils in front of
+the input's surfaces. So some steps of a fit draw the Gaussians from cameras behind, beside, above and below those of
+the photos, and compare their opacities and depths with those of the input.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 STEP_BACK_LOW, STEP_BACK_HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
 # Multiples of this vector, modulo one, fill a cube evenly, whatever their number (the R sequence of Roberts 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
-PLACES = 42  # most views from outside; with more photos than this, there may be one for each photo
+PLACES = 42  # largest number of views from outside, if there are not more photos; then one for each photo
 DEPTH_GAUSSIANS = 2000  # the depths of views are measured on at least this many Gaussians, or on all if there are fewer
 # The views from outside are drawn from a sample of the input. It has this many Gaussians for each photo, but at most
 # for PLACES photos, because more photos do not make the pictures larger
@@ -121,7 +121,7 @@ def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarra
     """Draw the Gaussians of the input in v views from outside; return the limits ``[v,h,w]`` of :class:`Outside`."""
 
     def view_limits(view: int) -> np.ndarray:
-        """Return the depth of the surface in each pixel; inf if the pixel is empty, 0 if it is half transparent."""
+        """Return the depth of the surface in each pixel; inf if the pixel is empty, 0 if it is partly transparent."""
         depths, transmittance = blend_depths(tile_view(splats, **views.camera(view), near=near[view]), far[view])
         opacities = 1 - transmittance
         limits = np.where(opacities > SOLID_OPACITY, depths, 0)

@@ -113,7 +113,7 @@ class FitRun:
         return np.where(self.first_pixels[step.view][step.sample.pixels], weight, np.float32(0))
 
     def outside_view(self, step: int, progress: float) -> int | None:
-        """Return the index of the view from outside that is drawn after step ``step`` (from 1), or None if none is."""
+        """Return the index of the view from outside that is drawn after step ``step`` (from 1); None for no view."""
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
@@ -247,7 +247,7 @@ class Schedule:
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     """Return the step size of each of the fourteen parameters; it decays geometrically, and further in longer runs."""
-    usual_steps = 300  # in a longer run, the last step size is smaller by the ratio of the numbers of steps
+    usual_steps = 300  # in a run with twice as many steps, the last step size is half as large
     decay = rates.decay * min(1.0, usual_steps / steps)
     start_rates = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
     widths = [3, 3, 4, 1, 3]  # columns of means, log scales, quaternions, opacity logit and colours
@@ -258,6 +258,6 @@ def first_decay(rates: Tuning, rounds: float) -> float:
     """Return the decay of Adam's first moment after a number of ``rounds`` over all views.
 
     The moment averages about two steps at first, and one step more after every four rounds, up to ``rates.beta1``.
-    Early gradients change quickly, so few are averaged. Later gradients differ most between views.
+    Early gradients change quickly, so few are averaged. Later gradients differ most between views, so more are.
     """
     return min(rates.beta1, 1 - 1 / (2 + rounds / 4))

@@ -48,7 +48,7 @@ def fit_scene(
     with stage("fit"):
         photos = fit_photos(scene, options, views)
         record_choices(start_count=len(decoded.gaussians))
-        if decoded.exact and not options.grows:  # no drop may change the exact number, because nothing grows back
+        if decoded.exact and not options.grows:  # the number is exact, and no Gaussians are added after a drop
             options = replace(options, min_contribution=0.0)
         takes_all = decoded.exact or options.fills  # the fit grows to the whole count, even where that gains little
         job = FitJob(

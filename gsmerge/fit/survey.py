@@ -18,7 +18,7 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
 MOST_SCORED = 12  # a fit is scored on at most this many photos
-ENOUGH_PHOTOS = 6  # a survey needs no further photo of a Gaussian if the centre of the Gaussian is inside this many
+ENOUGH_PHOTOS = 6  # a survey needs no further photo of a Gaussian whose centre is inside this many
 # A photo is added to a survey if more than this share of its Gaussians is inside fewer than ENOUGH_PHOTOS photos
 FEWER_SHARE = 0.03
 
@@ -31,7 +31,7 @@ class Survey:
     inside: np.ndarray  # [n] bool, true for Gaussians that may reach into the frustum of some photo
     peaks: np.ndarray  # [n] float32 largest blending weight in any pixel
     sums: np.ndarray  # [n] float64 blending weights summed over all photos, pixels
-    squares: np.ndarray  # [n] float64 sum over photos of the squared sum of weights in a photo
+    squares: np.ndarray  # [n] float64 squares of the weights summed over a photo, added up for all photos
     pixels: np.ndarray  # [n] float32 size of the finest pixel that shows the Gaussian, world units; inf if none does
 
     def visible(self, min_weight: float) -> np.ndarray:
@@ -95,7 +95,7 @@ def choose_scored_photos(count: int) -> list[int]:
 
 
 def spread_views(count: int) -> list[int]:
-    """Return the indices of ``count`` views in such an order that any number of the first is spread evenly over all."""
+    """Return the indices of ``count`` views, in an order whose first n views are spread evenly over all, for any n."""
     # the order of the reversed bits of the numbers (van der Corput)
     return sorted(range(count), key=lambda view: f"{view:032b}"[::-1])
 

@@ -119,7 +119,7 @@ def inspect(
 def _describe_file(ply: GaussianFile) -> dict[str, Any]:
     """Describe a file of Gaussians, without views."""
     info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
-    opaque = 0.995  # the optical depth is capped from this opacity on
+    opaque = 0.995  # above this opacity, optical depths are capped
     saturated = 1e-6  # float32 changes the logit of an opacity that is nearer to 0 or 1 than this
     return {
         **{name: getattr(info, name) for name in _FILE_KEYS},
@@ -311,7 +311,7 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
     """Describe the order of the rows and the distances of Gaussians from their pixels, or say why these are unknown."""
     alignment, problem = scene["alignment"], scene["alignment_problem"]
     if problem is not None and scene["compact"] is None:
-        return []  # compact raises the same problem as an error
+        return []  # the command ends with this problem as its error
     if problem is not None:
         return [f"alignment  not one Gaussian per pixel: {problem.removeprefix('expected one Gaussian per pixel, ')}"]
     if alignment is None:

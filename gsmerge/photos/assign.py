@@ -1,7 +1,7 @@
 """Assign photos to views: find which photo shows which view, and in which orientation.
 
-File names propose a photo for each view. A comparison of the photo with the Gaussians of the view decides. A proposed
-photo is replaced or left out
+File names propose a photo for each view. The photo is then compared with the Gaussians of the view. A proposed photo is
+replaced or left out
 
 - if another photo or another orientation matches the view clearly better,
 - if it matches the view no better than photos match views that they do not show (wrong pairs), or
@@ -178,8 +178,8 @@ class Assigner:
         scores = self.score_in_views(photo for _, photo in named_pairs)
         proposed = {view: Assignment(photo, self._stored_or_tagged(scores, view, photo)) for view, photo in named_pairs}
         columns = [scores.photos.index(photo) for _, photo in named_pairs]
-        best = scores.best()[np.ix_(list(proposed), columns)]  # of each proposed view with each proposed photo
-        own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)  # of each photo in its view
+        best = scores.best()[np.ix_(list(proposed), columns)]  # scores of each proposed view with each proposed photo
+        own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)  # of photos in their views
         matched = _match_columns(best)
         with_contrast = own[self.has_contrast[list(proposed)]]
         # wrong pairs score about 0, and right ones about the median, so the threshold may lie in the middle
@@ -259,7 +259,7 @@ class Assigner:
             return {}
         step, tag = -(-len(photos) // FIRST_PHOTOS), self.candidates.tag
         compared = set(range(0, len(photos), step))  # indices into ``photos``
-        max_compared = 4  # photos with the highest scores that are compared with a view part by part
+        max_compared = 4  # number of photos that are compared with a view part by part
         while True:  # until the best photos of all views have no neighbours that were not compared
             scores = self.score_in_views(photos[index] for index in sorted(compared))
             best = scores.best()

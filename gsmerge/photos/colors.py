@@ -153,7 +153,7 @@ def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fi
     """Change each half of the blocks of photos ``[v,h,w,3]`` by the change that ``fit`` finds for the other half."""
     out, block_side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
     y, x = ((np.arange(size) / block_side).astype(int) for size in photos.shape[1:3])
-    black_squares = (y[:, None] + x) % 2 == 1  # of the chess board
+    black_squares = (y[:, None] + x) % 2 == 1  # like those of a chess board
     for fold in (black_squares, ~black_squares):
         colors, targets = photos[:, ~fold].reshape(-1, 3), pictures[:, ~fold].reshape(-1, 3)
         change = fit(colors, targets, weights[:, ~fold].reshape(-1))

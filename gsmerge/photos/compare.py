@@ -100,7 +100,7 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
 
     If the Gaussians are drawn, all photos share a curve. If no photo changes by more than :data:`EXPOSURE_STEP`, no
     curve counts, because models have a tone of their own. A curve counts only if the inverse curve, from Gaussians to
-    photos, reduces errors, too. It does not if the difference is noise, which flattens the colours of the Gaussians.
+    photos, reduces errors, too. It does not if the cause is noise, which flattens the colours of Gaussians.
     """
     curves, is_large = list[np.ndarray | None]([None] * len(pairs)), False
     stored = cut_blocks(pairs)
@@ -276,7 +276,7 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
     """Note in which photos of ``views`` something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
     max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
-    noted_percent = 1  # of a photo; if less differs, there is no note
+    noted_percent = 1  # there is no note if less of every photo differs
     if max_percent < noted_percent:
         return
     note(

@@ -1,15 +1,15 @@
 """Scene -> the scene in one exposure, if the exposures of its photos and Gaussians differ at random.
 
 Cameras choose exposure and white balance for each photo, and models copy them into their Gaussians, so one surface has
-several tones. Pixels of a view are looked up in other views that have Gaussians at the same depth. The median ratio of
-their colours, in each channel, is the ratio of this pair of views. The gains of all views follow from all pairs by
-least squares, with a geometric mean of one.
+several tones. Pixels of a view are looked up in other views that have Gaussians at the same depth. The ratio of two
+views is the median ratio of the colours of such pixels, in each channel. The gains of all views follow from the ratios
+of all pairs of views by least squares, with a geometric mean of one.
 
 Gains are removed if nothing predicts the gain of a new view, so that the mean of all gains is the best guess. Photos
 stay unchanged in two cases, in which the gain can be predicted. First, a camera that meters light makes bright places
-darker, also in new photos. Then photos with larger gains are not brighter. Second, exposure may drift along a video.
-Then neighbours have nearly the same gain. In both cases photos of mean exposure would be farther from new photos, by
-1.5 dB in a video of a kitchen.
+darker, also in new photos. In this case photos with larger gains are not brighter. Second, exposure may drift along a
+video. In this case neighbours have nearly the same gain. In both cases photos of mean exposure would be farther from
+new photos, by 1.5 dB in a video of a kitchen.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FOLLOWS, OPPOSED = 0.5, -0.6
 # if gains are removed
 UNEXPECTED = 0.69
 COARSE_STEP = 4  # the brightness of a photo is measured on every COARSE_STEP-th pixel of every COARSE_STEP-th row
-BRIGHT_GAIN = 1.15  # gain from which on clipped pixels no longer count
+BRIGHT_GAIN = 1.15  # clipped pixels do not count in photos with a larger gain than this
 CLIPPED_NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
 # Numbers of nearest and of farther views with which a view is compared; see choose_partners
 NEAREST_VIEWS, FARTHER_VIEWS = 6, 2
@@ -212,7 +212,7 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
     """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; all are zero without pairs."""
     matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
-    max_weighted_pixels = 1000  # pixels up to which the weight of a pair of views grows
+    max_weighted_pixels = 1000  # more shared pixels give a pair of views no larger weight
     for pair in pairs:
         ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, max_weighted_pixels))
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])

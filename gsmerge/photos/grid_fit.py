@@ -31,7 +31,7 @@ from gsmerge.photos.offsets import correlate_parts
 from gsmerge.photos.pictures import ViewPictures
 from gsmerge.photos.scores import stands_out
 
-_TILES = 4  # most pictures in a row or a column of a photo
+_TILES = 4  # largest number of pictures in a row or a column of a photo
 _HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
 
 
@@ -40,7 +40,7 @@ class PartFit:
     """The part of each photo that its view shows."""
 
     part: Part = WHOLE
-    # Size to whose aspect ratio the part is stretched, since stereo films squeeze both pictures; None: not stretched
+    # The part is stretched to the aspect ratio of this size, because stereo films squeeze pictures; None: not stretched
     shape: Size | None = None
 
     def cut(self, photo: np.ndarray) -> np.ndarray:
@@ -115,9 +115,9 @@ def round_to_cameras(inner: Part, size: Size, shape: Size) -> Part:
 
 @dataclass(frozen=True)
 class GridFit:
-    """The resizing and cropping by which a model made the pixels of a grid of rows from photos."""
+    """How a model resized and cropped photos to the grid of pixels whose Gaussians are the rows of a file."""
 
-    size: Size  # of the grid
+    size: Size  # size of the grid
     crops: bool = False  # True: resized in proportion and cropped at the centre; False: resized without proportion
     trim: tuple[int, int] = (0, 0)  # columns and lines that the model cut off its output at each side
 

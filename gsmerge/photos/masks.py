@@ -68,7 +68,7 @@ class MaskFiles:
         """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
         photo, counts, importance = self.photos[view] if self.photos else None, None, None
         alpha = None if photo is None else decode_alpha(photo)
-        min_level = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
+        min_level = 191  # level of 255; a pixel counts if three quarters of its pixels in the file count
         if alpha is not None:
             opaque = cut_part(turn_picture(alpha, self.turns[view]), self.part) * _WHITE
             counts = self._reduce(opaque, view) > min_level
@@ -251,7 +251,7 @@ def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple
     counts = masks.counts
     if counts is None:
         return masks, []
-    share = float(1 - counts.mean())  # of the pixels that masks leave out
+    share = float(1 - counts.mean())  # share of the pixels that masks leave out
     max_share = 0.98  # masks that leave out more are not used
     if share < max_share:
         count = int((~counts.all((1, 2))).sum())

@@ -47,7 +47,7 @@ def choose_part(
     """
     proposal = proposal.without_broken() or proposal
     named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
-    max_compared = 8  # most photos whose parts are compared with their views
+    max_compared = 8  # largest number of photos whose parts are compared with their views
     views, photos = zip(*(named[i] for i in pick_views(len(named), max_compared)), strict=True) if named else ((), ())
     sizes = [image_size(proposal.pool[photo]) for photo in photos]
     shapes_differ = not all(same_shape(size, sizes[0]) for size in sizes)
@@ -67,11 +67,12 @@ def choose_part(
     pictures, bars = zip(*parallel_map(read, range(len(photos))), strict=True)
     left, above, right, below = np.median(bars, 0).tolist()
     inner = left, above, 1 - right, 1 - below  # the part inside of bars
-    shape = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
-    fits: list[GridFit | PartFit] = [] if grid_fit is None else [grid_fit]
+    view_size = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
     if grid_fit is None:
-        inner = round_to_cameras(inner, sizes[0], shape)
-    fits += list_parts(sizes[0], shape if grid_fit is None else None, inner)
+        inner = round_to_cameras(inner, sizes[0], view_size)
+        fits: list[GridFit | PartFit] = [*list_parts(sizes[0], view_size, inner)]
+    else:  # cameras were estimated, so parts may have any shape
+        fits = [grid_fit, *list_parts(sizes[0], None, inner)]
     fit = choose_fit(show_views(scene, OFFSET_PIXELS)[views], pictures, fits)
     if isinstance(fit, GridFit) or fit == WHOLE_FIT:
         return None

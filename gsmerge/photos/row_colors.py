@@ -25,8 +25,8 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
-# Names of pictures in messages: the photos that a fit uses, and the pictures with which results are compared. Without
-# photos these are the colours of the rows, or, if rows belong to no pixels, renders
+# Names in messages of the pictures to which results are fitted and with which they are compared. If photos are missing,
+# these are the colours of the rows, or renders if the rows belong to no pixels
 OWN_PHOTOS = "the scene's own photos"
 PHOTOS = "photos"
 ROW_COLORS = "the model's own pixels"
@@ -101,7 +101,7 @@ def _picture_camera(scene: Scene, views: np.ndarray) -> RowPicture:
     weights = np.minimum(opacity, drawn_opacity)  # pixels that are faint in one of the two pictures count less
     differences = (row_picture - drawn_colors) * weights[..., None]
     red, green, blue = np.moveaxis(np.abs(blur(differences, ROW_BLUR_PIXELS)), -1, 0)
-    disagreement = 0.2  # mean difference of the blurred colours over the channels (sRGB) from which on they disagree
+    disagreement = 0.2  # largest mean difference over the channels (sRGB) at which blurred colours agree
     agree = (red + green + blue) / (3 * np.maximum(blur(weights, ROW_BLUR_PIXELS), np.float32(1e-6))) < disagreement
     is_solid = transmittance < COVERED_TRANSMITTANCE
     by_row = (opacity > 0) & ~(is_solid & ((opacity < FAINT_OPACITY) | ~agree))  # pixels with the Gaussians' colours

@@ -74,7 +74,7 @@ class ScenePhotos:
 
     @property
     def file_size(self) -> Size | None:
-        """Most frequent size of the used part of upright photos, the largest of several. None without files."""
+        """Most frequent size of the used part of upright photos, or the largest of several; None for no photos."""
         sizes = [
             part_size(_upright_size(path, turn), self.part)
             for path, turn in zip(self.paths, self.turns, strict=True)
@@ -91,7 +91,7 @@ class Proposal:
     pool: tuple[Path, ...]  # all files
     named: tuple[int | None, ...]  # for each camera, the index of its file in the pool; None without a proposed file
     exact: bool  # True: names propose the files; False: their order does
-    faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None without a reason
+    faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None if it can
     by_names: bool = False  # True: the folder was found by the names of its files
     fit: PartFit = WHOLE_FIT  # the part of each photo that is used
     notes: tuple[str, ...] = ()  # on this part

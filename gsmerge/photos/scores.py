@@ -54,7 +54,7 @@ class _Filters:
     orientations: tuple[int, ...]  # the t orientations
     products: np.ndarray  # [v·t,h·w·3] weight times contrast, normalised to length 1
     weights: np.ndarray  # [v·t,h·w]
-    lengths: np.ndarray  # [v] of the products before they were normalised
+    lengths: np.ndarray  # [v] lengths of the products before these were normalised
 
 
 class Comparer:
@@ -65,7 +65,7 @@ class Comparer:
         self._small = small = [shown.shrink(side) for side in SCORE_PIXELS]
         width, height = small[0].weights.shape[2:0:-1]
         self._portrait, self._square = height > width, height == width
-        self.least_noise = 1 / np.sqrt(width * height)  # of Fisher's z, if all pixels are independent
+        self.least_noise = 1 / np.sqrt(width * height)  # noise of Fisher's z if all pixels are independent
         self._empty = small[0].weights.max((1, 2)) < LEAST_OPACITY  # views without Gaussians
 
     @cached_property
