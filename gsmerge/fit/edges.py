@@ -88,11 +88,11 @@ def _compute_cuts(splats: Splats, edges: Edges) -> tuple[np.ndarray, np.ndarray,
     count = len(splats.means)
     means, covars, is_cut = splats.means.copy(), np.empty((count, 3, 3)), np.zeros(count, np.uint8)
 
-    def cut(start: int) -> None:
+    def cut_rows(start: int) -> None:
         stop = min(start + ROWS, count)
         cut_at_edges(splats.quats, splats.scales, edges.normals, edges.offsets, start, stop, means, covars, is_cut)
 
-    parallel_map(cut, range(0, count, ROWS))
+    parallel_map(cut_rows, range(0, count, ROWS))
     return means, covars, is_cut.astype(bool)
 
 

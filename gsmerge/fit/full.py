@@ -141,7 +141,8 @@ def take_step(fit: FullFit) -> None:
 
 def end_fit(fit: FullFit) -> FitResult:
     """Return the fitted Gaussians, split at the edges of the views if the photos hardly suffer, and a report."""
-    job, final = fit.run.job, state_of(fit.tail.of(fit.state.x), fit.state.splats.shN)
+    job = fit.run.job
+    final = state_of(fit.tail.of(fit.state.x), fit.state.splats.shN)
     final.origins, final.min_sizes = fit.state.origins, fit.state.min_sizes
     # A fit that fills an exact number of Gaussians has no room for halves. There are no edges if renders stand for
     # photos, because renders show what lies beyond

@@ -109,7 +109,8 @@ def error_masses(state: FitState, half: Photos) -> np.ndarray:
     The pixels are those of the half-size photos ``half``. Errors are multiplied by the importance of their pixels.
     """
 
-    def one_view(view: int) -> np.ndarray:
+    def view_masses(view: int) -> np.ndarray:
+        """Return the error mass ``[n]`` of each Gaussian in one view."""
         tiled = tile_view(state.splats, **half.camera(view))
         image, _ = composite(tiled, state.view_colors())
         errors = np.abs(image - half.image(view)).mean(-1, keepdims=True)
@@ -118,6 +119,6 @@ def error_masses(state: FitState, half: Photos) -> np.ndarray:
         return splat_adjoint(tiled, errors)[:, 0]
 
     masses = np.zeros(len(state.x))
-    for view_masses in in_turn(one_view, range(len(half))):
-        masses += view_masses
+    for added_masses in in_turn(view_masses, range(len(half))):
+        masses += added_masses
     return masses

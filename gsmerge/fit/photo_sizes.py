@@ -161,13 +161,14 @@ def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.
     clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
     gains = exposure_gains(clipped, photos.images, weights, min_gain)
 
-    def one_view(view: int) -> tuple[float, float]:
+    def sum_errors(view: int) -> tuple[float, float]:
+        """Return the sum of the squared errors of a view's held-out pixels, and the number of these pixels."""
         red, green, blue = np.moveaxis((clipped[view] * gains[view] - photos.images[view]) ** 2, -1, 0)
         error = red + green + blue  # takes a tenth of the time of a sum along the last axis
         mask = weights[view] == 0
         return float(error[mask].sum(dtype=np.float64)), float(mask.sum())
 
-    error, count = np.sum(parallel_map(one_view, views), axis=0)
+    error, count = np.sum(parallel_map(sum_errors, views), axis=0)
     return decibels(error / max(3 * count, 1))
 
 
@@ -181,14 +182,15 @@ def exposure_gains(
     they may lie outside this range. If all factors are between ``1 / min_gain`` and ``min_gain``, all are set to 1.
     """
 
-    def one_view(view: int) -> np.ndarray:
+    def view_gains(view: int) -> np.ndarray:
+        """Return the factors ``[3]`` of one view."""
         image, weight = images[view], weights[view][..., None]
         photo_products, image_squares = (
             (weight * picture * image).sum((0, 1), dtype=np.float64) for picture in (photos[view], image)
         )
         return np.clip(photo_products / np.maximum(image_squares, 1e-9), 1 / MAX_GAIN, MAX_GAIN)
 
-    gains = np.stack(parallel_map(one_view, range(len(photos))))
+    gains = np.stack(parallel_map(view_gains, range(len(photos))))
     gains /= exp(log(gains).mean(0))
     if np.abs(log(gains)).max() < log(min_gain):
         gains[:] = 1

@@ -126,7 +126,8 @@ class FitRun:
         viewers one after the other. If there are larger photos, some of the later steps draw these, which has the
         effect of a viewer who moves closer.
         """
-        photos, is_early, has_larger = self.job.photos, progress < self.half_part, len(self.job.photos) > 2
+        photos, has_larger = self.job.photos, len(self.job.photos) > 2
+        is_early = progress < self.half_part
         if is_early and not self.samples:
             return DrawMode(1, photos[1].eps2d)
         if has_larger and is_early:  # no step needs a smaller low-pass, because later steps draw the larger photos
@@ -232,7 +233,8 @@ class Schedule:
         """
         if not self.views_left:
             self.views_left = self.rng.permutation(len(self.run.job.photos[0])).tolist()
-        view, background, mask = self.views_left.pop(), self.rng.random(3, dtype=np.float32), None
+        view = self.views_left.pop()
+        background, mask = self.rng.random(3, dtype=np.float32), None
         are_renders = self.run.job.num_scored is not None
         if are_renders and number % 2:  # most viewers have a black background
             background = np.zeros(3, np.float32)

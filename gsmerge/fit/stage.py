@@ -87,10 +87,10 @@ def fit_gaussians(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Fit the Gaussians that some photo shows; return these Gaussians without the fit if most photos became worse."""
-    options = job.options
-    run, scored_photos = prepare_fit(job), job.scored_photos(0) if job.held_out is None else job.held_out
+    run = prepare_fit(job)
+    scored_photos = job.scored_photos(0) if job.held_out is None else job.held_out
     survey = survey_photos(gaussians, run)
-    is_shown = survey.visible(options.min_contribution)
+    is_shown = survey.visible(job.options.min_contribution)
     start, rows = gaussians[is_shown], np.flatnonzero(is_shown)
     fixed = None if job.fixed is None else job.fixed[rows]
     fitted, report = _better_of(scored_photos, start, *fit_full(start, run, survey[is_shown], fixed))

@@ -41,7 +41,8 @@ class Optimiser:
 
     def step(self, state: FitState, step: Step) -> float:
         """Change a state by one Adam step on one view; return the mean squared error of the pixels that count."""
-        rates, weight = self.run.job.options.tuning, self.run.weight(step)
+        rates = self.run.job.options.tuning
+        weight = self.run.weight(step)
         photo, camera = self.select_view(step)
         numbers = self.constants(state, step) | {
             "camera": camera_numbers(**camera),

@@ -52,16 +52,18 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
     colors = state.view_colors()
 
-    def one_view(view: int) -> tuple[np.ndarray, ...]:
-        drawn = tile_view(state.splats, **half.camera(view))
+    def survey_view(view: int) -> tuple[np.ndarray, ...]:
+        """Return the ids of the Gaussians in a view, the sizes of its pixels at them, and the result of ``survey``."""
+        tiled = tile_view(state.splats, **half.camera(view))
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
-        return drawn.ids, drawn.depths / focal, *survey(drawn, colors)
+        return tiled.ids, tiled.depths / focal, *survey(tiled, colors)
 
-    views, scored, images = choose_photos(gaussians, half), choose_scored_photos(len(half)), []
+    views, scored_views = choose_photos(gaussians, half), choose_scored_photos(len(half))
+    images = []  # renders of the scored views
     inside, peaks = np.zeros(count, bool), np.zeros(count, np.float32)
     sums, squares, pixels = np.zeros(count), np.zeros(count), np.full(count, np.inf, np.float32)
-    for view, (ids, pixel_sizes, image, weights, view_peaks) in zip(views, in_turn(one_view, views), strict=True):
-        if view in scored:
+    for view, (ids, pixel_sizes, image, weights, view_peaks) in zip(views, in_turn(survey_view, views), strict=True):
+        if view in scored_views:
             images.append(image)
         inside[ids] = True
         peaks[ids] = np.maximum(peaks[ids], view_peaks)
@@ -104,12 +106,13 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
     """Return the largest blending weight ``[n]`` of each Gaussian, and a mask ``[n]`` of those in some frustum."""
     splats = make_splats(gaussians)
 
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+    def view_peaks(view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ids of the Gaussians in a view, and their largest blending weights."""
         tiled = tile_view(splats, **photos.camera(view))
         return tiled.ids, list_contributions(tiled)[1]
 
     peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
-    for ids, peaks in in_turn(one_view, range(len(photos))):
+    for ids, peaks in in_turn(view_peaks, range(len(photos))):
         inside[ids] = True
         peak[ids] = np.maximum(peak[ids], peaks)
     return peak, inside
@@ -132,7 +135,7 @@ def score_state(state: FitState, run: FitRun, half: Photos) -> float:
 def photo_mses(gaussians: Gaussians, photos: Photos) -> np.ndarray:
     """Return the mean squared error ``[v]`` of the render of each whole photo, always above 0 for use as a divisor."""
 
-    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
+    def measure_mse(view: int, image: np.ndarray, _: np.ndarray) -> float:
         return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
 
-    return np.array(photo_errors(gaussians, photos, score)) + np.finfo(np.float32).tiny
+    return np.array(photo_errors(gaussians, photos, measure_mse)) + np.finfo(np.float32).tiny

@@ -111,6 +111,7 @@ class Assigner:
         task_size = max(min_per_task, -(-len(new) // max_tasks))
 
         def correlate_task(start: int) -> np.ndarray:
+            """Return the correlations of the photos of one task."""
             return self._comparer.correlate([self.candidates.read(photo) for photo in new[start : start + task_size]])
 
         new_correlations = parallel_map(correlate_task, range(0, len(new), task_size))
@@ -272,6 +273,7 @@ class Assigner:
             compared, step = compared | neighbours, 1
 
         def list_assignments(view: int) -> list[Assignment]:
+            """List the likely photos of a view, in their likely orientations."""
             likely = [scores.photos[column] for column in columns[view] if np.isfinite(best[view, column])]
             return [Assignment(photo, scores.choose_orientation(view, photo, tag(photo))) for photo in likely]
 

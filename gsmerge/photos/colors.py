@@ -116,6 +116,7 @@ def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
     toned = pairs.photos.copy()
 
     def change_group(group: Sequence[int]) -> None:
+        """Fit a tone curve to a group of views, and apply it to their photos in ``toned``."""
         group_pairs = pairs[group]
         shown = group_pairs.shown
         toned[group] = _cross_fit(

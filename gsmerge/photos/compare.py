@@ -193,6 +193,7 @@ def find_matching_views(
     candidates = Candidates(lambda photo: photos[ids[photo]], len(ids), lambda _: 0)
 
     def show(side: int) -> ViewPictures:
+        """Make pictures of the views ``ids`` with up to ``side`` pixels on the longer side."""
         return (shown.shrink(side) if shown.drawn and side <= PICTURE_PIXELS else show_views(scene, side))[ids]
 
     assigner = Assigner(show, candidates)
@@ -305,6 +306,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
         return fill_gaps(differs[..., None], known)[..., 0]
 
     def compare_drawn(views: np.ndarray, drawn: RowPicture) -> None:
+        """Compare the photos of ``views`` with a drawing, and replace their pixels in ``hidden`` and ``pictures``."""
         for view in views:
             known = shown[view] & inside[view] & drawn.known  # a pixel needs a Gaussian of its own
             pictures[view] = drawn.picture

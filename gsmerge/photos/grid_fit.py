@@ -180,6 +180,7 @@ def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: S
     views = [view for view, photo in enumerate(photos) if photo is not None]
 
     def correlate(fit: FitT) -> np.ndarray:
+        """Return the correlations of all parts of all photos after a fit."""
         return np.concatenate([
             correlate_parts(shown, view, fit.cut(photos[view]))  # type: ignore[arg-type]
             for view in views

@@ -393,6 +393,7 @@ def has_nearer_colors(scene: Scene, other: Scene) -> bool:
     assert images is not None
 
     def measure_errors(shown: ViewPictures) -> np.ndarray:
+        """Return the errors ``[n]`` of blocks between pictures and the scene's photos."""
         return cut_blocks(Pairs(shrink_pictures(images, *shown.weights.shape[2:0:-1]), shown)).errors()
 
     return stands_out(
