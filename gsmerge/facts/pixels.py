@@ -84,7 +84,7 @@ def find_pixels(scene: Scene) -> Pixels:
     In each view, the weight of a Gaussian is opacity x transmittance x area in pixels. The pixel of a Gaussian is the
     one with its centre in the view of its largest weight, or in the first such view. It is -1 if no view sees the
     Gaussian. The front of a pixel is the Gaussian with the largest opacity x transmittance among those with a centre in
-    the pixel. If there are none, the pixel has the front of its cell, or -1 if the cell is empty.
+    the pixel. If there are none, the pixel has the front of the cell around it, or -1 if the cell is empty.
     """
     g, cameras, count = scene.gaussians, scene.cameras, len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))

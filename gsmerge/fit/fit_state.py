@@ -61,7 +61,7 @@ class FitState:
 def start_state(gaussians: Gaussians) -> FitState:
     """Return the state at the start of a fit: the parameters of the Gaussians, and moments of zero."""
     x = np.empty((len(gaussians), COLUMNS), np.float32)
-    opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)
+    opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)  # beyond, a step hardly changes opacities
     x[:, :3] = gaussians.means
     x[:, SIZE:QUAT] = log(gaussians.scales.clip(1e-9))
     x[:, QUAT:LOGIT] = gaussians.quats

@@ -74,10 +74,10 @@ class Outside:
         cameras = Cameras(self.views.viewmats, self.views.Ks, self.views.width, self.views.height)
         pixels, z = project(points, cameras)
         inside = (z > self.near[:, None]) & is_inside(pixels, cameras)
-        view, point = np.nonzero(inside)
-        column, row = pixels[inside].astype(np.int64).T
-        wrong = z[inside] < share * self.limits[view, row, column]
-        return np.bincount(point[wrong], minlength=len(points)) > 0
+        view_ids, point_ids = np.nonzero(inside)
+        columns, rows = pixels[inside].astype(np.int64).T
+        too_near = z[inside] < share * self.limits[view_ids, rows, columns]
+        return np.bincount(point_ids[too_near], minlength=len(points)) > 0
 
 
 def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options: FitOptions) -> Outside | None:

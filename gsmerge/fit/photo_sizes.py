@@ -126,7 +126,7 @@ def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.nd
     random = np.random.default_rng([seed, view])
     counting = np.ones((rows, columns), bool) if photos.weights is None else _counting_patches(photos, view, size)
     held_out = (random.random((rows, columns)) < share) & counting
-    if counting.any() and not held_out.any():
+    if counting.any() and not held_out.any():  # hold out a random patch, unless it is the only one
         candidates = np.argwhere(counting)  # [p,2] row and column of patches
         patch = (random.integers(rows), random.integers(columns)) if counting.all() else random.choice(candidates)
         held_out[tuple(patch)] = len(candidates) > 1

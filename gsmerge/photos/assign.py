@@ -118,8 +118,8 @@ class Assigner:
         self._correlations |= dict(zip(new, itertools.chain(*new_correlations), strict=True))
         correlations = np.stack([self._correlations[photo] for photo in ids], 1)
         z = fisher_z(correlations)
-        middle, noise = measure_noise(z, self._comparer.least_noise)
-        return _Scores(ids, (z - middle[:, None, None]) / noise, correlations)
+        medians, noise = measure_noise(z, self._comparer.least_noise)
+        return _Scores(ids, (z - medians[:, None, None]) / noise, correlations)
 
     def compare_parts(self, view: int, assignment: Assignment) -> float | None:
         """Compare a photo with a view part by part, and return their similarity.
@@ -302,23 +302,23 @@ def assign_photos(
         The assignment of each view, None where no photo shows it; and True if the proposed photos explain most views.
     """
     assigner = Assigner(show, candidates)
-    out, confirmed = assigner.confirm(named, exact=exact)
-    num_assigned = sum(assignment is not None for assignment in out)
-    most_match = 2 * num_assigned > len(out) and assigner.match_together(out)
-    explain_most = assigner.explain_most(out)
+    assignments, confirmed = assigner.confirm(named, exact=exact)
+    num_assigned = sum(assignment is not None for assignment in assignments)
+    most_match = 2 * num_assigned > len(assignments) and assigner.match_together(assignments)
+    explain_most = assigner.explain_most(assignments)
     if exact and most_match:  # search only for the views whose proposed photo was rejected
-        unknown = [view for view, photo in enumerate(named) if photo is not None and out[view] is None]
+        unknown = [view for view, photo in enumerate(named) if photo is not None and assignments[view] is None]
     else:
         unknown = [view for view, is_confirmed in enumerate(confirmed) if not is_confirmed]
     if not unknown:
-        return out, explain_most
-    used = {assigned.photo for view, assigned in enumerate(out) if assigned is not None and view not in unknown}
+        return assignments, explain_most
+    used = {assigned.photo for view, assigned in enumerate(assignments) if assigned and view not in unknown}
     if stored is not None:
         assigner = Assigner(show, stored)
     results = assigner.search(unknown, [photo for photo in range(candidates.count) if photo not in used])
     for view in unknown:
-        out[view] = results.get(view) or (out[view] if most_match else None)
-    return out, explain_most
+        assignments[view] = results.get(view) or (assignments[view] if most_match else None)
+    return assignments, explain_most
 
 
 def _exceed_noise(scores: np.ndarray) -> bool:

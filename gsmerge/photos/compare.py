@@ -188,9 +188,9 @@ def find_matching_views(
     No view is returned if all photos together match no better than photos match other views. Views of one camera share
     one photo. ``shown`` are small pictures of the Gaussians in all views; if they are drawings, they are reused.
     """
-    kinds = camera_kinds(scene.cameras)
-    ids = sorted({kinds[view]: view for view in reversed(views)}.values())  # the first view of each camera
-    candidates = Candidates(lambda photo: photos[ids[photo]], len(ids), lambda _: 0)
+    camera_ids = camera_kinds(scene.cameras)
+    ids = sorted({camera_ids[view]: view for view in reversed(views)}.values())  # the first view of each camera
+    candidates = Candidates(read=lambda photo: photos[ids[photo]], count=len(ids), tag=lambda _: 0)
 
     def show(side: int) -> ViewPictures:
         """Make pictures of the views ``ids`` with up to ``side`` pixels on the longer side."""
@@ -201,9 +201,9 @@ def find_matching_views(
     if not assigner.match_together(confirmed_photos):
         return []
     # views without contrast cannot be compared, so they count as matching
-    rows = zip(ids, confirmed_photos, assigner.has_contrast, strict=True)
-    matching = {kinds[view] for view, photo, has_contrast in rows if photo is not None or not has_contrast}
-    return [view for view in views if kinds[view] in matching]
+    results = zip(ids, confirmed_photos, assigner.has_contrast, strict=True)
+    matching = {camera_ids[view] for view, photo, has_contrast in results if photo is not None or not has_contrast}
+    return [view for view in views if camera_ids[view] in matching]
 
 
 def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> bool:

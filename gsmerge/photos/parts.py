@@ -76,7 +76,7 @@ def choose_part(
     fit = choose_fit(show_views(scene, OFFSET_PIXELS)[views], pictures, fits)
     if isinstance(fit, GridFit) or fit == WHOLE_FIT:
         return None
-    candidates = Candidates(lambda photo: fit.cut(pictures[photo]), len(photos), lambda _: 0)
+    candidates = Candidates(read=lambda photo: fit.cut(pictures[photo]), count=len(photos), tag=lambda _: 0)
     assigner = Assigner(lambda side: show_views(scene, side)[views], candidates)
     is_right = assigner.explain_most([Assignment(photo, 0) for photo in range(len(photos))])
     note = fit.describe(sizes[0], bars=fit.part == inner != WHOLE)

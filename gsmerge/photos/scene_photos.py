@@ -192,8 +192,8 @@ def _find_photos_near(files: SceneFiles, camera_file: CameraFile) -> tuple[Path,
     folder = capture_folder(path)
     named = [find_image(folder, name, path, option=files.photo_option) for name in names]
     pool = list(dict.fromkeys(path for path in named if path is not None))
-    is_nameless = all(name.removeprefix("view ").isdecimal() for name in names)
-    if not pool and is_nameless:
+    are_numbers = all(name.removeprefix("view ").isdecimal() for name in names)  # the cameras have no names of photos
+    if not pool and are_numbers:
         folder = files.ply.parent  # AnySplat writes its Gaussians among the photos
         beside = (path for path in folder.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
         pool = natural_order(path for path in beside if path.is_file())
@@ -207,10 +207,10 @@ def _describe_missing_file(folder: Path, name: str) -> str:
         with suppress(OSError, ValueError):
             same_stem |= {file for file in os.listdir(place) if PurePath(file).stem == inner.stem}
     unread = {file for file in same_stem if PurePath(file).suffix.lower() not in IMAGE_SUFFIXES}
-    shown = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner
+    short = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner  # without the folder's name
     if not unread:
-        return f"{shown}: no such file"
-    return f"{shown}: no such file, and the format of {min(unread)} is not read; {CONVERT}"
+        return f"{short}: no such file"
+    return f"{short}: no such file, and the format of {min(unread)} is not read; {CONVERT}"
 
 
 def _find_fault(path: Path, *, decode: bool = False) -> str | None:

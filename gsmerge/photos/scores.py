@@ -35,7 +35,7 @@ def fisher_z(correlations: np.ndarray) -> np.ndarray:
 
 
 def find_contrast(picture: np.ndarray, weight: np.ndarray | None = None, side: int | None = None) -> np.ndarray:
-    """Subtract the local mean from the colours of a picture ``[h,w,3]``.
+    """Return the differences between the colours of a picture ``[h,w,3]`` and their local mean.
 
     The local mean is a Gaussian blur with a standard deviation of a sixth of ``side``, by default of the longer side of
     the picture. ``weight [h,w]`` are weights of the pixels, by default 1.

@@ -44,8 +44,7 @@ def pick_views(num_views: int, max_count: int) -> list[int]:
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
     """Return the index of the candidate nearest to the middle of each two consecutive ``contexts``.
 
-    Contexts and candidates are positions along the capture. If there is no candidate between two contexts, they add no
-    index.
+    Contexts and candidates are positions along the capture. Two contexts without a candidate between them are left out.
     """
     midpoints = []
     for low, high in pairwise(sorted(contexts)):
