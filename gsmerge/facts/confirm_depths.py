@@ -1,9 +1,9 @@
 """Scene with pixels -> the share of its depth that other views confirm, which predicts whether a fit can succeed.
 
-Each pixel's Gaussian is projected into the other views. The Gaussian in front there is projected back. If it returns
-near the pixel, at about the same depth, the depth of the pixel is confirmed. It is contradicted if more views see
-through it than confirm it, and alone if its position is outside of all other views. A pixel does not count if other
-views have no Gaussian at its position, for example beyond a crop.
+Each pixel's Gaussian is projected into the other views. The Gaussian in front at that place is projected back. If it
+returns near the pixel, at about the same depth, the other view confirms the pixel. A pixel is contradicted if more
+views see through its surface than confirm it, and alone if its position is outside of all other views. A pixel does not
+count if other views have no Gaussian at its position, for example beyond a crop.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are lo
 AGREEMENT_SHARE, AGREEMENT_PIXELS = 1 / 120, 1.5
 SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LEAST_DEPTH = 1e-9  # least depth, canonical units
-# A result is poor if the share of confirmed pixels is below POOR_SHARE, which separates the poor results of 15 captures
-# from the sound ones. If the share of alone pixels is above LONELY_SHARE, the reason is that too few views see the
-# pixels
+# A result is expected to be poor if the share of confirmed pixels is below POOR_SHARE. This bound separates the poor
+# results of 15 captures from the sound ones. If the share of alone pixels is above LONELY_SHARE, the cause is that too
+# few views see the pixels
 POOR_SHARE, LONELY_SHARE = 0.5, 0.2
-# Difference that chance may cause, in standard errors; and number of samples from which on errors are about normal
+# Chance may change a share by CHANCE_ERRORS standard errors. From fewer samples than NORMAL_SAMPLES nothing follows
 CHANCE_ERRORS, NORMAL_SAMPLES = 2.0, 30
 # Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if more than the share POOR_PART_SHARE
 # of its pixels is poor
@@ -41,25 +41,24 @@ THIRDS = {
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
 }  # fmt: skip
 POOR_PART_SHARE = 0.5  # share of the pixels of a part, above which the part is poor
-# Useful number of Gaussians per pixel. It is MOST_PER_PIXEL if the share of confirmed pixels is at least SOUND_SHARE,
-# and falls to the usual share, FEWEST, at a share of WRONG_SHARE. With more Gaussians a fit memorises the photos
-# (docs/guide/how-many.md). MOST_PER_PIXEL is the largest number at which no capture with as much confirmed depth lost
-# .1 dB in photos that were not used.
+# Useful number of Gaussians per pixel. It is MOST_PER_PIXEL if at least SOUND_SHARE of the pixels are confirmed, and
+# FEWEST, the usual number, if at most WRONG_SHARE are confirmed. With more Gaussians a fit memorises the photos
+# (docs/guide/how-many.md). With MOST_PER_PIXEL, all captures whose depth was confirmed lost less than .1 dB in photos
+# that the fit had not seen
 MOST_PER_PIXEL, FEWEST, SOUND_SHARE, WRONG_SHARE = 0.07, parse_share(SHARE), 0.75, 0.6
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Shares of the counted pixels of a scene whose depth other views confirm, contradict or do not see."""
+    """Shares of a scene's pixels whose depth other views confirm or contradict, or that no other view sees."""
 
-    confirmed: float  # At least one view confirms the depth, and no more views see through it
+    confirmed: float  # A view confirms the depth, and no larger number of views sees through it
     contradicted: float  # More views see through it than confirm it
     alone: float  # No other view sees the position
     num_pixels: int = field(default=CONFIRM_PIXELS, compare=False)  # Number of sampled pixels that count
-    # The part of the pictures in which most pixels are contradicted, and the part in which most are alone; for example
-    # "left third of 4 of 7 views"; empty if there is none
+    # Part of the pictures in which most pixels are contradicted, such as "left third of 4 of 7 views"; empty for none
     contradicted_part: str = field(default="", compare=False)
-    alone_part: str = field(default="", compare=False)
+    alone_part: str = field(default="", compare=False)  # Part in which most pixels are alone
     # True if the cameras are so close together that no two views show things displaced by ``AGREEMENT_PIXELS``
     from_one_point: bool = field(default=False, compare=False)
 
@@ -135,7 +134,7 @@ def _look_up_pixels(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarr
     """Look up n pixels ``rows`` of a view in the nearest other views.
 
     Returns four arrays ``[n]``: the number of views that confirm the depth of a pixel, the number of views that see
-    through it, whether no view sees its position, and whether the pixel counts.
+    through its surface, whether no view sees its position, and whether the pixel counts.
     """
     means, cameras = scene.gaussians.means, scene.cameras
     fronts = scene.get_pixels().fronts.reshape(len(scene), -1)
@@ -144,21 +143,21 @@ def _look_up_pixels(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarr
     pixels, depths = project(points, cameras[neighbors])
     x, y = pixels[..., 0], pixels[..., 1]
     inside = (depths > LEAST_DEPTH) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
-    # pairs of a neighbour and a point inside its picture: first all pairs, and below those with a Gaussian in the pixel
-    neighbor_ids, ids = np.nonzero(inside)
+    neighbor_ids, ids = np.nonzero(inside)  # pairs of a neighbour and a point in its picture
     column, row = x[neighbor_ids, ids].astype(np.int64), y[neighbor_ids, ids].astype(np.int64)
     front = fronts[neighbors[neighbor_ids], row * cameras.width + column]
     has_front = front >= 0
-    neighbor_ids, ids = neighbor_ids[has_front], ids[has_front]
+    neighbor_ids, ids = neighbor_ids[has_front], ids[has_front]  # only pairs with a Gaussian at the point's pixel
     is_alone = np.asarray(~inside.any(0))
     is_counted = is_alone.copy()
     is_counted[ids] = True
     surface = means.take(front[has_front], 0).astype(np.float64)  # the points that the neighbours show there
     distance = _distance_back(surface, rows[ids], cameras[[view]])
     surface_depths = camera_depths(surface, cameras.viewmats[neighbors[neighbor_ids]])
-    behind = log(depths[neighbor_ids, ids] / np.maximum(surface_depths, LEAST_DEPTH))  # above 0: the point is hidden
-    agrees = (distance < 1) & (np.abs(behind) < SAME_LOG_DEPTH)
-    sees_through = ~agrees & ((behind < -2 * SAME_LOG_DEPTH) | ((behind < 0) & (distance > 2)))
+    # how far the point is behind the neighbour's surface (above 0), or in front of it
+    log_depths = log(depths[neighbor_ids, ids] / np.maximum(surface_depths, LEAST_DEPTH))
+    agrees = (distance < 1) & (np.abs(log_depths) < SAME_LOG_DEPTH)
+    sees_through = ~agrees & ((log_depths < -2 * SAME_LOG_DEPTH) | ((log_depths < 0) & (distance > 2)))
     num_same, num_through = (np.bincount(ids[mask], minlength=len(rows)) for mask in (agrees, sees_through))
     return num_same, num_through, is_alone, is_counted
 

@@ -13,8 +13,8 @@ from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 STREAMED_LEVELS = 3  # levels of detail of a lod-meta.json; the coarsest, a sixteenth of the Gaussians, loads at once
 LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the next finer one
 FEW_PIXELS = 1 << 18  # pixels of a few small photos
-# A scene has few Gaussians if it has less than this number per pixel of the photos, of which at most FEW_PIXELS pixels
-# count. The superpixels are then a share of the pixels, but at most this share of the Gaussians
+# A scene has few Gaussians if it has fewer than this number per pixel of its photos. At most FEW_PIXELS pixels count.
+# The number of superpixels is then a share of the pixels, but at most FEW times the number of Gaussians
 FEW = 0.5
 
 
@@ -24,9 +24,9 @@ def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int |
     ``num_input`` is the number that a share refers to, and ``sh_degree`` decides how many Gaussians a file holds.
     """
     device = DEVICES.get(str(options.budget))
-    if device is not None:  # a device only sets a limit, unless it is to be filled or the useful number is known
-        device_limit = num_input if options.fill else options.most
-        return None if device_limit is None else min(device, device_limit)
+    if device is not None:  # a device requests a number if the option says to fill it, or if the useful number is known
+        num_useful = num_input if options.fill else options.most
+        return None if num_useful is None else min(device, num_useful)
     if options.budget in (None, AUTO):
         return None
     limit = num_input if options.most is None else options.most
@@ -56,7 +56,7 @@ class FileSize:
 def file_size(options: BudgetOptions) -> FileSize | None:
     """Return the file size that a budget in bytes requests; None for any other budget.
 
-    Raises UsageError if the size of the output's format does not follow from its Gaussians.
+    Raises UsageError if the size of the output does not follow from the number of its Gaussians.
     """
     if not options.in_bytes:
         return None
@@ -78,12 +78,12 @@ class CountLimits:
 
     per_view: int  # Superpixels of each view that the options ask for
     default: int  # Gaussians that `superpixels` and K give
-    min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
-    max_count: int  # Most Gaussians that a budget, a size or a device allows
+    min_count: int  # Least number of Gaussians of a result: one for each view
+    max_count: int  # Largest number of Gaussians that a budget, a size or a device allows
     exact: int | None  # Gaussians that a budget or a size requests; None if there is neither
     num_pixels: int  # Pixels of all views
     num_input: int  # Gaussians of the scene
-    most: int  # Most Gaussians that are useful for the scene; if unknown, the number of its Gaussians
+    most: int  # Useful number of Gaussians; if it is unknown, all Gaussians of the scene
 
     @property
     def count(self) -> int | None:
@@ -108,8 +108,8 @@ def count_limits(
 ) -> CountLimits:
     """Compute the limits on the number of Gaussians.
 
-    ``num_input``: the number of Gaussians that shares of a budget refer to; None: that of the scene. Raises UsageError
-    if more superpixels are requested than there are pixels, or fewer Gaussians than views.
+    A budget that is a share refers to ``num_input`` Gaussians, or to those of the scene if this is None. Raises
+    UsageError if more superpixels are requested than there are pixels, or fewer Gaussians than views.
     """
     count, views = scene.num_gaussians, scene.num_views
     exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
@@ -134,8 +134,8 @@ def count_limits(
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
     """Return the number of superpixels per view.
 
-    A share is a share of the pixels. If views have no Gaussians of their own, it is a share of the Gaussians if these
-    are fewer, unless the scene has only few Gaussians.
+    If the option ``superpixels`` is a share, it refers to the pixels. If views have no Gaussians of their own, and if
+    there are fewer Gaussians than pixels, it refers to the Gaussians. Scenes of few Gaussians (:data:`FEW`) get more.
     """
     per_view = count_for(segment, scene.height, scene.width)
     if scene.has_own_pixels or segment.per_view is not None:
@@ -168,7 +168,7 @@ def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptio
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Return the number of superpixels of a view with ``height`` x ``width`` pixels; UsageError if there are fewer."""
+    """Return the number of superpixels for a view of ``height`` x ``width`` pixels; UsageError if it is too small."""
     if options.per_view is not None:
         if options.per_view > height * width:
             limit = f"{height * width}, one per pixel of {width} x {height}"

@@ -21,7 +21,7 @@ MOSTLY = 0.5  # share of a pixel's opacity above which it shows mostly the insid
 
 
 def find_region(crop: str) -> Region:
-    """Return the region of a crop, in world units."""
+    """Return the region that the text of a crop describes, in world units."""
     shape, parsed = parse_crop(crop)
     numbers = np.array(parsed)
     if shape == "sphere":
@@ -39,7 +39,7 @@ def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
 def crop_scene(scene: Scene, crop: str) -> Scene:
     """Return the scene of the Gaussians inside a crop; its photos count only at pixels that mostly show these.
 
-    Counts, fit and scores are then those of the crop. Raises UsageError if no Gaussian is inside.
+    Counts, the fit and scores then refer to the crop. Raises UsageError if no Gaussian is inside.
     """
     means, region = scene.gaussians.means, find_region(crop)
     inside = lies_inside(region, means)
@@ -47,8 +47,9 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
     if count == 0:
         remedy = "gsmerge inspect shows the extent of the scene"
         raise UsageError(f"crop: expected Gaussians of the scene in {crop}, found none; {remedy}")
-    reach = float(np.abs(region.middle).max() + region.half.max())
-    scene = replace(scene, region=replace(region, rounding=float(np.finfo(means.dtype).eps) * reach))
+    # centres on the border are inside, although coordinates as large as these are rounded
+    largest = float(np.abs(region.middle).max() + region.half.max())
+    scene = replace(scene, region=replace(region, rounding=float(np.finfo(means.dtype).eps) * largest))
     if count == scene.num_gaussians:
         return scene
     note(f"crop: {count:,} of {scene.num_gaussians:,} Gaussians are inside; counts, fit and scores refer to these")

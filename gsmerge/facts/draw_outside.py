@@ -1,7 +1,7 @@
 """Scene -> the scene with drawings of its Gaussians outside of all views.
 
-A fit to photos alone loses what no photo shows. Pictures of the input stand for photos there, so that a missing camera
-costs no more than what its photo would have added.
+A fit to photos alone loses what no photo shows. So pictures of the input are added as photos of these Gaussians. If a
+scene lacks the camera of a photo, its result then lacks only what the photo itself would have added.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from gsmerge.runtime.record import note, record_choices
 from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels, make_scene
 
 # Cameras are placed if views miss at least this share of the Gaussians. A placed camera is used if at least this share
-# of its pixels shows mainly such Gaussians. Views of fifteen captures in voxels miss at most .001 of the Gaussians, at
-# their edges. Two of four views of a narrow capture miss .02, and two of five views of another capture miss .006
+# of its pixels shows mainly such Gaussians. In fifteen captures in voxels, at most .001 of the Gaussians are outside of
+# all views. Two of the four views of a narrow capture miss .02, and two of the five views of another one .006
 LEAST_OUTSIDE = 0.005
-SOURCES, STEPS_BACK = 4, 8  # most views beside which cameras are placed, and number of cameras for each that step back
+SOURCES, STEPS_BACK = 4, 8  # number of views beside which cameras are placed, and of steps back from each
 # Bounds of the steps: back as a share of the depth, rotation to the sides, and rotation up or down, both in degrees
 BESIDE_LOW, BESIDE_HIGH = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
 
@@ -35,11 +35,11 @@ BESIDE_LOW, BESIDE_HIGH = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
 def draw_outside(scene: PicturedScene) -> PicturedScene:
     """Add pictures of the input from placed cameras, with a note, if the views miss a part of the Gaussians.
 
-    The placed cameras come last. Of their pixels, only those count that show mainly Gaussians which no view sees. The
-    scene is canonical, and its rows are not pixels. Without such a part the same scene is returned.
+    The placed cameras come last. Their pixels count only if they show mainly Gaussians that no view sees. The scene is
+    canonical, and its rows are not pixels. It is returned unchanged if its views miss too little.
     """
     outside = scene.get_pixels().homes < 0
-    if outside.mean() < LEAST_OUTSIDE or outside.all():  # cameras that see nothing are wrong, which is said later
+    if outside.mean() < LEAST_OUTSIDE or outside.all():  # if all are outside, the cameras are wrong
         return scene
     placed = _place_beside(scene.gaussians, outside, scene.cameras)
     white = np.repeat(outside.astype(np.float32)[:, None], 3, 1)  # all other Gaussians are black

@@ -31,10 +31,11 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, fill_pixels
 # shuffled and with merged rows
 HOLE_OPACITY = 0.75  # opacity of the drawing below which a pixel is empty
 # Shares of the usual opacity of a view, which is low if the export has few rows. A pixel shows nothing if its opacity
-# is below the share NOTHING. There is nothing around a pixel if the mean opacity around it is below the share SPARSE
+# is below the share NOTHING. It is in an empty part only if the mean opacity around it is below the share SPARSE
 NOTHING, SPARSE = 0.5, 0.25
-# A part stays empty if it holds a square whose sides are the share LARGE_SIDE of the picture's longer side. The squares
-# must cover at least the share LARGE_AREA of the picture. Parts are reduced by a rim of RIM_PIXELS pixels
+# A part stays empty if a square with the side LARGE_SIDE, a share of the picture's longer side, fits into it. All such
+# squares together must cover at least the share LARGE_AREA of the picture. A rim of RIM_PIXELS pixels is taken off the
+# part
 LARGE_SIDE, LARGE_AREA, RIM_PIXELS = 1 / 12, 0.12, 2
 GAP_WIDTH = 1 / 53  # beside large empty parts, only gaps narrower than this share of the longer side are filled
 MOST_EMPTY = 0.5  # from this share of empty pixels on, the scene may be only a part of what the photos show
@@ -52,29 +53,30 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     ``shown [v,h,w]`` marks pixels with a usable picture. The new Gaussians come after the others. None is added if most
     of the pixels are empty, because photos may show more than the scene. Large connected parts of a view without
     Gaussians stay empty, because the scene may have been cut out, or its model may have left out the sky. With
-    ``everywhere`` these parts are filled, too. In a cropped scene, all pixels without Gaussians stay empty. Notes say
+    ``everywhere``, these parts are filled, too. In a cropped scene, all pixels without Gaussians stay empty. Notes say
     what was filled and what stays empty.
     """
     fronts, is_cropped = scene.get_pixels().fronts, scene.region is not None
-    free, bare = shown & (fronts < 0), (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)
+    fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian of their own
+    bare = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)  # pixels that seem to show nothing
     views = [
         view
         for view in range(len(scene))
-        if is_cropped or free[view].any() or (not everywhere and large_parts(bare[view]).any())
+        if is_cropped or fillable[view].any() or (not everywhere and large_parts(bare[view]).any())
     ]
     if not views:
         return scene
-    holes, empty, edges = np.zeros_like(free), np.zeros_like(free), dict[int, _Edges]()
+    holes, empty, edges = np.zeros_like(fillable), np.zeros_like(fillable), dict[int, _Edges]()
     gap = 2 * round(GAP_WIDTH * max(shown.shape[1:]) / 2) + 1
 
     def find_holes(view: int, tiled: TiledView) -> None:
-        """Fill the rows of a view in ``empty``, ``bare`` and ``holes``, and add its depths to ``edges``."""
+        """Find the pixels of a view that stay empty, that are bare in its drawing, and that are holes to fill."""
         depths, transmittance = blend_depths(tiled)
         covered = transmittance <= 1 - HOLE_OPACITY
         if is_cropped or not everywhere:
             empty[view] = _find_empty(1 - transmittance, shown[view], gap, is_cropped=is_cropped)
         bare[view] = ~covered & ~empty[view]
-        holes[view] = free[view] & bare[view]
+        holes[view] = fillable[view] & bare[view]
         if empty[view].any():  # the edges of a scene that was cut out are no holes
             window = np.ones((gap, gap), np.uint8)
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
@@ -99,7 +101,7 @@ def _find_empty(opacity: np.ndarray, shown: np.ndarray, gap: int, *, is_cropped:
     if is_cropped:
         beside = np.ones((3, 3), np.uint8)  # a Gaussian never ends exactly between two pixels
         return np.asarray(cv2.erode((nothing & ~shown).astype(np.uint8), beside) > 0)
-    sparse = blur(opacity, gap / 4) < SPARSE * usual  # so edges of a scene that was cut out do not count
+    sparse = blur(opacity, gap / 4) < SPARSE * usual  # edges of a scene that was cut out are not sparse
     return large_parts(nothing & sparse)
 
 
@@ -136,9 +138,9 @@ def _fill_views(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Ed
 def large_parts(empty: np.ndarray) -> np.ndarray:
     """Return a mask ``[h,w]`` of the connected parts of ``empty [h,w]`` that hold a large square, without their rim.
 
-    The mask is empty if the squares cover little of the picture. Gaps, and borders that exporters leave out, are
-    narrower than the squares. Depth Anything 3 leaves out the farthest tenth of the pixels, which is less than
-    LARGE_AREA.
+    Gaps, and the borders that exporters leave out, are narrower than a large square. The mask has no pixel if all
+    squares together cover less than ``LARGE_AREA``. So the tenth of the pixels that Depth Anything 3 leaves out does
+    not count.
     """
     if empty.mean() < LARGE_AREA:
         return np.zeros_like(empty)
@@ -176,13 +178,13 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
 
 
 def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges) -> Gaussians:
-    """Make a Gaussian for each of a view's ``holes [h,w]``."""
+    """Make a Gaussian for each pixel of a view in the mask ``holes [h,w]``."""
     cameras, shN = scene.cameras, scene.gaussians.shN
     y, x = np.nonzero(holes)
     pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
     rays = matmul(matmul(pixels, invert(cameras.Ks[view]).T), cameras.viewmats[view, :3, :3])  # to depth 1
-    beside, beyond = edges.beside.astype(np.float64), edges.farthest * FACTORS[:, None]
-    candidates = np.concatenate([beside[None], np.maximum(beyond, beside)])
+    edge_depths, far_depths = edges.beside.astype(np.float64), edges.farthest * FACTORS[:, None]
+    candidates = np.concatenate([edge_depths[None], np.maximum(far_depths, edge_depths)])
     depth = _choose_depths(scene, view, holes, rays, candidates)
     eye, size = cameras.centres[view], NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
     return make_round_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
@@ -210,7 +212,8 @@ def _choose_depths(
 ) -> np.ndarray:
     """Choose one of ``depths [d,n]`` for each of ``rays [n,3]``: where the nearest other views show the same colour.
 
-    Differences of colours are averaged over neighbouring ``holes [h,w]``. If nothing decides, it is the first depth.
+    Differences of colours are averaged over neighbouring ``holes [h,w]``. If no view sees a point, the first depth is
+    chosen.
     """
     centres = scene.cameras.centres
     neighbors = [i for i in nearest_views(centres, view) if (centres[i] != centres[view]).any()][:HOLE_NEIGHBORS]

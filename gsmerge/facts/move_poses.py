@@ -1,10 +1,10 @@
 """Scene -> the scene with its cameras, and the Gaussians of their pixels, moved to poses at which the photos agree.
 
-Poses that a network predicts are wrong by some pixels. Its Gaussians have the same error, so every view agrees with
-itself but not with other views. The pixels of a view, at their depths, are projected into the photos of its neighbours.
-All poses are moved at once until the greys agree. This is direct image alignment (Engel et al., "Direct Sparse
-Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. Scenes with right poses stay unchanged
-bit for bit, after one step at the smallest size.
+Poses that a network predicts are wrong by some pixels. The Gaussians of a view have the same error as its pose, so
+every view agrees with itself but not with other views. The pixels of a view, at their depths, are projected into the
+photos of its neighbours. All poses are moved at once until the greys agree. This is direct image alignment (Engel et
+al., "Direct Sparse Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. If one step at the
+smallest size shows that the poses are right, the scene stays unchanged bit for bit.
 
 Highlights move over their surfaces with the camera, and so look like wrong poses. The comparison therefore expects the
 changes of colour that the harmonics describe. New poses are kept only if the fine detail of the photos agrees no worse
@@ -38,24 +38,26 @@ from gsmerge.types import PicturedScene
 SIDES = (60, 120, 240)  # longer side of the photos in pixels, one size after the other
 BORDER = 2  # width in pixels of the border that is not compared
 POSE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
-# Compared pixels of a view, and most steps, at the first size. They are fewer, because scenes with right poses
-# need them as well
+# Compared pixels of a view, and largest number of steps, at the first size, at which right poses are recognised. The
+# numbers are small, because scenes with right poses need this time, too
 FIRST_PIXELS, FIRST_STEPS = 600, 2
 POSE_NEIGHBOURS = 4  # number of other views with which a view is compared
-POSE_STEPS = 6  # most Gauss-Newton steps at each size
+POSE_STEPS = 6  # largest number of Gauss-Newton steps at each size
 TOGETHER = 16  # pairs of views that one task compares
 POSE_BLUR = 0.7  # blur of the photos, standard deviation in pixels
 # Detail of photos is finer than this blur, in pixels. Highlights are smooth. If new poses follow highlights, the detail
-# of surfaces agrees less than before. If it does so by more than CHANCE standard errors, the new poses are dropped
+# of surfaces agrees less than before. New poses are dropped if the loss is above CHANCE standard errors
 DETAIL, CHANCE = 2.0, 2.0
-# Prior standard error of a pose, rotation in radians and shift in canonical units; and the weight of this prior
+# Errors of poses are assumed to have these standard deviations: PRIOR_TURN in radians, and PRIOR_SHIFT in canonical
+# units. PRIOR is the weight of this assumption
 PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
-# A gain is the share of the disagreement between photos that new poses remove. Poses are moved only if the gain of some
-# view is LEAST_GAIN at every size, and if at the largest size it is VIEW_GAIN, or MEAN_GAIN for all views together.
-# Wrong depth moves views with right poses, too. Its gains at the largest size are up to 0.14 for one view and 0.06 for
-# all, and up to 0.28 and 0.18 with the track of a depth camera. If all views are half a degree off, the gain for all is
-# at least 0.22; if a single view is wrong, its gain is 0.32 (14 captures). Views with gains in between are not moved,
-# because other photos of the scene have poses in the frame of the input
+# A gain is the share of the disagreement between photos that new poses remove. Poses are moved only if some view has a
+# gain above LEAST_GAIN at every size. At the largest size, the gain of some view must also be above VIEW_GAIN, or the
+# gain of all views together above MEAN_GAIN. Right poses have gains, too, if the depth is wrong. At the largest size
+# these are up to 0.14 for a view and 0.06 for all views together; with the poses of a depth camera up to 0.28 and 0.18.
+# If all poses are wrong by half a degree, the gain of all views is at least 0.22. If a single pose is wrong, the gain
+# of its view is 0.32 (14 captures). In doubt poses stay, because other photos of the scene have poses in the input's
+# frame
 LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
 
 
@@ -76,7 +78,7 @@ class _PhotoLevel:
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """Evidence from the pixels of the first view of p pairs about its pose relative to the second."""
+    """Evidence from the pixels of the first view of each of p pairs about the relative pose of both views."""
 
     # Curvature and slope of half the squared differences for a motion of the second view. A motion of the first view
     # has the opposite effect, because only the relative pose counts
@@ -89,20 +91,20 @@ class _Evidence:
 def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = False) -> PicturedScene | None:
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
-    The photos of ``views`` show the scene; other views are not moved. With ``always`` even small errors are corrected.
-    The median motion of the views is subtracted from all. Returns None if no pose is wrong, if the photos say too
-    little, or if their detail agrees less after the move.
+    Only ``views``, whose photos show the scene, are moved. With ``always`` even small errors are corrected. The median
+    motion of the views is subtracted from all motions. Returns None if no pose is wrong, if the photos are too small or
+    do not overlap, or if their detail agrees less after the move.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
     pairs = _choose_pairs(scene, views)
     sides = [side for side in SIDES if side < largest] or [largest]
-    min_side = 24  # least number of pixels of the shorter side at the first size; smaller photos say too little
+    min_side = 24  # pixels of the shorter side at the first size; smaller photos say too little
     if len(pairs) == 0 or shortest * sides[0] < min_side * largest:
         return None
     viewmats = start
     for side in sides:
-        check = side == sides[0] != sides[-1] and not always
+        check = side == sides[0] != sides[-1] and not always  # the first size decides whether poses may be wrong
         level = _make_level(scene, pairs, largest / side, FIRST_PIXELS if check else POSE_PIXELS)
         viewmats, final = _improve_poses(level, viewmats, check=check)
         before = _gather_evidence(level, start)
@@ -130,7 +132,7 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
         points = scene.gaussians.means[rows[rows >= 0]].astype(np.float64)
         inside, _ = see_points(points, viewmats, Ks, anywhere, cameras.width, cameras.height, NEAR_PLANE, 1.0)
         seen_shares = inside.mean(1) if len(points) else np.zeros(len(inside))
-        cosines = matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3])  # of the viewing directions
+        cosines = matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3])  # between viewing directions
         overlap = seen_shares * cosines.clip(0)
         ranked = [int(i) for i in np.argsort(-overlap, kind="stable") if i != view and i in candidates]
         for neighbour in ranked[:POSE_NEIGHBOURS]:
@@ -142,7 +144,7 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
 def _make_level(
     scene: PicturedScene, pairs: np.ndarray, factor: float, samples: int, *, detail: bool = False
 ) -> _PhotoLevel:
-    """Shrink the photos by ``factor``, and sample the pixels of each photo with the largest gradients.
+    """Shrink the photos by ``factor``, and choose at most ``samples`` pixels of each photo with large gradients.
 
     With ``detail`` each photo is replaced by its difference from a blurred copy.
     """
@@ -172,10 +174,16 @@ def _make_level(
 
     pictures, points, greys, ids, depths = zip(*parallel_map(sample_view, range(len(scene))), strict=True)
     return _PhotoLevel(
-        np.stack(pictures), photos.Ks.astype(np.float64), scene.cameras.width / photos.width,
-        np.concatenate(points), _expect_greys(scene, pairs, greys, ids), np.cumsum([0, *map(len, greys)]),
-        np.stack(depths), scene.cameras.viewmats.astype(np.float64), pairs,
-    )  # fmt: skip
+        pictures=np.stack(pictures),
+        Ks=photos.Ks.astype(np.float64),
+        scale=scene.cameras.width / photos.width,
+        points=np.concatenate(points),
+        greys=_expect_greys(scene, pairs, greys, ids),
+        starts=np.cumsum([0, *map(len, greys)]),
+        depths=np.stack(depths),
+        first_viewmats=scene.cameras.viewmats.astype(np.float64),
+        pairs=pairs,
+    )
 
 
 def _expect_greys(
@@ -183,32 +191,33 @@ def _expect_greys(
 ) -> np.ndarray:
     """Return the greys ``[p,m]`` that the second view of each pair should show at the sampled points of the first.
 
-    They are the ``greys`` of the first view, changed as the harmonics of the Gaussians ``rows`` change between the two
-    views. Otherwise a highlight, which moves over its surface with the camera, would look like a wrong pose.
+    These are the ``greys`` of the first view, changed like the colours of the Gaussians ``rows`` between the two views.
+    Otherwise a highlight, which moves over its surface with the camera, would look like a wrong pose.
     """
     g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
     expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)
-    for pair, (view, other) in zip(expected, pairs, strict=True):
-        columns = [np.ascontiguousarray(values[rows[view]], np.float32) for values in (g.means, g.sh0, g.shN)]
-        ids = np.arange(len(rows[view]), dtype=np.int32)
-        here, there = np.empty((2, len(ids), 3), np.float32)
-        view_colors(*columns, ids, eyes[view], 0, len(ids), here)
-        view_colors(*columns, ids, eyes[other], 0, len(ids), there)
-        pair[: len(ids)] = greys[view] + (there.clip(max=1) - here.clip(max=1)).mean(1)  # photos show nothing brighter
+    for expected_greys, (first, second) in zip(expected, pairs, strict=True):
+        columns = [np.ascontiguousarray(values[rows[first]], np.float32) for values in (g.means, g.sh0, g.shN)]
+        ids = np.arange(len(rows[first]), dtype=np.int32)
+        first_colors, second_colors = np.empty((2, len(ids), 3), np.float32)
+        view_colors(*columns, ids, eyes[first], 0, len(ids), first_colors)
+        view_colors(*columns, ids, eyes[second], 0, len(ids), second_colors)
+        changes = second_colors.clip(max=1) - first_colors.clip(max=1)  # photos show nothing brighter than 1
+        expected_greys[: len(ids)] = greys[first] + changes.mean(1)
     return expected
 
 
 def _improve_poses(level: _PhotoLevel, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, _Evidence]:
     """Improve poses by Gauss-Newton steps at one size; return the poses, and the evidence at these poses.
 
-    With ``check`` there are few steps, and only one if it moves no view far.
+    With ``check`` there are few steps, and a single one if it shows that the poses are right.
     """
     max_steps = FIRST_STEPS if check else POSE_STEPS
-    early_px = 1.0  # poses are considered right if the first step moves all views by less than this, in pixels
+    right_px = 1.0  # poses are considered right if the first step moves all views by less than this, in pixels
     min_step = 1e-4  # a smaller step, in radians and canonical units, is the last
     for step in range(max_steps + 1):
         evidence = _gather_evidence(level, viewmats)
-        if step == max_steps or (check and step == 1 and _view_flows(level, evidence).max() < early_px):
+        if step == max_steps or (check and step == 1 and _view_flows(level, evidence).max() < right_px):
             break
         change = _solve_step(level, viewmats, evidence)
         viewmats = matmul(viewmats, motion_matrices(change))
@@ -222,12 +231,12 @@ def _solve_step(level: _PhotoLevel, viewmats: np.ndarray, evidence: _Evidence) -
     prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
     curvature, slope = np.diag(prior), prior * motion_vectors(level.first_viewmats, viewmats).ravel()
     pairs = zip(level.pairs.tolist(), evidence.curvatures, evidence.slopes, strict=True)
-    for (a, b), pair_curvature, pair_slope in pairs:
-        rows, columns = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
-        for row, column, sign in ((rows, rows, 1), (columns, columns, 1), (rows, columns, -1), (columns, rows, -1)):
-            curvature[row, column] += sign * pair_curvature
-        slope[rows] -= pair_slope
-        slope[columns] += pair_slope
+    for (view, other), pair_curvature, pair_slope in pairs:
+        a, b = slice(6 * view, 6 * view + 6), slice(6 * other, 6 * other + 6)  # the motions of both views
+        for rows, columns, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
+            curvature[rows, columns] += sign * pair_curvature
+        slope[a] -= pair_slope
+        slope[b] += pair_slope
     damping = 1e-3  # damping of the steps, relative to the curvature
     curvature[np.diag_indices(len(curvature))] *= 1 + damping
     return -solve(curvature, slope).reshape(-1, 6)
@@ -239,11 +248,12 @@ def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:
     evidence = _Evidence(np.empty((count, 6, 6)), np.empty((count, 6)), np.empty(count), np.empty(count))
 
     def compare_pairs(begin: int) -> None:
-        # fills the rows of the evidence; the two arrays before it are scratch
+        """Fill the evidence of a few pairs."""
+        scratch, scratch_ids = np.empty((SCRATCH_COLUMNS, max_points)), np.empty(max_points, np.int64)
         compare_views(
             level.points, level.greys, level.starts, level.pairs, viewmats, level.first_viewmats, level.Ks,
             level.pictures, level.depths, NEAR_PLANE, BORDER, level.scale, begin, min(begin + TOGETHER, count),
-            np.empty((SCRATCH_COLUMNS, max_points)), np.empty(max_points, np.int64), *vars(evidence).values(),
+            scratch, scratch_ids, evidence.curvatures, evidence.slopes, evidence.costs, evidence.flows,
         )  # fmt: skip
 
     parallel_map(compare_pairs, range(0, count, TOGETHER))
@@ -251,15 +261,15 @@ def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:
 
 
 def _view_flows(level: _PhotoLevel, evidence: _Evidence) -> np.ndarray:
-    """Return the shift ``[v]``, in pixels, of the pixels of each view since the input: the median over its pairs."""
+    """Return by how many pixels ``[v]`` the points of each view have moved since the input, the median of its pairs."""
     flows = [evidence.flows[(level.pairs == view).any(1)] for view in range(len(level.first_viewmats))]
     return np.array([median(view_flows) if len(view_flows) else 0.0 for view_flows in flows])
 
 
 def _any_wrong(level: _PhotoLevel, before: _Evidence, after: _Evidence, *, end: bool) -> bool:
-    """Return whether some view moved far and now agrees better with other views; at the ``end``, whether much better.
+    """Return whether some view moved far, and now agrees better with other views.
 
-    At the ``end`` it is also enough that some view moved far, and that all views together agree better.
+    At the ``end`` the view has to agree much better, or all views together have to agree better.
     """
     limit_px = 1.5  # a pose counts as wrong if it moves by more than this, in pixels of the views
     is_far = _view_flows(level, after) > limit_px

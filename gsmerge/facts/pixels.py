@@ -1,11 +1,12 @@
-"""Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel; sizes of at least a pixel's low-pass.
+"""Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel; also raise sizes far below a pixel.
 
 Pixels are found by projection of centres. Each view is divided into cells that are wider than the distances between
-neighbouring Gaussians. Gaussians behind the front of a cell are hidden. A pixel without a centre in it shows the front
-of its cell.
+neighbouring Gaussians. The front of a cell is the Gaussian that its pixels show most. Gaussians behind it are hidden. A
+pixel without a centre in it shows the front of its cell.
 
-A view draws every Gaussian with the low-pass of its pixels added. So Gaussians far smaller than a pixel, such as points
-that all got one tiny size, look sound. Steps that use their sizes without drawing them would find an empty scene.
+A renderer widens every Gaussian by the low-pass filter of the pixels. So Gaussians that are far smaller than a pixel,
+such as points that all got one tiny size, look sound. But functions that use the sizes without rendering would find an
+empty scene.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT
 
-# Only cells whose neighbours all have a centre are examined. Cells are wide enough if at least this share of them has a
-# centre. Six captures in voxels with a share of .97 or more give the same result as drawing. Two with .93 and .95 lose
-# 1.5 and 5 dB
+# Cells are wide enough if at least this share of them has a centre. Only cells whose neighbours all have a centre are
+# examined. Of eight captures in voxels, six with shares of at least .97 give the same result as rendering. Two with .93
+# and .95 lose 1.5 and 5 dB
 COVERED_CELLS = 0.96
 SHOWN_WIDTH = 4.0  # width of a Gaussian that shows nearly all of it, in standard deviations
 ESTIMATE_GAUSSIANS = 10_000  # medians and shares are estimated from at least this many Gaussians, if there are as many
 SAME_DEPTH = 1.05  # a centre is on the surface of its cell up to this multiple of the depth of the cell's front
 LOW_PASS = math.sqrt(EPS2D)  # standard deviation of the low-pass, pixels
 # The low-pass hides a Gaussian whose scales are all below the share HIDDEN_SIZE of the low-pass. If less than the share
-# FEWEST_HIDDEN of the Gaussians is hidden, nothing changes. A fit repairs so few, and in placed views of scenes without
-# cameras up to .05 are hidden
+# FEWEST_HIDDEN of the Gaussians is hidden, nothing changes, because a fit repairs so few. In placed views of sound
+# scenes up to .05 are hidden
 HIDDEN_SIZE, FEWEST_HIDDEN = 0.5, 0.1
 
 
@@ -48,22 +49,23 @@ def with_pixels(scene: SceneT) -> SceneT:
 def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     """Return a canonical scene in which Gaussians that the low-pass hides have the size of the low-pass, with a note.
 
-    Gaussians that share a pixel may be smaller, since each shows a part of it. So views with few pixels change no sound
-    scene. If the cameras were ``placed``, the distance to the nearest Gaussian takes the place of a pixel.
+    Gaussians that share a pixel may be smaller, because each shows a part of it. Otherwise views with few pixels would
+    change sound scenes. If the cameras were ``placed``, sizes are compared with the distance to the nearest Gaussian
+    instead of a pixel.
     """
     g, cameras, by_distance = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
     step = max(1, len(g) // ESTIMATE_GAUSSIANS)
     units = measure_pixel_sizes(g.means[::step], homes[::step], cameras)
-    if by_distance:  # a sample of the Gaussians of a surface lies farther apart
+    if by_distance:  # the Gaussians of a sample are farther apart than all Gaussians
         units = np.minimum(units, find_nearest(g.means[::step], 1)[1][:, 0] / math.sqrt(step))
     if (g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units).mean() < FEWEST_HIDDEN:
         return scene
     units = find_nearest(g.means, 1)[1][:, 0] if by_distance else measure_pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | by_distance
     num_sharing = 1 if by_distance else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
-    # a size of 1 is the scene's median depth
-    hidden = (sizes * np.sqrt(num_sharing) < HIDDEN_SIZE * LOW_PASS * units) & (units < 1)
+    is_near = units < 1  # a pixel that is as large as the scene's median depth, or larger, is no measure
+    hidden = (sizes * np.sqrt(num_sharing) < HIDDEN_SIZE * LOW_PASS * units) & is_near
     if np.count_nonzero(hidden & seen) <= FEWEST_HIDDEN * np.count_nonzero(seen):
         return scene
     share, usual = 100 * hidden.mean(), np.median(sizes[hidden] / units[hidden])
@@ -82,7 +84,7 @@ def find_pixels(scene: Scene) -> Pixels:
     In each view, the weight of a Gaussian is opacity x transmittance x area in pixels. The pixel of a Gaussian is the
     one with its centre in the view of its largest weight, or in the first such view. It is -1 if no view sees the
     Gaussian. The front of a pixel is the Gaussian with the largest opacity x transmittance among those with a centre in
-    the pixel. If there are none, the pixel has the front of its cell, or -1 if the cell is empty.
+    the pixel. If there are none, the pixel has the front of the cell around it, or -1 if the cell is empty.
     """
     g, cameras, count = scene.gaussians, scene.cameras, len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
@@ -118,13 +120,15 @@ def _weigh_view(
     level = choose_level(
         shown, SHOWN_WIDTH * float(np.sqrt(np.median(np.abs(areas[:: max(1, len(areas) // ESTIMATE_GAUSSIANS)]))))
     )
+    # first the fronts of all cells, then the fronts of pixels from the Gaussians on the surface of their cell
     order, (cells, shape) = order_by_depth(depths), _cells_of(pixels, fronts.shape, level)
     grid_fronts = np.empty(shape, np.int32)
     weights = weigh_centres(order, ids, cells, areas, opacities, grid_fronts)  # fills `grid_fronts`
     cell_fronts = grid_fronts.reshape(-1)
     front_depths = depths[np.searchsorted(ids, cell_fronts).clip(max=len(ids) - 1)]
     max_depths = SAME_DEPTH * np.where(cell_fronts >= 0, front_depths, np.inf)
-    weigh_centres(order[(depths <= max_depths[cells])[order]], ids, pixels, areas, opacities, fronts)  # fills `fronts`
+    on_surface = (depths <= max_depths[cells])[order]
+    weigh_centres(order[on_surface], ids, pixels, areas, opacities, fronts)  # fills `fronts`
     pixel_cells, _ = _cells_of(np.arange(fronts.size, dtype=np.int32), fronts.shape, level)
     np.copyto(fronts, cell_fronts[pixel_cells].reshape(fronts.shape), where=fronts < 0)
     return ids, pixels, weights

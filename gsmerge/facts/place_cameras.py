@@ -20,8 +20,8 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
-NUM_VIEWS = 24  # most cameras that are placed
-HELD_OUT = 8  # one in so many placed cameras is held out from the fit, for scores
+NUM_VIEWS = 24  # largest number of cameras that are placed
+HELD_OUT = 8  # every HELD_OUT-th placed camera is not used in the fit, but only for scores
 FITTED = 16  # cameras of each kind to which a scene without cameras is fitted; on a walk half as many
 CANDIDATE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
 AROUND_CAMERAS = 40  # candidate cameras around the scene
@@ -34,10 +34,10 @@ INSIDE_FIELD, INSIDE_PIXEL = 5 / 3, 1.5
 PROBE = 96  # pixels per side of the pictures for choosing candidates
 SMALLEST_PIXELS, LARGEST_PIXELS = 96, 640  # pixels per side
 NEAR_PLANE_SHARE = 0.02  # near plane, as a share of the scene's radius
-# Number of nearest views of each view between which cameras are placed, and the share of the way at which they stand
+# Cameras are placed between a view and its PAIRS nearest views, at the share MIDDLE of the way
 PAIRS, MIDDLE = 2, 0.5
 WIDEST = np.pi / 4  # the space between two views is unknown if the angle between them is larger
-# With at most this many views, a fit to renders also gets views between them. A fit does not memorise more views
+# With at most this many views, a fit to renders also gets views between them, because it would memorise so few views
 FEW_RENDERED_VIEWS = 24
 OUTSIDE_SHARE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share of all views, and its maximum
 # Bounds of the views from outside: step back as a share of the depth, rotation to the sides, and rotation up or down,
@@ -56,16 +56,17 @@ NO_VIEWS = (
 
 
 def add_views(scene: Scene, *, shown: bool = False) -> Scene:
-    """Keep the finite Gaussians, of which there must be one, and place cameras if there are none; notes say so.
+    """Keep the finite Gaussians, and place cameras if there are none; notes say so.
 
-    ``shown``: place cameras for people to look from, as :func:`place_viewpoints` does.
+    The cameras are those of a fit, or with ``shown``, those of :func:`place_viewpoints`, which are for people. Raises
+    ValueError if no Gaussian is finite.
     """
     scene = keep_finite(scene)
     if len(scene) == 0:
         inside = place_inside(scene.gaussians)
         note(NO_VIEWS if inside is None else VIEWER_VIEWS)
         cameras = inside or (_place_around_and_inside if shown else place_around)(scene.gaussians)
-        order = sorted(range(len(cameras)), key=lambda view: (view + 1) % HELD_OUT != 0)  # first those for scores
+        order = sorted(range(len(cameras)), key=lambda view: (view + 1) % HELD_OUT != 0)  # held-out cameras come first
         scene = _with_cameras(scene.gaussians, cameras if shown else cameras[order])
     return scene
 
@@ -76,12 +77,13 @@ def _with_cameras(gaussians: Gaussians, cameras: Cameras) -> Scene:
 
 
 def place_inside(gaussians: Gaussians) -> Cameras | None:
-    """Place cameras where a scene's viewer stands, looking to all sides; None if it was not made around a viewer."""
+    """Place cameras around a viewer's place, looking to all sides; None if the scene was not made around a viewer."""
     viewer = find_viewer(gaussians[:: -(-len(gaussians) // CANDIDATE_GAUSSIANS)])
     if viewer is None:
         return None
     size = int(np.clip(round(INSIDE_FIELD / (INSIDE_PIXEL * viewer.angle)), SMALLEST_PIXELS, LARGEST_PIXELS))
-    radii = viewer.free * power(np.arange(NUM_VIEWS) * GOLDEN / np.pi % 1, 1 / 3)  # spread evenly in the free ball
+    # cube roots, so that the cameras fill the empty ball evenly
+    radii = viewer.free_radius * power(np.arange(NUM_VIEWS) * GOLDEN / np.pi % 1, 1 / 3)
     eyes = viewer.place + radii[:, None] * spread_directions(NUM_VIEWS)[::-1]
     viewmats = np.stack(
         [_look_along(eye, direction) for eye, direction in zip(eyes, spread_directions(NUM_VIEWS), strict=True)]
@@ -127,7 +129,7 @@ def place_around(gaussians: Gaussians, count: int = FITTED) -> Cameras:
     """Place cameras to which a scene without cameras is fitted, and on which results are scored.
 
     There are ``count`` cameras far away, ``count`` near by, at most ``count`` at positions that show most of the scene,
-    and half as many on a walk.
+    and ``count / 2`` on a walk through the scene.
     """
     means = thin_out(gaussians, CANDIDATE_GAUSSIANS).means.astype(np.float64)
     centre, half = _robust_box(means)
@@ -165,15 +167,18 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
     if views <= FEW_RENDERED_VIEWS:
         more = concat_cameras(between_cameras(scene.cameras), more)
     drawn = draw_pictures(_with_cameras(scene.gaussians, more))
-    names = (*scene.names, *(f"around {view}" for view in range(len(more))))
     return replace(
-        scene, cameras=concat_cameras(scene.cameras, more), names=names, pixels=None,
-        images=np.concatenate([scene.images, drawn.images]), empty=np.concatenate([scene.empty, drawn.empty]),
-    )  # fmt: skip
+        scene,
+        cameras=concat_cameras(scene.cameras, more),
+        names=(*scene.names, *(f"around {view}" for view in range(len(more)))),
+        pixels=None,
+        images=np.concatenate([scene.images, drawn.images]),
+        empty=np.concatenate([scene.empty, drawn.empty]),
+    )
 
 
 def between_cameras(cameras: Cameras, *further: float) -> Cameras:
-    """Place cameras half way from each of two or more views to the nearest other views.
+    """Place a camera half way between each of two or more views and its nearest other views.
 
     For each of the shares ``further``, each view gets one more camera at this share of the way to its nearest view.
     Cameras lie on the screw motion from one pose to the other, so they look at the point at which both views look.
@@ -181,9 +186,10 @@ def between_cameras(cameras: Cameras, *further: float) -> Cameras:
     """
     viewmats = cameras.viewmats.astype(np.float64)
     nearest = [nearest_views(cameras.centres, view)[:PAIRS] for view in range(len(cameras))]
-    middle = {(min(view, i), max(view, i)): MIDDLE for view, neighbours in enumerate(nearest) for i in neighbours}
-    beside = [((view, neighbours[0]), share) for share in further for view, neighbours in enumerate(nearest)]
-    pairs, shares = (np.array(column) for column in zip(*middle.items(), *beside, strict=True))
+    # each camera is a pair of views and a share of the way from the first view to the second
+    half_way = {(min(view, i), max(view, i)): MIDDLE for view, neighbours in enumerate(nearest) for i in neighbours}
+    at_shares = [((view, neighbours[0]), share) for share in further for view, neighbours in enumerate(nearest)]
+    pairs, shares = (np.array(column) for column in zip(*half_way.items(), *at_shares, strict=True))
     motions = motion_vectors(viewmats[pairs[:, 0]], viewmats[pairs[:, 1]])
     is_narrow = (motions[:, :3] ** 2).sum(1) <= WIDEST**2
     views, moves = pairs[is_narrow, 0], motion_matrices((shares[:, None] * motions)[is_narrow])
@@ -221,8 +227,7 @@ def _square_intrinsics(size: int, field: float = FIELD) -> np.ndarray:
 
 def _robust_box(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centre ``[3]`` and half sides ``[3]`` of the box that contains most of the means ``[n,3]``."""
-    # Quantiles of the positions along each axis between which the scene is assumed to lie
-    extent_quantiles = (0.05, 0.95)
+    extent_quantiles = (0.05, 0.95)  # positions along each axis between which the scene is assumed to lie
     low, high = np.quantile(means, extent_quantiles, axis=0)
     half = (high - low) / 2
     widest = float(half.max()) if half.max() > 0 else 1.0
@@ -255,10 +260,12 @@ def _viewmats_on_walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.nd
     steps = 2 * (np.arange(count) + 0.5) / count - 1
     angles = GOLDEN * np.arange(count)
     directions = cos(angles)[:, None] * along + sin(angles)[:, None] * side
-    pairs = zip(steps, directions, strict=True)
     walk_share = 0.6  # largest distance from the middle, as a share of the longest half axis
     return np.stack(
-        [_look_along(middle + step * walk_share * half.max() * along, direction) for step, direction in pairs]
+        [
+            _look_along(middle + step * walk_share * half.max() * along, direction)
+            for step, direction in zip(steps, directions, strict=True)
+        ]
     )
 
 
@@ -277,9 +284,10 @@ def _look_along(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def choose_showing(sample: Gaussians, candidates: Cameras, counting: np.ndarray, least_added: float) -> list[int]:
-    """Choose candidates that show as much as possible of the ``counting [n]`` Gaussians of a canonical sample.
+    """Choose candidates that show as much as possible of the Gaussians in the mask ``counting [n]`` of a sample.
 
-    The next candidate has to add more than the share ``least_added`` of what those before it show.
+    A further candidate must add more than the share ``least_added`` to what those before it show. The sample is
+    canonical.
     """
     shares = _shares_seen(sample, resize_cameras(candidates, PROBE, PROBE), NEAR_PLANE)
     return _choose_candidates(shares[:, counting], NUM_VIEWS, least_added)
@@ -299,10 +307,10 @@ def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndar
 
 
 def _choose_candidates(shares: np.ndarray, num_views: int, least_added: float) -> list[int]:
-    """Choose at most ``num_views`` candidates, at least one; the next one always adds most to the opacity shown so far.
+    """Choose one to ``num_views`` candidates, each of which adds most to the opacity that those before it show.
 
-    ``shares [c,n]`` are those of :func:`_shares_seen`. A candidate that adds less than the share ``least_added`` ends
-    the choice.
+    ``shares [c,n]`` is the result of :func:`_shares_seen`. No more candidates are chosen if each of them would add at
+    most the share ``least_added``.
     """
     seen = np.zeros(shares.shape[1], np.float32)
     candidates: list[int] = []

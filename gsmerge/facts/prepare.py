@@ -38,18 +38,18 @@ FLAT = 2 / 255  # a picture shows one flat colour if the range of its values is 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Pictures of a canonical scene that a result is fitted to and scored on."""
+    """Which pictures of a canonical scene a result is fitted to and scored on."""
 
     name: str  # "photos", or the name of the pictures that replace them
     score_views: tuple[int, ...]  # Views whose pictures results are scored on
-    # True if the scene has no views of its own. The views for scores were placed then, and no fit sees them
+    # True if the scene has no views of its own. Then all views are placed, and no fit sees those for scores
     placed: bool = False
     # [v,h,w,3] unchanged photos of the input scene, if the run changed some of them
     photo_files: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def of_views(self) -> bool:
-        """Return whether the pictures show the scene's own views and are more than renders of the scene."""
+        """Return whether the pictures are photos or the colours of the views' own Gaussians, and not renders."""
         return self.name != RENDERS
 
 
@@ -69,15 +69,14 @@ class Prepared:
     @property
     def size(self) -> SceneSize:
         """Sizes of the scene that the plan depends on."""
-        measured = self.input_scene if self.reference.placed else self.scene
-        reference = self.reference
-        size = measure_size(measured, rendered=not reference.of_views)
+        own_views = self.input_scene if self.reference.placed else self.scene  # placed views do not count
+        size = measure_size(own_views, rendered=not self.reference.of_views)
         # Gaussians that fill holes are not in the file and do not count
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 
     @cached_property
     def doubt(self) -> str | None:
-        """Why scores of the scene and of its results mean nothing, in one sentence; None if they mean something."""
+        """Why scores of the scene and of its results mean nothing, as one sentence; None if scores are meaningful."""
         unlike = unlike_captures(self.scene.gaussians[sample_rows(self.scene)])
         if unlike is not None:
             return unlike
@@ -88,7 +87,7 @@ class Prepared:
 
     @cached_property
     def scene_around(self) -> PicturedScene:
-        """The canonical scene with further renders, from around its views, which a fit to renders needs."""
+        """The canonical scene with more renders, from places around its views. A fit to renders needs them."""
         return draw_around(self.scene)
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
@@ -122,9 +121,9 @@ def prepare(
     """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
     ``frame`` is the canonical frame; None: the scene's own. ``fill``: add Gaussians at pixels that only pictures show.
-    ``outside``: draw pictures of what no view sees; False if these views are a part of others that see it. ``pixels``:
-    find the pixels of placed views, which superpixels need. Raises ValueError if there is no finite Gaussian, or if
-    there are images without cameras.
+    ``outside``: draw pictures of Gaussians that no view sees; False if other views of a larger scene see them.
+    ``pixels``: find the pixels of placed views, which superpixels need. Raises ValueError if there is no finite
+    Gaussian, or if there are images without cameras.
     """
     options = options or PrepareOptions()
     input_scene, (scene, repeated, notes) = scene, without_repeats(scene)
@@ -153,7 +152,7 @@ def prepare(
 
 
 def _photos_before(input_scene: Scene, prepared: Prepared) -> np.ndarray | None:
-    """Return the photos of the input scene if a pixel that counts in scores was changed; otherwise None."""
+    """Return the photos of the input scene if preparation changed a pixel that counts in scores, else None."""
     photos, scored = prepared.scene.images, prepared.reference.score_views
     if input_scene.images is None or prepared.reference.name != PHOTOS or photos is input_scene.images:
         return None
@@ -169,12 +168,12 @@ def _photos_before(input_scene: Scene, prepared: Prepared) -> np.ndarray | None:
 def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
     """Return a copy with Gaussians added at pixels that pictures show and no Gaussian covers; see :func:`fill_holes`.
 
-    Views whose pictures no longer count anywhere are not scored.
+    A view is no longer scored if all of its pixels stay empty.
     """
-    scene, views = prepared.scene, prepared.reference.score_views  # the views whose photos show the scene
+    scene, views = prepared.scene, prepared.reference.score_views
     shown = np.zeros(scene.images.shape[:3], bool)
-    by_rows = prepared.reference.name == ROW_COLORS  # gaps in these pictures have the colours beside them
-    shown[list(views)] = True if by_rows or scene.masks is None else scene.masks[list(views)]
+    has_row_colors = prepared.reference.name == ROW_COLORS  # these pictures have colours at all pixels
+    shown[list(views)] = True if has_row_colors or scene.masks is None else scene.masks[list(views)]
     filled = fill_holes(scene, shown, everywhere=options.extent == "photos")
     reference = prepared.reference
     if filled.empty is not None and filled.masks is not None:
@@ -192,25 +191,25 @@ def _prepare_pictures(
     used. If views have no Gaussians of their own, renders of the scene are used. Views with Gaussians of their own and
     photos also get one exposure, and poses at which the photos agree.
     """
-    own = canonical.has_own_pixels
-    stand_in = partial(add_row_colors, has_photos=canonical.images is not None) if own else blank_pictures
-    scene, views = _with_pictures(canonical, stand_in, options.look)
+    has_own, has_photos = canonical.has_own_pixels, canonical.images is not None
+    stand_in = partial(add_row_colors, has_photos=has_photos) if has_own else blank_pictures
+    scene, photo_views = _with_pictures(canonical, stand_in, options.look)
     every = tuple(range(len(scene)))
-    if views:
-        reference = Reference(PHOTOS, views)
-    elif own:
+    if photo_views:
+        reference = Reference(PHOTOS, photo_views)
+    elif has_own:
         reference = Reference(ROW_COLORS, every)
     else:
         placed, lacks_photos = len(input_scene) == 0, input_scene.images is None
         reason = "no photos, and the rows are not the pixels of the views" if lacks_photos else "photos do not count"
         remedy = "; name photos with --images" if lacks_photos else ""
-        if not placed:  # of placed views another note says so
+        if not placed:  # if views were placed, another note has said this
             note(f"{reason}: renders of the scene itself are used instead{remedy}")
         scene, scored = draw_pictures(scene), every[: len(every) // HELD_OUT] if placed else every
-        shown = tuple(view for view in scored if scene.images[view].any())  # in an empty view any result is right
+        shown = tuple(view for view in scored if scene.images[view].any())  # any result is right in an empty view
         return Prepared(input_scene, scene, frame, Reference(RENDERS, shown or scored, placed), repeated, False)
     input_scene, moved = _with_photos(input_scene, scene, repeated), None
-    if own:  # each view's Gaussians have the exposure and the pose of the view
+    if has_own:  # each view's Gaussians have the exposure and the pose of the view
         scene = equalise_exposure(scene, reference.score_views, options.exposure)
         fixed, always = options.poses == "fixed", options.poses == "free"
         moved = None if fixed else move_poses(scene, reference.score_views, always=always)
@@ -220,9 +219,9 @@ def _prepare_pictures(
 def _with_pictures(
     scene: Scene, stand_in: Callable[[Scene], PicturedScene], look: Look
 ) -> tuple[PicturedScene, tuple[int, ...]]:
-    """Return a scene with pictures, and the views whose photos show it.
+    """Return a scene with its photos as pictures, and the views whose photos show it.
 
-    If there are no such views, ``stand_in`` makes the pictures.
+    If no photo shows it, no views are returned, and ``stand_in`` makes the pictures.
     """
     if scene.images is not None:
         pictured, views = compare_photos(PicturedScene.with_pictures(scene, scene.images, scene.masks), look)
@@ -232,38 +231,37 @@ def _with_pictures(
 
 
 def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:
-    """Return a scene without repeated views, the index in it of every input view, and notes on repeated views."""
+    """Return a scene without repeated views, the index in it of every input view, and notes on the repeated ones."""
     views, repeated = distinct_views(scene)
     count = len(scene) - len(views)
     if not count:
         return scene, repeated, []
-    if count == 1:
-        return subset(scene, views), repeated, ["1 view repeats another in every pixel and counts once"]
-    return subset(scene, views), repeated, [f"{count} views repeat others in every pixel and count once"]
+    one = "1 view repeats another in every pixel and counts once"
+    notes = [one if count == 1 else f"{count} views repeat others in every pixel and count once"]
+    return subset(scene, views), repeated, notes
 
 
 def views_notes(scene: Scene) -> list[str]:
     """Return the notes of a run about repeated views and about missing views or photos, without comparing colours."""
     if len(scene) == 0:
         return [NO_VIEWS if place_inside(scene.gaussians) is None else VIEWER_VIEWS]
-    shows_rows = scene.images is None and scene.is_shown and len(scene) > 0  # the rows' own colours replace photos
-    return [*without_repeats(scene)[2], *([NO_PHOTOS] if shows_rows else [])]
+    return [*without_repeats(scene)[2], *([NO_PHOTOS] if scene.images is None and scene.is_shown else [])]
 
 
 def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
-    """Return a scene with its pictures for scores, and True if :func:`prepare` changes its photos.
+    """Return a scene with its pictures for scores, and whether :func:`prepare` would change these pictures.
 
-    The pictures are those of :func:`prepare`. If photos are missing, have another look, or do not show the scene, the
-    pictures of a scene with pixels have the colours of its own rows.
+    The pictures are the photos. If photos are missing, have another look, or do not show the scene, and if views have
+    Gaussians of their own, the pictures have the colours of these Gaussians.
     """
-    has_colors = scene.has_own_pixels and len(scene) > 0
-    if len(scene) == 0 or len(scene.gaussians) == 0 or not (has_colors or scene.images is not None):
+    has_pictures = scene.has_own_pixels or scene.images is not None
+    if len(scene) == 0 or len(scene.gaussians) == 0 or not has_pictures:
         return scene, False
     with record_part(silent=True) as record:
         canonical = canonicalise(scene)[0]
         if scene.images is not None:
             compared, views = compare_photos(PicturedScene.with_pictures(canonical, scene.images, scene.masks))
-            if views or not has_colors:
+            if views or not scene.has_own_pixels:
                 if canonical.has_own_pixels:
                     equalise_exposure(compared, views, "auto")
                 return scene, not views or bool(record.choices)

@@ -41,15 +41,19 @@ class SceneSize:
 def measure_size(scene: Scene, rendered: bool | None = None) -> SceneSize:
     """Return the sizes of a scene.
 
-    ``rendered`` is as in :class:`SceneSize`. None: views with photos count as pictured, whatever the photos show.
+    ``rendered`` is the field of :class:`SceneSize`. If it is None, photos are assumed to show the scene.
     """
-    rendered = not scene.is_shown if rendered is None else rendered
-    cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
+    cameras = scene.cameras.numpy()  # Gaussians on a GPU stay there, because only their number is needed
     return SceneSize(
-        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.has_own_pixels, rendered,
+        num_gaussians=scene.num_gaussians,
+        num_views=len(scene),
+        height=cameras.height,
+        width=cameras.width,
+        has_own_pixels=scene.has_own_pixels,
+        rendered=not scene.is_shown if rendered is None else rendered,
         num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
         sh_degree=scene.gaussians.sh_degree,
-    )  # fmt: skip
+    )
 
 
 def unlike_captures(gaussians: Gaussians) -> str | None:

@@ -17,7 +17,7 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, make_scene
 
-# A view shows a Gaussian if its blending weight in some pixel is at least this; a fit has the same threshold
+# A view shows a Gaussian if the Gaussian's blending weight in some pixel is at least this, the least weight in a fit
 SHOWN_WEIGHT = FitOptions().min_contribution
 
 
@@ -43,6 +43,6 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
 
 def count_views_in_world(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
-    """Count the views that show each of n Gaussians in their own world, ``[n]`` int32; there is at least one view."""
+    """Count the views that show each of n Gaussians in the world frame, ``[n]`` int32; there must be a view."""
     frame = scene_frame(make_scene(gaussians, cameras))
     return count_views(frame.enter(gaussians), frame.enter_cameras(cameras))

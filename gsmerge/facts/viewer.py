@@ -18,11 +18,11 @@ from gsmerge.types import Gaussians
 
 GOLDEN = np.pi * (1 + math.sqrt(5))  # angle between successive directions that spreads them evenly
 ALIKE = 0.5  # logarithms of the Gaussians' angles have to vary less than this share of those of their sizes
-# A place is likely if its error is at most this multiple of the least error. From the other side of a plane, sizes are
-# explained equally well. Of the likely places, the viewer's is the one around which most directions show Gaussians
+# A place is likely if its error is at most this multiple of the least error. If a scene is one plane, places on both
+# sides of it have equal errors. Of the likely places, the one with Gaussians in most directions is the viewer's
 LIKELY = 1.1
 CELLS = 100  # cells of directions, half of which the scene has to cover
-# The radius around a viewer in which nothing is, as a share of a distance; and the share of Gaussians that are nearer
+# The radius of the empty space around a viewer is the share FREE of a distance. NEAR_SHARE of the Gaussians are nearer
 # than this distance
 FREE, NEAR_SHARE = 0.25, 0.05
 
@@ -32,7 +32,7 @@ class Viewer:
     """The viewer around whom a scene was made."""
 
     place: np.ndarray  # ``[3]``
-    free: float  # radius around the place in which nothing is
+    free_radius: float  # radius of the empty space around the place
     angle: float  # median angle at which the viewer sees a Gaussian's standard deviation, radians
 
 
@@ -45,7 +45,7 @@ def find_viewer(gaussians: Gaussians) -> Viewer | None:
     if not sizes.all() or _spread_of_logs(sizes) == 0:
         return None
     order = np.argsort(sizes, kind="stable")
-    # the search begins in the middle of the smaller half of the Gaussians, which are nearer, and at a direct solution
+    # the search has two starts: the middle of the smaller Gaussians, which are nearer, and a direct solution
     starts = np.median(means[order[: (len(means) + 1) // 2]], 0), _solve_squares(means, sizes)
     solutions = [_solve_place(means, sizes, start) for start in starts]
     least = min(error for _, error in solutions)
@@ -71,7 +71,7 @@ def _solve_place(means: np.ndarray, sizes: np.ndarray, place: np.ndarray) -> tup
     """
     error = math.inf
     rounds = 8  # number of steps
-    doubt_factor = 2.0  # an error counts half if it is this multiple of the median error
+    doubt_factor = 2.0  # an error gets half the weight if it is this multiple of the median error
     least_error = 1e-3  # added to this multiple, so that weights are finite if half of the errors are 0
     for _ in range(rounds):
         offsets = means - place
@@ -105,7 +105,7 @@ def _spread_of_logs(values: np.ndarray) -> float:
 
 
 def spread_directions(count: int) -> np.ndarray:
-    """Return directions ``[count,3]`` spread evenly over the spread_directions (golden spiral)."""
+    """Return directions ``[count,3]`` that are spread evenly over the sphere (golden spiral)."""
     i = np.arange(count) + 0.5
     height, angle = 1 - 2 * i / count, GOLDEN * i
     radius = np.sqrt(1 - height**2)

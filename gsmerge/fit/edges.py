@@ -1,9 +1,9 @@
 """Cut the Gaussians of a fit at the edges of the views, because no photo shows how far they reach beyond.
 
-The edges are here the four borders of each picture. In space, an edge is the plane through the camera and that border.
-A viewer who steps back sees Gaussians that reach across the edges as a soft rim and as clouds around the scene. The
-cut makes a Gaussian smaller, but its border stays soft, the softer the larger it is. So large ones are split along the
-edge after the fit.
+A view has four edges, the borders of its picture. In space, an edge is the plane through the camera and a border. A
+viewer who steps back sees Gaussians that reach across the edges as a soft rim and as clouds around the scene. A cut
+makes a Gaussian smaller. The border of a large Gaussian is still wide and soft after the cut, so large Gaussians are
+also split along the edge after the fit.
 """
 
 from __future__ import annotations
@@ -74,53 +74,53 @@ def cut_state(state: FitState, edges: Edges) -> None:
     sizes = np.maximum(log(scales), state.min_sizes[rows, None])
     x[rows, :SIZE], x[rows, SIZE:QUAT], x[rows, QUAT:LOGIT] = means[rows], sizes, quats
     state.x0[rows, :SIZE] = means[rows]
-    state.x0[rows, SIZE:QUAT] = np.sort(
-        state.x0[rows, SIZE:QUAT], 1
-    )  # because the scales along the new axes are in rising order
+    state.x0[rows, SIZE:QUAT] = np.sort(state.x0[rows, SIZE:QUAT], 1)  # in rising order, as along the new axes
     state.m[rows, :LOGIT] = 0  # because the momentum was along the old axes
     splats.means[rows], splats.scales[rows], splats.quats[rows] = means[rows], exp(x[rows, SIZE:QUAT]), quats
 
 
 def _compute_cuts(splats: Splats, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut Gaussians with the C kernel, without changing them.
+    """Compute how Gaussians would be cut at the edges.
 
-    Returns the means ``[n,3]`` after the cut, the covariances ``[n,3,3]`` after the cut, which are written only for
-    Gaussians that are cut, and a mask ``[n]`` of these Gaussians. The kernel does not return the edge at which it cuts
-    a Gaussian. :func:`split_at_edges` needs this edge, so it takes only the mask and calls :func:`_find_nearest_edges`.
+    Returns their means ``[n,3]`` after the cut, their covariances ``[n,3,3]`` after the cut, and a mask ``[n]`` of the
+    Gaussians that are cut. The covariances of all other Gaussians are not set.
     """
     count = len(splats.means)
     means, covars, is_cut = splats.means.copy(), np.empty((count, 3, 3)), np.zeros(count, np.uint8)
 
-    def cut(start: int) -> None:
+    def cut_rows(start: int) -> None:
         stop = min(start + ROWS, count)
         cut_at_edges(splats.quats, splats.scales, edges.normals, edges.offsets, start, stop, means, covars, is_cut)
 
-    parallel_map(cut, range(0, count, ROWS))
+    parallel_map(cut_rows, range(0, count, ROWS))
     return means, covars, is_cut.astype(bool)
 
 
 def split_at_edges(state: FitState, edges: Edges, count: int) -> FitState:
     """Split Gaussians along the edges and drop halves beyond them, until the rim is narrow or there are ``count``.
 
-    The Gaussians with the widest soft borders are split first, and their halves again. Returns a new state without
-    moments, for the end of a fit. If no Gaussian is split, returns the given state.
+    In each round the Gaussians with the widest soft borders are split. Returns a new state without moments, for the end
+    of a fit. If no Gaussian is split, returns the given state.
     """
-    # Rows of x that may have to be split: at first all Gaussians across an edge, then the halves of the last round.
-    # `sources` are the rows of the state from which all rows of x come
+    # `candidates` are the rows of x that may be split: at first all Gaussians across an edge, later the halves of the
+    # last round. `sources` are the rows of the state from which the rows of x come
     x, candidates = state.x, np.flatnonzero(_compute_cuts(state.splats, edges)[2])
     sources, is_split = np.arange(len(x)), np.zeros(len(x), bool)
     while len(x) < count:
         covars = covariances(
             x[candidates, QUAT:LOGIT].astype(np.float64), exp(x[candidates, SIZE:QUAT].astype(np.float64))
         )
-        normals, rooms, widths = _find_nearest_edges(x[candidates, :SIZE].astype(np.float64), covars, edges)
-        opacities = exp(-np.square(np.maximum(rooms, 0)) / 2) / (1 + exp(-x[candidates, LOGIT].astype(np.float64)))
-        soft = np.flatnonzero((np.abs(rooms) < REACH) & (widths > SOFT) & ((opacities > SHOWN) | is_split[candidates]))
+        normals, distances, widths = _find_nearest_edges(x[candidates, :SIZE].astype(np.float64), covars, edges)
+        edge_opacities = exp(-np.square(np.maximum(distances, 0)) / 2) / (
+            1 + exp(-x[candidates, LOGIT].astype(np.float64))
+        )
+        is_shown = (edge_opacities > SHOWN) | is_split[candidates]
+        soft = np.flatnonzero((np.abs(distances) < REACH) & (widths > SOFT) & is_shown)
         soft = soft[np.argsort(-widths[soft], kind="stable")[: count - len(x)]]
         if len(soft) == 0:
             break
         inner, outer = _split_across(x[candidates[soft]], covars[soft], normals[soft])
-        stays = rooms[soft] > 0  # otherwise at most a sixth of the outer half lies inside, and it is dropped
+        stays = distances[soft] > 0  # all other outer halves are dropped, of which at most a sixth lies inside
         x = np.concatenate([x, outer[stays]])
         x[candidates[soft]], is_split[candidates[soft]] = inner, True
         sources = np.concatenate([sources, sources[candidates[soft[stays]]]])
@@ -155,22 +155,20 @@ def _find_nearest_edges(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find, for each of n Gaussians, the nearest edge of the view in which the Gaussian lies deepest.
 
-    This is the rule of ``nearest_plane`` in kernels/gaussians/edges.c. It stands here a second time, because the kernel
-    finds the edge for its own cut and returns only the Gaussian that is left. A split needs the edge itself, and only
-    for the few Gaussians that are cut or split.
-
-    Returns the outward normal ``[n,3]`` of the edge's plane, the distance ``[n]`` of the mean inside the plane in
-    standard deviations across it, and the width ``[n]`` of the Gaussian's soft border as a share of the view's width.
+    Returns the outward normal ``[n,3]`` of the edge, the distance ``[n]`` of the mean from the edge in standard
+    deviations of the Gaussian along the normal, positive inside, and the width ``[n]`` of the Gaussian's soft border as
+    a share of the view's width. The kernel that cuts Gaussians has the same rule (``nearest_plane`` in edges.c), but
+    does not return the edge.
     """
-    rows, rooms, cameras = np.arange(len(means)), np.full(len(means), -np.inf), edges.cameras
+    rows, deepest, cameras = np.arange(len(means)), np.full(len(means), -np.inf), edges.cameras
     nearest, widths = np.zeros((len(means), 3)), np.zeros(len(means))
     for view, (normals, offsets) in enumerate(zip(edges.normals, edges.offsets, strict=True)):
         sigmas = np.sqrt((matmul(normals, covars) * normals).sum(2))  # [n,4]
         distances = (offsets - matmul(means, normals.T)) / sigmas
         edge = distances.argmin(1)
-        deeper = distances[rows, edge] > rooms
-        rooms[deeper], nearest[deeper] = distances[rows, edge][deeper], normals[edge][deeper]
+        deeper = distances[rows, edge] > deepest
+        deepest[deeper], nearest[deeper] = distances[rows, edge][deeper], normals[edge][deeper]
         depths = np.maximum(camera_depths(means, cameras.viewmats[view].astype(np.float64)), 1e-9)
         soft = FALL * float(cameras.Ks[view, 0, 0]) / cameras.width * sigmas[rows, edge] / depths
         widths[deeper] = soft[deeper]
-    return nearest, rooms, widths
+    return nearest, deepest, widths

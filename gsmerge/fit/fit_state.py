@@ -27,7 +27,7 @@ class FitState:
     units: np.ndarray  # [n] size of each Gaussian: geometric mean of its two largest scales at the start
     box_shares: np.ndarray  # [n] share of the box about the start within which means and scales may move
     min_sizes: np.ndarray  # [n] least log scale of each Gaussian
-    origins: np.ndarray  # [n] row of the Gaussian at the start of the fit from which each Gaussian comes
+    origins: np.ndarray  # [n] for each Gaussian, the row of the Gaussian at the start of the fit from which it comes
     fixed: np.ndarray  # [n] bool, Gaussians that stay unchanged
     splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
     colors: np.ndarray  # [n,3] base colours, sRGB
@@ -50,9 +50,9 @@ class FitState:
             np.divide(self.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=self.splats.sh0)
 
     def view_colors(self) -> np.ndarray | None:
-        """Return the colours to draw, or None if there are higher harmonics.
+        """Return the colours to draw, or None if colours depend on the direction of view.
 
-        For None the rasterizer evaluates ``splats.sh0`` and ``splats.shN``, so ``sh0`` is updated first.
+        In that case the rasterizer computes the colours from ``splats.sh0``, which is updated here, and ``splats.shN``.
         """
         self.update_harmonics()
         return self.colors if self.splats.shN.shape[1] == 0 else None
@@ -61,7 +61,7 @@ class FitState:
 def start_state(gaussians: Gaussians) -> FitState:
     """Return the state at the start of a fit: the parameters of the Gaussians, and moments of zero."""
     x = np.empty((len(gaussians), COLUMNS), np.float32)
-    opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)
+    opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)  # beyond, a step hardly changes opacities
     x[:, :3] = gaussians.means
     x[:, SIZE:QUAT] = log(gaussians.scales.clip(1e-9))
     x[:, QUAT:LOGIT] = gaussians.quats
@@ -72,7 +72,7 @@ def start_state(gaussians: Gaussians) -> FitState:
 
 def state_of(x: np.ndarray, shN: np.ndarray) -> FitState:
     """Return a new state with parameters ``x [n,14]``, which are not copied, and harmonics ``shN [n,k-1,3]``."""
-    sizes = np.sort(x[:, SIZE:QUAT], 1)
+    log_scales = np.sort(x[:, SIZE:QUAT], 1)
     colors = np.ascontiguousarray(x[:, COLOR:])
     splats = Splats(
         means=np.ascontiguousarray(x[:, :3]),
@@ -83,10 +83,19 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> FitState:
         shN=shN,
         origin=np.zeros(3),
     )
-    units = exp((sizes[:, 1] + sizes[:, 2]) / 2)
-    shares, least = np.ones_like(units), np.full_like(units, -np.inf)
-    zero, rows, fixed = np.zeros_like(x), np.arange(len(x)), np.zeros(len(x), bool)
-    return FitState(x, x.copy(), zero, zero.copy(), units, shares, least, rows, fixed, splats, colors)
+    return FitState(
+        x=x,
+        x0=x.copy(),
+        m=np.zeros_like(x),
+        v=np.zeros_like(x),
+        units=exp((log_scales[:, 1] + log_scales[:, 2]) / 2),
+        box_shares=np.ones(len(x), np.float32),
+        min_sizes=np.full(len(x), -np.inf, np.float32),
+        origins=np.arange(len(x)),
+        fixed=np.zeros(len(x), bool),
+        splats=splats,
+        colors=colors,
+    )
 
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:

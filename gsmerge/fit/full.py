@@ -47,7 +47,7 @@ def fit_full(
     """
     fit = start_fit(gaussians, run, survey, fixed)
     while fit.step < fit.steps:
-        if fit.progress >= run.half_part:  # before the growth, because new halves score worse until they are fitted
+        if fit.progress >= run.half_part:  # before Gaussians are split, because new halves score worse
             score_fit(fit)
         renew_state(fit)
         take_step(fit)
@@ -59,7 +59,7 @@ def fit_full(
 
 @dataclass(eq=False)
 class FullFit:
-    """State of a running full fit."""
+    """A full fit between two of its steps."""
 
     run: FitRun
     optimiser: Optimiser
@@ -75,7 +75,7 @@ class FullFit:
 
     @property
     def progress(self) -> float:
-        """Share of the steps that are taken, in [0, 1]."""
+        """Share of the steps that were taken so far, in [0, 1]."""
         return self.step / self.steps
 
     @property
@@ -84,7 +84,7 @@ class FullFit:
         return self.optimiser.photos[1]
 
     def reaches(self, *milestones: float) -> bool:
-        """Return true if the next step is the first one at or after one of the ``milestones``, shares of the steps."""
+        """Return true if the next step is the first after one of the ``milestones``, which are values of `progress`."""
         return any(self.last < milestone <= self.progress for milestone in milestones)
 
 
@@ -105,10 +105,10 @@ def score_fit(fit: FullFit) -> None:
 
 
 def renew_state(fit: FullFit) -> None:
-    """Grow the state, drop its faint Gaussians, or cut it at the edges of the views, if one of these is due.
+    """Add Gaussians, drop faint ones, or cut Gaussians at the edges of the views, if one of these is due.
 
-    These change the meaning of the state's rows and axes, so the mean of the last steps begins anew. If some Gaussians
-    are fixed, no row is dropped or added, because the caller finds its other Gaussians by their rows.
+    Afterwards a row may be another Gaussian, or have other axes, so the mean of the last steps begins anew. If some
+    Gaussians are fixed, none are dropped or added, because the caller expects every Gaussian in its row.
     """
     job, options = fit.run.job, fit.run.job.options
     if not options.grows or not fit.reaches(GROWTH, *CLEARS, *CUTS):
@@ -140,31 +140,43 @@ def take_step(fit: FullFit) -> None:
 
 
 def end_fit(fit: FullFit) -> FitResult:
-    """Return the fitted Gaussians, split at the edges of the views if the photos allow it, and a report."""
-    after = fit.before if fit.after is None else fit.after
-    job, ended, viewmats = fit.run.job, state_of(fit.tail.of(fit.state.x), fit.state.splats.shN), fit.optimiser.viewmats
-    ended.origins, ended.min_sizes = fit.state.origins, fit.state.min_sizes
-    # Otherwise splits would exceed an exact number of Gaussians, or renders stand for photos and show what lies beyond
-    is_limit = job.options.grows and not job.options.fills
-    if is_limit and job.edges is not None and job.fixed is None:
-        split = split_at_edges(ended, job.edges, job.count)
-        if split is not ended:
-            whole, parts = (float(photo_mses(gaussians_of(s.x, s.splats.shN), fit.half).mean()) for s in (ended, split))
-            # halves cover more than their parents; where large Gaussians overlap much, photos would lose .5 dB
-            ended = split if parts <= SPLIT_LOSS * whole else ended
-    report = FitReport("full", True, fit.step, fit.before, after, "all steps done", viewmats, origins=ended.origins)
-    return gaussians_of(ended.x, ended.splats.shN), report
+    """Return the fitted Gaussians, split at the edges of the views if the photos hardly suffer, and a report."""
+    job = fit.run.job
+    final = state_of(fit.tail.of(fit.state.x), fit.state.splats.shN)
+    final.origins, final.min_sizes = fit.state.origins, fit.state.min_sizes
+    # A fit that fills an exact number of Gaussians has no room for halves. There are no edges if renders stand for
+    # photos, because renders show what lies beyond
+    has_room = job.options.grows and not job.options.fills
+    if has_room and job.edges is not None and job.fixed is None:
+        split = split_at_edges(final, job.edges, job.count)
+        if split is not final:
+            mse, split_mse = (
+                float(photo_mses(gaussians_of(s.x, s.splats.shN), fit.half).mean()) for s in (final, split)
+            )
+            # two halves cover more than their parent: where large Gaussians overlap, photos may lose .5 dB
+            final = split if split_mse <= SPLIT_LOSS * mse else final
+    report = FitReport(
+        method="full",
+        accepted=True,
+        steps=fit.step,
+        holdout_before=fit.before,
+        holdout_after=fit.before if fit.after is None else fit.after,
+        stopped="all steps done",
+        viewmats=fit.optimiser.viewmats,
+        origins=final.origins,
+    )
+    return gaussians_of(final.x, final.splats.shN), report
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
-    """Return the share ``[n]`` of its box that each Gaussian may use, and its least log scale ``[n]``.
+    """Return how far each Gaussian may move, as a share ``[n]`` of its full range, and its least log scale ``[n]``.
 
-    The share is the effective number of photos that show the Gaussian, minus 1, but at least ``single_view_share`` and
-    at most 1. The effective number is (sum w)^2 / sum w^2, where w is the sum of the Gaussian's blending weights in a
-    photo. The least scale is ``min_scale`` times the finest pixel that shows the Gaussian (the 3D filter of
+    A Gaussian that a single photo shows may move by ``single_view_share``, and one that two photos show by 1. The
+    effective number of photos is (sum w)^2 / sum w^2, where w is the sum of the Gaussian's blending weights in a photo.
+    The least scale is ``min_scale`` times the size of the finest pixel that shows the Gaussian (the 3D filter of
     Mip-Splatting). If no photo shows the Gaussian, its scale has no lower limit.
     """
     num_photos = survey.sums**2 / np.maximum(survey.squares, 1e-12)
     box_shares = np.clip(num_photos - 1, rates.single_view_share, 1).astype(np.float32)
-    pixels = np.where(np.isfinite(survey.pixels), survey.pixels, 0)
-    return box_shares, log(rates.min_scale * pixels).astype(np.float32)
+    pixel_sizes = np.where(np.isfinite(survey.pixels), survey.pixels, 0)
+    return box_shares, log(rates.min_scale * pixel_sizes).astype(np.float32)

@@ -19,9 +19,9 @@ FADED = 0.005  # fainter Gaussians are dropped, because their halves would be fa
 FAINT = 0.02  # late in a run, fainter Gaussians only fade away; without them the run takes .9 of the time
 # Most Gaussians after a growth, as a multiple of those that are left when it begins. The usual number of Gaussians is a
 # share of all pixels. Where many views show the same surfaces, this is far more than the surfaces can use. Most
-# Gaussians of the start are hidden there, further halves are smaller than the details of the photos, and most of them
-# fade. With this limit, real scenes of 60 and 84 views gain .1 to .2 dB in .7 to .8 of the time. A limit of 4 costs a
-# rendered room .06 dB. With up to a dozen views the number only doubles, so this limit is not reached
+# Gaussians of the start are hidden there, and halves of halves are smaller than the details of the photos, so most of
+# them fade. Compared with no limit, real scenes of 60 and 84 views gain .1 to .2 dB, and their fit takes .7 to .8 of
+# the time. With a limit of 4, a rendered room loses .06 dB. Scenes of up to a dozen views do not reach the limit
 MOST_GROWTH = 8
 
 
@@ -82,11 +82,11 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
 def split_parameters(parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split Gaussians with parameters ``[m,14]`` across their longest axes; return the parameters of both halves."""
     rows, longest = np.arange(len(parents)), parents[:, SIZE:QUAT].argmax(1)
-    reach = OFFSET * exp(parents[rows, SIZE + longest])
+    distances = OFFSET * exp(parents[rows, SIZE + longest])
     rotations = quat_to_rotmat(parents[:, QUAT:LOGIT])
-    shift = rotations[rows, :, longest] * reach[:, None]
+    shift = rotations[rows, :, longest] * distances[:, None]
     halves = parents.copy()
-    halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)
+    halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)  # so both halves together are as long as the parent
     halves[:, LOGIT] = fade_halves(halves[:, LOGIT])
     first_halves, second_halves = halves, halves.copy()
     first_halves[:, :SIZE] -= shift
@@ -95,10 +95,10 @@ def split_parameters(parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fade_halves(logits: np.ndarray) -> np.ndarray:
-    """Return the opacity logits ``[m]`` of the halves of Gaussians whose own opacity ``logits [m]`` are given."""
+    """Return the opacity logits ``[m]`` for halves of Gaussians with the opacity ``logits [m]``."""
     transmittances = 1 / (1 + exp(logits.astype(np.float64)))  # 1 - opacity
-    # Optical depth of a half, as a share of the parent's. Halves are narrower than the parent, so with a share of 0.7
-    # both halves would cover as much as the parent; a little more closes gaps between them
+    # Optical depth of a half, as a share of the parent's. Halves are narrower than the parent. With a share of 0.7 they
+    # would together cover as much as the parent. They cover a little more, which closes gaps between them
     depth_share = 0.8
     return np.asarray(log(1 / power(transmittances, depth_share) - 1))
 
@@ -109,7 +109,8 @@ def error_masses(state: FitState, half: Photos) -> np.ndarray:
     The pixels are those of the half-size photos ``half``. Errors are multiplied by the importance of their pixels.
     """
 
-    def one_view(view: int) -> np.ndarray:
+    def view_masses(view: int) -> np.ndarray:
+        """Return the error mass ``[n]`` of each Gaussian in one view."""
         tiled = tile_view(state.splats, **half.camera(view))
         image, _ = composite(tiled, state.view_colors())
         errors = np.abs(image - half.image(view)).mean(-1, keepdims=True)
@@ -118,6 +119,6 @@ def error_masses(state: FitState, half: Photos) -> np.ndarray:
         return splat_adjoint(tiled, errors)[:, 0]
 
     masses = np.zeros(len(state.x))
-    for view_masses in in_turn(one_view, range(len(half))):
-        masses += view_masses
+    for added_masses in in_turn(view_masses, range(len(half))):
+        masses += added_masses
     return masses

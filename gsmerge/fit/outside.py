@@ -1,9 +1,9 @@
 """Place views outside of the capture, from which a fit removes fog and veils.
 
-Photos do not show the space between their fields of view, nor the space close to other cameras, and a fit fills it with
-large Gaussians. A viewer who steps back sees these as fog where the input is empty, and as veils in front of the
-input's surfaces. So some steps of a fit draw the Gaussians from cameras behind, beside, above and below those of the
-photos, and compare their opacities and depths with those of the input.
+Photos do not show the space between their fields of view, nor the space close to other cameras. A fit fills these
+spaces with large Gaussians. A viewer who steps back sees them as fog where the input is empty, and as veils in front of
+the input's surfaces. So some steps of a fit draw the Gaussians from cameras behind, beside, above and below those of
+the photos, and compare their opacities and depths with those of the input.
 """
 
 from __future__ import annotations
@@ -25,32 +25,33 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
-# Least and largest values of three numbers. They are the step back as a share of the median depth of a view, the
-# rotation to the sides about the middle of the view in degrees, and the rotation up or down in degrees. Without a step
-# back, cameras would see the same as new views between the photos, in which a fit has to fill gaps
+# Least and largest step back as a share of a view's median depth, rotation to the sides about the middle of the view in
+# degrees, and rotation up or down in degrees. Without a step back, cameras would see the same as new views between the
+# photos, where a fit has to fill gaps
 STEP_BACK_LOW, STEP_BACK_HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
 # Multiples of this vector, modulo one, fill a cube evenly, whatever their number (the R sequence of Roberts 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
-PLACES = 42  # most views from outside; with more photos than this, there may be one for each photo
+PLACES = 42  # largest number of views from outside, if there are not more photos; then one for each photo
 DEPTH_GAUSSIANS = 2000  # the depths of views are measured on at least this many Gaussians, or on all if there are fewer
-# A sample of the input represents all of it. It has this many Gaussians for each photo, but at most for PLACES photos,
-# because a picture has the same number of pixels, however many photos there are
+# The views from outside are drawn from a sample of the input. It has this many Gaussians for each photo, but at most
+# for PLACES photos, because more photos do not make the pictures larger
 GAUSSIANS_PER_PHOTO = 4000
 OUTSIDE_NEAR_PLANE = 0.25  # depth of the near plane, as a share of the median depth of a view
 # Depths are clipped to at most FAR_FACTOR times their quantile FAR_QUANTILE, because a Gaussian that is much too far
 # away would change the mean depth of its pixels
 FAR_QUANTILE, FAR_FACTOR = 0.98, 4.0
-# A pixel is empty if the opacity of the input is below the first number, and shows a surface if it is above the second
+# A pixel of the input is empty below EMPTY_OPACITY, and shows a surface above SOLID_OPACITY
 EMPTY_OPACITY, SOLID_OPACITY = 0.15, 0.9
 # Width of the rim around the outlines of the input, as a share of the picture's width. Empty pixels in the rim do not
 # count, because Gaussians beside an outline fill the background that becomes visible in new views
 RIM_SHARE = 0.04
-# A pixel is veiled if its loss (see veil_gradients) is above this: its mean depth is less than the limit by this share
+# A pixel is veiled if its loss (see veil_gradients) is above this. If the pixel is opaque, its mean depth is then less
+# than the limit by more than this share of the limit
 VEILED_LOSS = 0.15
 # The weight of fog in the loss is 1 if the start has at least MANY_PER_PHOTO Gaussians for each photo. Fewer Gaussians
-# are larger, and reach from the borders of photos into empty space. With the full weight they would vanish both there
-# and from the photos, so fog then weighs less, but at least LEAST_FOG_WEIGHT. VEIL_WEIGHT is the weight of veils
-# relative to fog
+# are larger, and reach from the borders of photos into empty space. With a weight of 1 they would vanish, although the
+# photos show them. So the weight of fog is smaller then, but at least LEAST_FOG_WEIGHT. VEIL_WEIGHT is the weight of
+# veils relative to fog
 MANY_PER_PHOTO, LEAST_FOG_WEIGHT, VEIL_WEIGHT = 1000, 0.15, 30
 OUTSIDE_LEVEL = 3  # width of a pixel of the pictures, in pixels of a photo: 2 leaves as much fog, 4 a fifth more
 LEAST_WIDTH = 64  # least width of the pictures, pixels
@@ -62,8 +63,8 @@ class Outside:
     """Views from outside, and the depth of the surface that the input shows in each of their pixels."""
 
     views: Photos  # Cameras with black pictures; the weights [v,h,w] are 0 for pixels that do not count
-    # [v,h,w] least camera z of Gaussians in each pixel: infinite where the input is empty and no Gaussian may be, 0
-    # where there is no limit
+    # [v,h,w] least camera z that Gaussians may have in each pixel: infinite where the input is empty, 0 where Gaussians
+    # may be anywhere
     limits: np.ndarray
     near: np.ndarray  # [v] camera z of the near plane
     far: np.ndarray  # [v] camera z to which larger depths are clipped
@@ -73,10 +74,10 @@ class Outside:
         cameras = Cameras(self.views.viewmats, self.views.Ks, self.views.width, self.views.height)
         pixels, z = project(points, cameras)
         inside = (z > self.near[:, None]) & is_inside(pixels, cameras)
-        view, point = np.nonzero(inside)
-        column, row = pixels[inside].astype(np.int64).T
-        wrong = z[inside] < share * self.limits[view, row, column]
-        return np.bincount(point[wrong], minlength=len(points)) > 0
+        view_ids, point_ids = np.nonzero(inside)
+        columns, rows = pixels[inside].astype(np.int64).T
+        too_near = z[inside] < share * self.limits[view_ids, rows, columns]
+        return np.bincount(point_ids[too_near], minlength=len(points)) > 0
 
 
 def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options: FitOptions) -> Outside | None:
@@ -88,7 +89,7 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
     count.
     """
     num_steps = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
-    if num_steps == 0:
+    if num_steps == 0:  # steps on views from outside
         return None
     sample = sample_gaussians(scene, GAUSSIANS_PER_PHOTO * min(len(photos), PLACES)) if len(scene.gaussians) else start
     if len(sample) == 0 or len(photos) == 0:
@@ -107,20 +108,20 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
 
 
 def _depth_range(points: np.ndarray, cameras: Cameras, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the depth of the near plane of each of ``count`` views from outside, and the largest depth that each sees.
+    """Return the depth of the near plane and the largest depth of each of ``count`` views from outside.
 
-    They follow from the depths of ``points [n,3]`` in the photos' ``cameras``, from which the views step back in turn.
+    A view has the depths of ``points [n,3]`` in the camera from which it steps back. These are ``cameras`` in turn.
     """
     depths = [depths_inside(points, cameras[[view]]) for view in range(min(count, len(cameras)))]
-    median, last = np.resize([quantiles(view_depths, (0.5, FAR_QUANTILE)) for view_depths in depths], (count, 2)).T
-    return OUTSIDE_NEAR_PLANE * median, FAR_FACTOR * last
+    median, far = np.resize([quantiles(view_depths, (0.5, FAR_QUANTILE)) for view_depths in depths], (count, 2)).T
+    return OUTSIDE_NEAR_PLANE * median, FAR_FACTOR * far
 
 
 def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarray) -> np.ndarray:
     """Draw the Gaussians of the input in v views from outside; return the limits ``[v,h,w]`` of :class:`Outside`."""
 
     def view_limits(view: int) -> np.ndarray:
-        """Return the depth of the surface in each pixel; inf if the pixel is empty, 0 if it is half transparent."""
+        """Return the depth of the surface in each pixel; inf if the pixel is empty, 0 if it is partly transparent."""
         depths, transmittance = blend_depths(tile_view(splats, **views.camera(view), near=near[view]), far[view])
         opacities = 1 - transmittance
         limits = np.where(opacities > SOLID_OPACITY, depths, 0)
@@ -130,11 +131,12 @@ def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarra
 
 
 def sample_gaussians(scene: Scene, count: int) -> Gaussians:
-    """Return about ``count`` of a scene's Gaussians, evenly from all rows, and enlarged to cover the same area."""
+    """Return about ``count`` Gaussians of a scene, spread evenly over its rows and enlarged to cover the same area."""
     num_rows = len(scene.gaussians)
     step = max(1, num_rows // max(1, count))
     starts = np.arange(0, num_rows - step + 1, step)  # one Gaussian is taken from each run of `step` rows
-    sample = scene.gaussians[starts + (step * (EVEN[0] * np.arange(len(starts)) % 1)).astype(np.int64)]
+    places = EVEN[0] * np.arange(len(starts)) % 1  # its place in the run, in [0, 1)
+    sample = scene.gaussians[starts + (step * places).astype(np.int64)]
     return replace(sample, scales=sample.scales * np.float32(math.sqrt(step)))
 
 
@@ -143,8 +145,8 @@ def outside_cameras(
 ) -> Cameras:
     """Return ``count`` cameras: each of ``cameras`` in turn, stepped back and rotated about the middle of what it sees.
 
-    The middle is at the middle depth of the points ``means [n,3]``. ``low`` and ``high`` are the least and the largest
-    step back, rotation to the sides, and rotation up or down, in the units of ``STEP_BACK_LOW``.
+    The middle is at the middle depth of the points ``means [n,3]``. ``low`` and ``high`` bound the step back and the
+    rotations, like ``STEP_BACK_LOW`` and ``STEP_BACK_HIGH``.
     """
     depths = [middle_depth(means, cameras[[view]]) for view in range(min(count, len(cameras)))]
     views, viewmats = [number % len(cameras) for number in range(count)], []
@@ -155,14 +157,14 @@ def outside_cameras(
 
 
 def mark_empty(opacities: np.ndarray) -> np.ndarray:
-    """Return a mask ``[h,w]`` of the pixels with empty ``opacities [h,w]``, without a rim beside the other pixels."""
+    """Return a mask ``[h,w]`` of the pixels in which the ``opacities [h,w]`` are empty, without a rim beside others."""
     side = 2 * round(RIM_SHARE * opacities.shape[1]) + 1
     empty = cv2.erode((opacities < EMPTY_OPACITY).astype(np.uint8), np.ones((side, side), np.uint8))
     return np.asarray(empty, bool)
 
 
 def _tiles_of(weights: np.ndarray) -> np.ndarray:
-    """Return a mask ``[lines,columns]`` of the tiles that have pixels with a weight, the only ones that are drawn."""
+    """Return a mask ``[lines,columns]`` of the tiles that are drawn, because some of their pixels have a weight."""
     height, width = weights.shape
     padded = np.pad(weights > 0, ((0, -height % TILE), (0, -width % TILE)))
     return np.asarray(padded.reshape(-(-height // TILE), TILE, -1, TILE).any((1, 3)))
@@ -187,7 +189,7 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     image_gradient = np.zeros_like(image)
     image_gradient[..., 0] = -weights * inverse_limits
     g = gradients_of(tiled, depths, image, transmittance, image_gradient, -weights, with_viewmat=False)
-    g.colors[:] = 0
+    g.colors[:] = 0  # the colours drawn were depths, so these gradients mean nothing for colours
     min_gradient = 1e-9  # Gaussians with a smaller gradient are behind the limit, and should not gain opacity
     return g[np.flatnonzero(g.opacities > min_gradient)]
 

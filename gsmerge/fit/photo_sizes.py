@@ -57,23 +57,20 @@ def _with_empty(photos: Photos, scene: PicturedScene) -> Photos:
 def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:
     """Choose the size of the photos in a fit as a multiple of the views' size, at least 1.
 
-    Also returns why this is less than the option asks for, or None. ``auto`` permits the option "auto" to enlarge.
+    Also returns a reason if the size is smaller than the option asks for, else None. With the option "auto", the size
+    is above 1 only if ``auto`` is true.
     """
     requested, largest = options.photo_scale, largest_scale(scene)
     can_enlarge = options.fit == "full" and options.half_res_part < 1
     if requested == "auto":
         enlarges = can_enlarge and auto and largest >= MIN_AUTO_SCALE
-        auto_scale = (
-            2.0  # largest scale of "auto", because more pixels take more time, and larger photos are rarely sharp
-        )
+        auto_scale = 2.0  # largest scale of "auto": more pixels take more time, and larger photos are rarely sharp
         return (min(largest, auto_scale) if enlarges else 1.0), None
     if requested == 1:
         return 1.0, None
     if not can_enlarge:
-        return (
-            1.0,
-            f"photo_scale {requested:g} is 1: larger photos need the full fit, with steps on photos of full size",
-        )
+        need = "larger photos need the full fit, with steps on photos of full size"
+        return 1.0, f"photo_scale {requested:g} is 1: {need}"
     tolerance = 0.01  # rounding of sizes to whole pixels may change a scale by this share
     if requested > largest * (1 + tolerance):
         return largest, f"photo_scale {requested:g} is {largest:.3g}: the photos are no larger"
@@ -128,20 +125,20 @@ def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.nd
     rows, columns = -(-photos.height // size), -(-photos.width // size)
     random = np.random.default_rng([seed, view])
     counting = np.ones((rows, columns), bool) if photos.weights is None else _counting_patches(photos, view, size)
-    patches = (random.random((rows, columns)) < share) & counting
-    if counting.any() and not patches.any():
+    held_out = (random.random((rows, columns)) < share) & counting
+    if counting.any() and not held_out.any():  # hold out a random patch, unless it is the only one
         candidates = np.argwhere(counting)  # [p,2] row and column of patches
         patch = (random.integers(rows), random.integers(columns)) if counting.all() else random.choice(candidates)
-        patches[tuple(patch)] = len(candidates) > 1
-    full = np.repeat(np.repeat(~patches, size, 0), size, 1)[: photos.height, : photos.width]
+        held_out[tuple(patch)] = len(candidates) > 1
+    in_training = np.repeat(np.repeat(~held_out, size, 0), size, 1)[: photos.height, : photos.width]
     if photos.weights is None:
-        return full.astype(np.float32)
+        return in_training.astype(np.float32)
     weights = photos.weights[view]
-    return np.where(weights == 1, full.astype(np.float32), np.maximum(weights, HIDDEN_WEIGHT))
+    return np.where(weights == 1, in_training.astype(np.float32), np.maximum(weights, HIDDEN_WEIGHT))
 
 
 def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:
-    """Return a mask ``[r,c]`` of the patches of ``size`` pixels that have a pixel of weight 1 that shows the scene."""
+    """Return a mask ``[r,c]`` of the patches of ``size`` pixels in which a pixel of weight 1 shows the scene."""
     assert photos.weights is not None
     counts = photos.weights[view] == 1
     if photos.empty is not None:
@@ -151,7 +148,7 @@ def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:
 
 
 def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
-    """Return weights of full-size photos at half size: those of every second pixel, in the size of ``photos``."""
+    """Return weights for half-size ``photos``: those of every second pixel of the full-size ``weights``."""
     return [np.ascontiguousarray(weight[::2, ::2][: photos.height, : photos.width]) for weight in weights]
 
 
@@ -164,13 +161,14 @@ def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.
     clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
     gains = exposure_gains(clipped, photos.images, weights, min_gain)
 
-    def one_view(view: int) -> tuple[float, float]:
+    def sum_errors(view: int) -> tuple[float, float]:
+        """Return the sum of the squared errors of a view's held-out pixels, and the number of these pixels."""
         red, green, blue = np.moveaxis((clipped[view] * gains[view] - photos.images[view]) ** 2, -1, 0)
         error = red + green + blue  # takes a tenth of the time of a sum along the last axis
         mask = weights[view] == 0
         return float(error[mask].sum(dtype=np.float64)), float(mask.sum())
 
-    error, count = np.sum(parallel_map(one_view, views), axis=0)
+    error, count = np.sum(parallel_map(sum_errors, views), axis=0)
     return decibels(error / max(3 * count, 1))
 
 
@@ -184,14 +182,15 @@ def exposure_gains(
     they may lie outside this range. If all factors are between ``1 / min_gain`` and ``min_gain``, all are set to 1.
     """
 
-    def one_view(view: int) -> np.ndarray:
+    def view_gains(view: int) -> np.ndarray:
+        """Return the factors ``[3]`` of one view."""
         image, weight = images[view], weights[view][..., None]
-        with_photo, with_image = (
+        photo_products, image_squares = (
             (weight * picture * image).sum((0, 1), dtype=np.float64) for picture in (photos[view], image)
         )
-        return np.clip(with_photo / np.maximum(with_image, 1e-9), 1 / MAX_GAIN, MAX_GAIN)
+        return np.clip(photo_products / np.maximum(image_squares, 1e-9), 1 / MAX_GAIN, MAX_GAIN)
 
-    gains = np.stack(parallel_map(one_view, range(len(photos))))
+    gains = np.stack(parallel_map(view_gains, range(len(photos))))
     gains /= exp(log(gains).mean(0))
     if np.abs(log(gains)).max() < log(min_gain):
         gains[:] = 1

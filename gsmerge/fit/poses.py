@@ -50,9 +50,16 @@ class PoseState:
 
 
 def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ...]]:
-    """Return motions of zero for the photos' cameras, and the photos with one array of viewmats that steps update."""
+    """Return cameras that have not moved yet, and the photos of all sizes with the viewmats that steps will update."""
     start = photos[0].viewmats.astype(np.float64)
-    zero, shared = np.zeros((len(start), 6)), start.copy()
-    pixel = 1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean())
-    state = PoseState(start, shared, zero, zero.copy(), zero.copy(), np.zeros(len(start), np.int64), pixel)
-    return state, tuple(replace(level, viewmats=shared) for level in photos)
+    count = len(start)
+    state = PoseState(
+        start=start,
+        viewmats=start.copy(),
+        x=np.zeros((count, 6)),
+        m=np.zeros((count, 6)),
+        v=np.zeros((count, 6)),
+        counts=np.zeros(count, np.int64),
+        pixel=1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean()),
+    )
+    return state, tuple(replace(level, viewmats=state.viewmats) for level in photos)

@@ -29,7 +29,7 @@ class FitReport(ArrayFields):
     viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None if cameras were fixed
     # Mean opacity, in [0, 1], that the result shows from outside where the input is empty; None if it is nowhere empty
     fog: float | None = None
-    # [n] row of the Gaussian at the start from which each Gaussian comes; None if unknown
+    # [n] for each Gaussian of the result, the row of the Gaussian at the start from which it comes; None if unknown
     origins: np.ndarray | None = field(default=None, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
@@ -60,11 +60,11 @@ def record_fit(report: FitReport) -> None:
         note("the fit was not accepted: it shows most views worse than its start does")
 
 
-def report_steps(step: int, steps: int, photos: float, half_part: float) -> None:
-    """Report the progress of a fit after ``step`` of ``steps`` steps, with the PSNR ``photos`` (dB) of the last ones.
+def report_steps(step: int, steps: int, psnr: float, half_part: float) -> None:
+    """Report the progress of a fit after ``step`` of ``steps`` steps, with the PSNR (dB) of the last photos.
 
-    Progress is measured by time. The first steps, a share ``half_part``, draw only samples of photos and take less.
+    Progress is measured by time. The share ``half_part`` of the steps draws only samples of photos and takes less time.
     """
-    half = half_part * steps
-    done, total = (count - (1 - SAMPLE_COST) * min(count, half) for count in (step, steps))
-    report_progress(f"fit: photos {photos:.1f} dB", round(done / total * steps), steps)
+    num_first = half_part * steps
+    time, total_time = (count - (1 - SAMPLE_COST) * min(count, num_first) for count in (step, steps))
+    report_progress(f"fit: photos {psnr:.1f} dB", round(time / total_time * steps), steps)

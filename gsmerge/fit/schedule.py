@@ -28,19 +28,18 @@ MANY_STEPS = 150
 STRIDE = 2
 OFFSETS = ((0, 0), (1, 1), (1, 0), (0, 1))  # first column and first row of each sample, one sample after the other
 DROPOUT = 0.1  # share of the Gaussians that each step leaves out if there are at most FEW_VIEWS
-LONG_DROPOUT = (
-    0.05  # the same share with more views, in runs of LONG_STEPS or more that draw each view LONG_ROUNDS times
-)
+# The same share if there are more views, in runs of at least LONG_STEPS steps that draw each view LONG_ROUNDS times
+LONG_DROPOUT = 0.05
 LONG_ROUNDS = 30  # steps for each view
-# If there are larger photos, of each LARGE_CYCLE steps those with the numbers LARGE_STEPS, from 0, draw them. With more
-# such steps, renders at the size of the views would become worse
+# If there are larger photos, they are drawn by the steps LARGE_STEPS (counted from 0) of each LARGE_CYCLE steps. With
+# more such steps, renders at the size of the views would become worse
 LARGE_CYCLE = 5
 LARGE_STEPS = (0, 2)
-# Draw modes of steps, one after the other. A mode has three parts: 1 for half size or 0 for full size; the low-pass
-# filter, as a share of that of viewers; and true if small Gaussians are made fainter to offset the low-pass, as some
-# viewers do. In a view that is enlarged twice, the low-pass has a quarter of its usual share of the picture. From afar,
-# it covers more of the scene. Gaussians that are fitted to one mode alone look thin or fat in the other modes
-# (Mip-Splatting, Yu et al. 2024). The first steps, in which Gaussians find their sizes, have several modes too
+# Draw modes, which the steps use one after the other. A mode has three parts: the size (0 full, 1 half), the variance
+# of the low-pass filter as a share of the variance in viewers, and whether small Gaussians are made fainter to offset
+# the low-pass, as some viewers do. From near by, the low-pass is smaller relative to the scene, and from afar it is
+# larger. Gaussians that are fitted to one mode alone look thin or fat in the other modes (Mip-Splatting, Yu et al.
+# 2024). The first steps decide the sizes of Gaussians, so they have several modes, too
 FIRST_MODES = (0, 1.0, False), (0, 0.25, False), (0, 1.0, False), (1, 1.0, False)
 DRAW_MODES = (
     (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
@@ -49,7 +48,7 @@ DRAW_MODES = (
     (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
 )  # fmt: skip
 
-# Takes the number of the step, the number of steps, the PSNR (dB) of the last photos, and the share of the first steps
+# Takes the step's number, the number of all steps, the PSNR (dB) of the last photos, and FitRun.half_part
 OnStep = Callable[[int, int, float, float], None]
 
 
@@ -64,13 +63,12 @@ class FitJob:
     seed: int = 0
     progress: OnStep | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, true for Gaussians that must not change; None if all may
-    # If renders stand for photos, the result is scored on the first `num_scored` photos. None if there are photos; then
-    # the result is scored on all of them
+    # If renders stand for photos, the result is scored on the first `num_scored` renders. If there are photos, this is
+    # None, and the result is scored on all photos
     num_scored: int | None = None
     held_out: Photos | None = None  # If given, the result is scored on these photos instead; no step draws them
-    outside: Outside | None = (
-        None  # Views from outside, in which some steps clear fog and veils; None for no such steps
-    )
+    # Views from outside, in which some steps remove fog and veils; None for no such steps
+    outside: Outside | None = None
     edges: Edges | None = None  # Edges of the views, at which Gaussians are cut; None for no cuts
     region: Region | None = None  # Region that no centre may leave; None for no limit
 
@@ -97,25 +95,25 @@ class FitRun:
     job: FitJob
     # [h,w] float32 weights of each photo at half size, for the score: 0 on held-out patches, which are scored;
     # `HIDDEN_WEIGHT` on pixels that neither steps nor scores use; 1 elsewhere
-    weights: list[np.ndarray]
-    # [h,w] float32 weights of each photo at each size, for the steps: 0 on hidden pixels, elsewhere the importance of
-    # the pixel. On held-out patches they are 0 at half size only
+    score_weights: list[np.ndarray]
+    # [h,w] float32 weights of each photo at each size, for the steps: 0 on hidden pixels, and the importance of the
+    # pixel elsewhere. At half size, the weights on held-out patches are 0, too
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the steps that are the first steps, which draw a quarter of the pixels
     samples: bool = True  # True if most of the first steps draw samples of photos; otherwise all draw half-size photos
-    # [h,w] bool of each photo at full size: pixels that count in the first steps; None if these are the same as later
+    # [h,w] bool of each photo at full size: pixels that count in the first steps; None: those of later steps
     first_pixels: tuple[np.ndarray, ...] | None = None
 
     def weight(self, step: Step) -> np.ndarray:
-        """Return the weights ``[h,w]`` of the pixels that a step draws; in the first steps, held-out patches have 0."""
+        """Return the weights ``[h,w]`` of the pixels that a step draws; 0 on held-out patches in the first steps."""
         weight = self.step_weights[step.mode.size][step.view][step.sample.pixels]
         if step.mode.stride == 1 or self.first_pixels is None:
             return np.ascontiguousarray(weight)
         return np.where(self.first_pixels[step.view][step.sample.pixels], weight, np.float32(0))
 
     def outside_view(self, step: int, progress: float) -> int | None:
-        """Return the index of the view from outside that is drawn after step ``step`` (from 1), or None if none is."""
+        """Return the index of the view from outside that is drawn after step ``step`` (from 1); None for no view."""
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
@@ -124,20 +122,21 @@ class FitRun:
     def draw_mode(self, step: int, progress: float) -> DrawMode:
         """Return how step ``step`` (from 1) draws the scene.
 
-        The first steps draw samples of the photos, and later steps draw whole photos. Both take turns in the modes of
-        different viewers. If there are larger photos, some of the later steps draw these, as a viewer does who moves
-        closer.
+        The first steps draw samples of the photos, and later steps draw whole photos. Steps use the modes of different
+        viewers one after the other. If there are larger photos, some of the later steps draw these, which has the
+        effect of a viewer who moves closer.
         """
-        photos, is_early, has_larger = self.job.photos, progress < self.half_part, len(self.job.photos) > 2
+        photos, has_larger = self.job.photos, len(self.job.photos) > 2
+        is_early = progress < self.half_part
         if is_early and not self.samples:
             return DrawMode(1, photos[1].eps2d)
-        if has_larger and is_early:  # later, the larger photos have the effect of a smaller low-pass
+        if has_larger and is_early:  # no step needs a smaller low-pass, because later steps draw the larger photos
             return DrawMode(0, photos[0].eps2d, stride=STRIDE)
         if has_larger and step % LARGE_CYCLE in LARGE_STEPS:
             return DrawMode(2, photos[2].eps2d)
         modes = FIRST_MODES if is_early else DRAW_MODES
         size, low_pass, antialiased = modes[step % len(modes)]
-        # Half-size photos cost short runs more than they gain. With larger photos, a third of these steps is enough
+        # In short runs, steps on half-size photos cost more than they gain. With larger photos, every third is enough
         half_cycle = 3
         if not self.job.options.grows or (has_larger and step % half_cycle):
             size = 0
@@ -148,22 +147,29 @@ def prepare_fit(job: FitJob) -> FitRun:
     """Prepare a fit: choose held-out patches, the weights of pixels, the dropout, and how the first steps draw."""
     photos, options = job.photos, job.options
     dropout = default_dropout(options.steps, len(photos[0])) if options.dropout is None else options.dropout
-    everywhere, *larger = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
-    weights = train_weights = _weights_of(photos[1])
+    full_weights, *large_weights = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
+    score_weights = half_weights = _weights_of(photos[1])
     first_pixels = None
     if options.scored:
-        whole = training_weights(photos[0], options.holdout, job.seed)
-        first_pixels = tuple((weight != 0) & (weight != HIDDEN_WEIGHT) for weight in whole)
-        weights = reduced(whole, photos[1])
-        train_weights = [np.where(weight == HIDDEN_WEIGHT, np.float32(0), weight) for weight in weights]
+        holdout_weights = training_weights(photos[0], options.holdout, job.seed)
+        first_pixels = tuple((weight != 0) & (weight != HIDDEN_WEIGHT) for weight in holdout_weights)
+        score_weights = reduced(holdout_weights, photos[1])
+        half_weights = [np.where(weight == HIDDEN_WEIGHT, np.float32(0), weight) for weight in score_weights]
         if len(photos[0]) == 1:  # no other photo shows the held-out patches, so the fit is scored on all pixels
-            weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
-    step_weights = everywhere, _weigh(train_weights, photos[1]), *larger
-    return FitRun(job, weights, step_weights, dropout, options.half_res_part, _can_sample(job), first_pixels)
+            score_weights = [np.where(weight == 1, np.float32(0), weight) for weight in score_weights]
+    return FitRun(
+        job=job,
+        score_weights=score_weights,
+        step_weights=(full_weights, _weigh(half_weights, photos[1]), *large_weights),
+        dropout=dropout,
+        half_part=options.half_res_part,
+        samples=_can_sample(job),
+        first_pixels=first_pixels,
+    )
 
 
 def default_dropout(steps: int, num_photos: int) -> float:
-    """Return the share of the Gaussians that each step leaves out, if a run has ``steps`` steps and ``num_photos``."""
+    """Return the share of the Gaussians that each step leaves out, in a run of ``steps`` steps on ``num_photos``."""
     if num_photos <= FEW_VIEWS and steps >= MANY_STEPS:
         return DROPOUT
     return LONG_DROPOUT if steps >= max(LONG_STEPS, LONG_ROUNDS * num_photos) else 0.0
@@ -211,14 +217,13 @@ class Step:
 class Schedule:
     """Draw the order of views, the backgrounds and the dropped Gaussians of all steps from one seed.
 
-    One generator draws everything, for each step first its background and then its dropout. With a second generator for
-    dropout, scenes of few views and long runs would have other results than before.
+    One generator draws everything, for each step first its background and then its dropout.
     """
 
     def __init__(self, run: FitRun):
         self.run, self.rng = run, np.random.default_rng(run.job.seed)
         self.views_left: list[int] = []  # views that the current round over all views has not drawn yet
-        # index of each view's next sample; views begin with different samples
+        # for each view, the number of its next sample in OFFSETS; views begin with different samples
         self.samples = list(range(len(run.job.photos[0])))
 
     def draw(self, number: int, progress: float, count: int) -> Step:
@@ -228,10 +233,10 @@ class Schedule:
         """
         if not self.views_left:
             self.views_left = self.rng.permutation(len(self.run.job.photos[0])).tolist()
-        view, background, mask = self.views_left.pop(), self.rng.random(3, dtype=np.float32), None
-        if (
-            self.run.job.num_scored is not None and number % 2
-        ):  # renders stand for photos; most viewers have a black background
+        view = self.views_left.pop()
+        background, mask = self.rng.random(3, dtype=np.float32), None
+        are_renders = self.run.job.num_scored is not None
+        if are_renders and number % 2:  # most viewers have a black background
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
             mask = self.rng.random(count, dtype=np.float32) >= self.run.dropout
@@ -244,7 +249,7 @@ class Schedule:
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     """Return the step size of each of the fourteen parameters; it decays geometrically, and further in longer runs."""
-    usual_steps = 300  # in a longer run, the last step size is smaller by the ratio of the numbers of steps
+    usual_steps = 300  # in a run with twice as many steps, the last step size is half as large
     decay = rates.decay * min(1.0, usual_steps / steps)
     start_rates = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
     widths = [3, 3, 4, 1, 3]  # columns of means, log scales, quaternions, opacity logit and colours
@@ -255,6 +260,6 @@ def first_decay(rates: Tuning, rounds: float) -> float:
     """Return the decay of Adam's first moment after a number of ``rounds`` over all views.
 
     The moment averages about two steps at first, and one step more after every four rounds, up to ``rates.beta1``.
-    Early gradients change quickly, so few are averaged. Later gradients differ most between views.
+    Early gradients change quickly, so few are averaged. Later gradients differ most between views, so more are.
     """
     return min(rates.beta1, 1 - 1 / (2 + rounds / 4))

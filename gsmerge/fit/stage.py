@@ -36,10 +36,11 @@ def fit_scene(
     num_scored: int | None = None,
     held_out: Sequence[int] = (),
 ) -> Fitted:
-    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene (None: all), unless the fit is "none".
+    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene (None: all views).
 
-    ``num_scored`` is None if the scene has photos; the result is then scored on all of them. If renders stand for
-    photos, the result is scored on the views ``held_out``, or if there are none, on the first ``num_scored`` views.
+    If the option ``fit`` is "none", the Gaussians are returned unchanged. If the scene has photos, ``num_scored`` is
+    None, and the result is scored on all photos. If renders stand for photos, the result is scored on the views
+    ``held_out``, or on the first ``num_scored`` views if none are held out.
     """
     if options.fit == "none":
         return Fitted(decoded.gaussians, scene.cameras, None)
@@ -47,15 +48,23 @@ def fit_scene(
     with stage("fit"):
         photos = fit_photos(scene, options, views)
         record_choices(start_count=len(decoded.gaussians))
-        if decoded.exact and not options.grows:  # no drop may change the exact number, because nothing grows back
+        if decoded.exact and not options.grows:  # the number is exact, and no Gaussians are added after a drop
             options = replace(options, min_contribution=0.0)
         takes_all = decoded.exact or options.fills  # the fit grows to the whole count, even where that gains little
-        growth = None if takes_all else MOST_GROWTH
-        job = FitJob(photos, options, decoded.count, growth, seed, report_steps, decoded.fixed, num_scored)
-        outside = place_outside_views(scene, decoded.gaussians, job.scored_photos(1), options)
-        edges = None if options.beyond else find_edges(scene.cameras, decoded.count)
-        unseen = scene_photos(scene)[held_out] if held_out else None
-        job = replace(job, held_out=unseen, outside=outside, edges=edges, region=scene.region)
+        job = FitJob(
+            photos=photos,
+            options=options,
+            count=decoded.count,
+            most_growth=None if takes_all else MOST_GROWTH,
+            seed=seed,
+            progress=report_steps,
+            fixed=decoded.fixed,
+            num_scored=num_scored,
+            held_out=scene_photos(scene)[held_out] if held_out else None,
+            edges=None if options.beyond else find_edges(scene.cameras, decoded.count),
+            region=scene.region,
+        )
+        job = replace(job, outside=place_outside_views(scene, decoded.gaussians, job.scored_photos(1), options))
         gaussians, report = fit_gaussians(decoded.gaussians, job)
         if scene.region is not None:  # splits after the last step may have moved centres out of the region
             gaussians = replace(gaussians, means=clamp_inside(scene.region, gaussians.means).astype(np.float32))
@@ -78,13 +87,13 @@ def fit_gaussians(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Fit the Gaussians that some photo shows; return these Gaussians without the fit if most photos became worse."""
-    options = job.options
-    run, scored = prepare_fit(job), job.scored_photos(0) if job.held_out is None else job.held_out
+    run = prepare_fit(job)
+    scored_photos = job.scored_photos(0) if job.held_out is None else job.held_out
     survey = survey_photos(gaussians, run)
-    keep = survey.visible(options.min_contribution)
-    start, rows = gaussians[keep], np.flatnonzero(keep)
+    is_shown = survey.visible(job.options.min_contribution)
+    start, rows = gaussians[is_shown], np.flatnonzero(is_shown)
     fixed = None if job.fixed is None else job.fixed[rows]
-    fitted, report = _better_of(scored, start, *fit_full(start, run, survey[keep], fixed))
+    fitted, report = _better_of(scored_photos, start, *fit_full(start, run, survey[is_shown], fixed))
     if not report.accepted:
         return start, replace(report, origins=rows)
     assert report.origins is not None
@@ -94,18 +103,18 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport) -> FitResult:
     """Return the Gaussians ``after`` the fit, or those ``before`` it if most photos became worse.
 
-    A fit makes photos worse if the Gaussians were fitted before, because steps of the default size scatter them. Whole
-    photos are compared only if held-out patches gained less than ``CLOSE`` dB. Held-out patches alone are no reason to
-    refuse a fit. Where few views see a place, they become worse in fits that gain up to 10 dB in views left out.
+    Gaussians that were fitted before can become worse, because steps of the default size scatter them. Whole photos are
+    compared only if held-out patches gained less than ``CLOSE`` dB. A fit is not refused because of held-out patches
+    alone. Where few views see a place, the patches become worse even in fits that improve new views by up to 10 dB.
     """
     if report.holdout_after - report.holdout_before >= CLOSE:
         return after, report
-    moved = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats[: len(photos)])
-    # the median and not the mean, because a placed camera close to a Gaussian may see nothing else
-    if np.median(photo_mses(after, moved) / photo_mses(before, photos)) <= 1:
+    moved_photos = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats[: len(photos)])
+    error_ratios = photo_mses(after, moved_photos) / photo_mses(before, photos)
+    if np.median(error_ratios) <= 1:  # not the mean, because a placed camera may see only one near Gaussian
         return after, report
-    why = "most photos were shown worse"
-    return before, replace(report, method="none", accepted=False, stopped=why, viewmats=None)
+    stopped = "most photos were shown worse"
+    return before, replace(report, method="none", accepted=False, stopped=stopped, viewmats=None)
 
 
 def start_share(options: FitOptions) -> float:

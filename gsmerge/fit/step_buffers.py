@@ -1,7 +1,7 @@
 """Take the steps of a fit with few calls of the native library, in buffers that many steps share.
 
-Memory is allocated and arguments are checked once for many steps. A slow twin in the tests takes the same steps by
-single calls of the kernels, with the same bits.
+Memory is allocated and arguments are checked once for many steps. The tests compare these steps bit by bit with the
+same steps taken by single calls of the kernels.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from gsmerge.raster.gradient import viewmat_gradient
 from gsmerge.raster.tiled_view import cache_line_rows, hides_most
 from gsmerge.runtime.threads import parallel_map
 
-# Names of arrays in the table that the native library reads, by where the arrays come from
+# The native library reads a table of arrays by name. These names are those of a state's arrays, and of its splats'
 OF_STATE = ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors")
 OF_SPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-# Arrays whose values each step sets, with their lengths
+# Arrays whose values each step sets, and the lengths of these arrays
 OF_STEP = {
     "camera": CAMERA, "eye": 3, "background": 3, "loss_weights": 2, "rates": 14, "limits": 5, "betas": 2, "regs": 2,
 }  # fmt: skip
@@ -31,17 +31,18 @@ OF_STEP = {
 
 @dataclass(eq=False)
 class StepBuffers:
-    """Buffers for the steps of one state, and for each size of the photos a table of their addresses."""
+    """Buffers for the steps of one state, and tables of their addresses for the native library."""
 
     state: FitState
     threads: int
     moves_camera: bool = False  # True if steps compute the gradient of the viewmat
     gaussians: dict[str, np.ndarray] = field(default_factory=dict)  # Arrays with a row for each Gaussian, and OF_STEP
     room: dict[str, np.ndarray] = field(default_factory=dict)  # Arrays with a row for each intersection with a tile
-    # By size of the photo: a table, and for each phase of a step the call of the library with this table
+    # Size of the photo -> its table, and a function for each phase of a step that calls the library with the table
     tables: dict[tuple[int, int], tuple[FilledTable, list[Callable[[], None]]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Allocate the arrays whose sizes depend on the number of Gaussians, and take over those of the state."""
         n = len(self.state.x)
         widths = {"tints": 3, "sums": SUMS, "g_means": 3, "g_quats": 4, "g_scales": 3, "g_colors": 3}
         self.gaussians |= {name: np.empty((n, width), np.float32) for name, width in widths.items()}

@@ -36,12 +36,13 @@ class Optimiser:
 
     @property
     def viewmats(self) -> np.ndarray | None:
-        """Poses ``[v,4,4]`` that the fit has moved; None if cameras are fixed."""
+        """Poses ``[v,4,4]`` of the cameras, which the fit moves; None if cameras are fixed."""
         return None if self.poses is None else self.poses.viewmats
 
     def step(self, state: FitState, step: Step) -> float:
         """Change a state by one Adam step on one view; return the mean squared error of the pixels that count."""
-        rates, weight = self.run.job.options.tuning, self.run.weight(step)
+        rates = self.run.job.options.tuning
+        weight = self.run.weight(step)
         photo, camera = self.select_view(step)
         numbers = self.constants(state, step) | {
             "camera": camera_numbers(**camera),
@@ -92,7 +93,7 @@ class Optimiser:
         return step.mask * np.minimum(raised, MAX_ALPHA)
 
     def constants(self, state: FitState, step: Step) -> dict[str, np.ndarray]:
-        """Return the constants of Adam at a step, by name, in the order of the arguments of ``kernels.adam``."""
+        """Return the constants of an Adam step by name, in the order of the arguments of ``kernels.adam``."""
         options, count = self.run.job.options, max(len(state.x), 1)
         rates, rounds = options.tuning, step.number / len(self.photos[0])
         return {
@@ -104,14 +105,16 @@ class Optimiser:
 
     @cached_property
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """The limits of the parameters, as ``kernels.adam`` takes them, before and after the growth of a run.
+        """The limits of the parameters, as ``kernels.adam`` takes them, before and after Gaussians are added.
 
-        Before the growth nothing shortens long Gaussians, because no new Gaussians could fill the gaps beside them.
+        Before that, nothing limits how long Gaussians are relative to their width, because no new Gaussians could fill
+        the gaps beside shorter ones.
         """
         rates = self.run.job.options.tuning
         moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
-        widest = max(photos.width for photos in self.run.job.photos)  # its pixel is the unit of the least scale
-        max_length = rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))  # in units of the least scale
+        width = max(photos.width for photos in self.run.job.photos)  # pixels
+        # Three standard deviations are at most a share of the width. The unit is the least scale, min_scale pixels
+        max_length = rates.long_share * width / (3 * max(rates.min_scale, 1e-9))
         log_ratio, log_length = log(np.array([rates.max_ratio, max_length]))
         before = np.array([*moves, np.inf, log_length], np.float32)
         after = np.array([*moves, log_ratio, log_length], np.float32)

@@ -18,8 +18,8 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
 MOST_SCORED = 12  # a fit is scored on at most this many photos
-ENOUGH_PHOTOS = 6  # a survey needs no further photo of a Gaussian if the centre of the Gaussian is inside this many
-# A photo is added to a survey if more than this share of its Gaussians has fewer photos than ENOUGH_PHOTOS
+ENOUGH_PHOTOS = 6  # a survey needs no further photo of a Gaussian whose centre is inside this many
+# A photo is added to a survey if more than this share of its Gaussians is inside fewer than ENOUGH_PHOTOS photos
 FEWER_SHARE = 0.03
 
 
@@ -31,11 +31,11 @@ class Survey:
     inside: np.ndarray  # [n] bool, true for Gaussians that may reach into the frustum of some photo
     peaks: np.ndarray  # [n] float32 largest blending weight in any pixel
     sums: np.ndarray  # [n] float64 blending weights summed over all photos, pixels
-    squares: np.ndarray  # [n] float64 sum over photos of the squared sum of weights in a photo
+    squares: np.ndarray  # [n] float64 squares of the weights summed over a photo, added up for all photos
     pixels: np.ndarray  # [n] float32 size of the finest pixel that shows the Gaussian, world units; inf if none does
 
     def visible(self, min_weight: float) -> np.ndarray:
-        """Return a mask ``[n]`` of Gaussians with a weight of at least ``min_weight``, or outside of all frustums."""
+        """Return a mask ``[n]`` of the Gaussians with a peak of at least ``min_weight``, or outside of all frustums."""
         return ~self.inside | (self.peaks >= min_weight)
 
     def __getitem__(self, rows: np.ndarray) -> Survey:
@@ -46,22 +46,24 @@ class Survey:
 def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
     """Draw Gaussians at the cameras of half-size photos, and measure what each photo shows of each Gaussian.
 
-    :func:`choose_photos` chooses the photos. The size of the finest pixel is that of a pixel of the largest photos.
+    :func:`choose_photos` chooses the photos. The sizes of pixels are those of the largest photos of the fit.
     """
     photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
     colors = state.view_colors()
 
-    def one_view(view: int) -> tuple[np.ndarray, ...]:
-        drawn = tile_view(state.splats, **half.camera(view))
+    def survey_view(view: int) -> tuple[np.ndarray, ...]:
+        """Return the ids of the Gaussians in a view, the sizes of its pixels at them, and the result of ``survey``."""
+        tiled = tile_view(state.splats, **half.camera(view))
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
-        return drawn.ids, drawn.depths / focal, *survey(drawn, colors)
+        return tiled.ids, tiled.depths / focal, *survey(tiled, colors)
 
-    views, scored, images = choose_photos(gaussians, half), choose_scored_photos(len(half)), []
+    views, scored_views = choose_photos(gaussians, half), choose_scored_photos(len(half))
+    images = []  # renders of the scored views
     inside, peaks = np.zeros(count, bool), np.zeros(count, np.float32)
     sums, squares, pixels = np.zeros(count), np.zeros(count), np.full(count, np.inf, np.float32)
-    for view, (ids, pixel_sizes, image, weights, view_peaks) in zip(views, in_turn(one_view, views), strict=True):
-        if view in scored:
+    for view, (ids, pixel_sizes, image, weights, view_peaks) in zip(views, in_turn(survey_view, views), strict=True):
+        if view in scored_views:
             images.append(image)
         inside[ids] = True
         peaks[ids] = np.maximum(peaks[ids], view_peaks)
@@ -76,7 +78,7 @@ def choose_photos(gaussians: Gaussians, photos: Photos) -> list[int]:
 
     A photo shows something new if many of its Gaussians are inside fewer than ``ENOUGH_PHOTOS`` of those chosen so far.
     """
-    sample_gaussians = 4096  # at most about twice this many Gaussians are looked at
+    sample_gaussians = 4096  # a sample of about this many Gaussians, at most twice as many, is projected
     means = gaussians.means[:: max(1, len(gaussians) // sample_gaussians)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
     inside = (depths > NEAR_PLANE) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
@@ -95,7 +97,7 @@ def choose_scored_photos(count: int) -> list[int]:
 
 
 def spread_views(count: int) -> list[int]:
-    """Return the indices of ``count`` views in an order whose first ones, however many, spread evenly over all."""
+    """Return the indices of ``count`` views, in an order whose first n views are spread evenly over all, for any n."""
     # the order of the reversed bits of the numbers (van der Corput)
     return sorted(range(count), key=lambda view: f"{view:032b}"[::-1])
 
@@ -104,12 +106,13 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
     """Return the largest blending weight ``[n]`` of each Gaussian, and a mask ``[n]`` of those in some frustum."""
     splats = make_splats(gaussians)
 
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+    def view_peaks(view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ids of the Gaussians in a view, and their largest blending weights."""
         tiled = tile_view(splats, **photos.camera(view))
         return tiled.ids, list_contributions(tiled)[1]
 
     peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
-    for ids, peaks in in_turn(one_view, range(len(photos))):
+    for ids, peaks in in_turn(view_peaks, range(len(photos))):
         inside[ids] = True
         peak[ids] = np.maximum(peak[ids], peaks)
     return peak, inside
@@ -120,7 +123,7 @@ def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> flo
     options, views = run.job.options, choose_scored_photos(len(half))
     if not options.scored:
         return float("nan")
-    return holdout_psnr(images, half[views], [run.weights[view] for view in views], options.tuning.min_gain)
+    return holdout_psnr(images, half[views], [run.score_weights[view] for view in views], options.tuning.min_gain)
 
 
 def score_state(state: FitState, run: FitRun, half: Photos) -> float:
@@ -130,9 +133,9 @@ def score_state(state: FitState, run: FitRun, half: Photos) -> float:
 
 
 def photo_mses(gaussians: Gaussians, photos: Photos) -> np.ndarray:
-    """Return the mean squared error ``[v]`` of the render of each whole photo, raised above 0 so that it can divide."""
+    """Return the mean squared error ``[v]`` of the render of each whole photo, always above 0 for use as a divisor."""
 
-    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
+    def measure_mse(view: int, image: np.ndarray, _: np.ndarray) -> float:
         return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
 
-    return np.array(photo_errors(gaussians, photos, score)) + np.finfo(np.float32).tiny
+    return np.array(photo_errors(gaussians, photos, measure_mse)) + np.finfo(np.float32).tiny

@@ -43,10 +43,10 @@ class FileCheck:
 
     @property
     def line(self) -> str:
-        """The result as one line for people."""
+        """The result as one line of text."""
         if self.problems:
             return f"wrong  {self.path}: {'; '.join(self.problems)}"
-        unit = {"networks": "parameters"}.get(self.kind, self.kind)
+        unit = "parameters" if self.kind == "networks" else self.kind
         size = f", {human_bytes(self.file_bytes)}" if self.file_bytes else ""
         layout = f", {self.layout}" if self.layout else ""
         views = f", {self.num_views:,} cameras, {self.num_photos:,} photos" if self.num_views else ""
@@ -54,9 +54,10 @@ class FileCheck:
 
 
 def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> FileCheck:
-    """Read a file completely: Gaussians with the cameras and photos beside them, cameras, networks or a ``.gsm``.
+    """Read a scene, a file of cameras or networks, or a ``.gsm`` completely, and return what it holds.
 
-    The ending decides the kind of file. A scene is read as ``compact`` reads it. UsageError if a package is missing.
+    The ending decides the kind of file. A scene is read as ``compact`` reads it, with cameras and photos. A file that
+    cannot be read is returned with its problem. UsageError if a package is missing.
     """
     try:
         file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read_other(path)
@@ -67,7 +68,7 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
 
 
 def holds_scene(path: Path) -> bool:
-    """Return True if a path is read as a scene, and False if as cameras, networks, levels or a state."""
+    """Return whether a path is read as a scene. Otherwise it holds cameras, networks, levels of detail or a state."""
     if STATE.names(path):
         return os.path.isfile(path) and not holds_features(path)
     return os.path.isdir(path) or may_hold_gaussians(path)

@@ -119,7 +119,7 @@ def inspect(
 def _describe_file(ply: GaussianFile) -> dict[str, Any]:
     """Describe a file of Gaussians, without views."""
     info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
-    opaque = 0.995  # the optical depth is capped from this opacity on
+    opaque = 0.995  # above this opacity, optical depths are capped
     saturated = 1e-6  # float32 changes the logit of an opacity that is nearer to 0 or 1 than this
     return {
         **{name: getattr(info, name) for name in _FILE_KEYS},
@@ -148,7 +148,7 @@ def _prepare_quietly(scene: Scene) -> tuple[Scene, list[str]]:
 
 
 def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] | None:
-    """Describe the number of Gaussians of an automatic budget; None if the views' depths cannot be compared."""
+    """Describe the number of Gaussians of an automatic budget; None if the depths of views cannot be compared."""
     if agreement is None:
         return None
     count = int(agreement.share * scene.num_gaussians)
@@ -209,7 +209,7 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
 
 
 def _describe_sight(scene: Scene) -> dict[str, Any]:
-    """Describe what the views show: how colours fit the photos, and the number of photos with sky; {} without views."""
+    """Describe how well colours fit the photos, and in how many photos there is sky; {} without views."""
     if len(scene) == 0:
         return {}
     gaussians, images = scene.gaussians, photo_array(scene.images)
@@ -219,10 +219,10 @@ def _describe_sight(scene: Scene) -> dict[str, Any]:
 
 
 def _count_unseen(load: Loaded) -> dict[str, Any]:
-    """Count the Gaussians of a result that no view shows; {} if that is not known.
+    """Count the Gaussians of a result that no view shows; {} if this number would mean nothing.
 
-    It is not known without views, or with a Gaussian for each pixel, since Gaussians of overlapping views then hide
-    each other.
+    It means nothing without views. It also means nothing if there is a Gaussian for each pixel, because Gaussians of
+    overlapping views hide each other.
     """
     if len(load.scene) == 0 or load.recovery is not None:
         return {}
@@ -308,10 +308,10 @@ def _describe_cameras(scene: Mapping[str, Any]) -> str:
 
 
 def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe the order of the rows and their distances from their pixels, or say why these are unknown."""
+    """Describe the order of the rows and the distances of Gaussians from their pixels, or say why these are unknown."""
     alignment, problem = scene["alignment"], scene["alignment_problem"]
     if problem is not None and scene["compact"] is None:
-        return []  # the error says why
+        return []  # the command ends with this problem as its error
     if problem is not None:
         return [f"alignment  not one Gaussian per pixel: {problem.removeprefix('expected one Gaussian per pixel, ')}"]
     if alignment is None:
@@ -327,7 +327,7 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe the shares of pixels or Gaussians that the views show, and name the view with the least share."""
+    """Describe what share of the pixels or of the Gaussians each view shows, and name the view with the least share."""
     views, sight = scene["coverage"], scene["sight"]
     if not views or sight is None:
         return []

@@ -1,7 +1,7 @@
 """Assign photos to views: find which photo shows which view, and in which orientation.
 
-File names propose a photo for each view. A comparison of the photo with the Gaussians of the view decides. A proposed
-photo is replaced or left out
+File names propose a photo for each view. The photo is then compared with the Gaussians of the view. A proposed photo is
+replaced or left out
 
 - if another photo or another orientation matches the view clearly better,
 - if it matches the view no better than photos match views that they do not show (wrong pairs), or
@@ -76,12 +76,12 @@ class _Scores:
     def choose_orientation(self, view: int, photo: int, tag: int) -> int:
         """Choose the orientation in which a photo shows a view.
 
-        It is the stored one, 0, if no other scores clearly higher; otherwise ``tag``, on the same condition; otherwise
-        the one with the highest score.
+        The stored orientation, 0, is chosen unless another one scores clearly higher. Then ``tag`` is chosen, unless
+        another one scores clearly higher than ``tag``. The last choice is the orientation with the highest score.
         """
         scores = np.nan_to_num(self.values[view, self.photos.index(photo)], nan=-np.inf)
-        likely = (orientation for orientation in (0, tag) if scores[orientation] > scores.max() - SIGNIFICANT)
-        return next(likely, int(scores.argmax()))
+        proposed = (orientation for orientation in (0, tag) if scores[orientation] > scores.max() - SIGNIFICANT)
+        return next(proposed, int(scores.argmax()))
 
 
 class Assigner:
@@ -96,7 +96,7 @@ class Assigner:
         self.candidates, self._show = candidates, show
         self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
         self._offsets = dict[tuple[int, Assignment], PhotoOffsets | None]()
-        self.has_contrast = self._comparer.measure_contrast() > MIN_CONTRAST  # [v] False: too plain to be compared
+        self.has_contrast = self._comparer.measure_contrast() > MIN_CONTRAST  # [v], False for views of one plain colour
 
     @cached_property
     def shown(self) -> ViewPictures:
@@ -107,19 +107,19 @@ class Assigner:
         """Return the scores of photos in all views, relative to the noise among these photos."""
         ids = tuple(dict.fromkeys(photos))
         new = [photo for photo in ids if photo not in self._correlations]
-        # Least photos per task, and most tasks: each task goes through the pictures of all views
-        min_per_task, max_tasks = 8, 16
+        min_per_task, max_tasks = 8, 16  # more tasks would take longer, because each reads the pictures of all views
         task_size = max(min_per_task, -(-len(new) // max_tasks))
 
         def correlate_task(start: int) -> np.ndarray:
+            """Return the correlations of the photos of one task."""
             return self._comparer.correlate([self.candidates.read(photo) for photo in new[start : start + task_size]])
 
         new_correlations = parallel_map(correlate_task, range(0, len(new), task_size))
         self._correlations |= dict(zip(new, itertools.chain(*new_correlations), strict=True))
         correlations = np.stack([self._correlations[photo] for photo in ids], 1)
         z = fisher_z(correlations)
-        middle, noise = measure_noise(z, self._comparer.least_noise)
-        return _Scores(ids, (z - middle[:, None, None]) / noise, correlations)
+        medians, noise = measure_noise(z, self._comparer.least_noise)
+        return _Scores(ids, (z - medians[:, None, None]) / noise, correlations)
 
     def compare_parts(self, view: int, assignment: Assignment) -> float | None:
         """Compare a photo with a view part by part, and return their similarity.
@@ -143,10 +143,10 @@ class Assigner:
         """Return True if the parts of a view's photo are displaced farther than the parts of the other views' photos.
 
         Wrong depth displaces the drawn Gaussians of all views. So parts of the photo may be displaced by twice the
-        median offset in the other views, but by no more than ``NEAR_PIXELS``, by which offsets within one view differ.
+        median offset in the other views, but by no more than ``NEAR_PIXELS``.
         """
         offsets = self.find_offsets(view, assignments[view])
-        if offsets is None or offsets.verdict is not False:  # the parts do not even speak against the photo
+        if offsets is None or offsets.verdict is not False:  # even without a tolerance, the parts fit the photo
             return False
         other_pairs = [pair for pair in assignments.items() if pair[0] != view]
         other_offsets = parallel_map(lambda pair: self.find_offsets(*pair), other_pairs)
@@ -157,20 +157,20 @@ class Assigner:
         return replace(offsets, tolerance=ZERO_OFFSET + min(threshold, NEAR_PIXELS)).verdict is False
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
-        """Check the photos ``named`` that names or order propose for the views, one for each view or None.
+        """Check the photos ``named``, which file names or order propose for the views; None for a view without one.
 
-        Returns two lists with an entry for each view: the assignment, None where no photo is proposed or the photo is
-        rejected; and True where the comparison confirms the photo. A photo is rejected
+        Returns two lists with an entry for each view: the assignment, or None if no photo is proposed or the photo is
+        rejected; and whether the comparison confirms the photo. A photo is rejected
 
         - if another orientation, or another photo that no other view needs, scores clearly higher in its view,
         - if it scores no higher than wrong pairs do, or
         - if its parts lie farther from their places than the parts of the other proposed photos do.
 
-        Noise of the drawings lowers the scores of all photos and moves their parts. The thresholds therefore follow
-        from the scores and parts of the proposed photos themselves.
+        Noisy Gaussians lower the scores of all photos and displace their parts. The thresholds therefore follow from
+        the scores and parts of the proposed photos themselves.
 
-        Where names are ``exact``, a photo is confirmed if its score is high and no other assignment scores higher.
-        Other photos are confirmed by their parts.
+        If names are ``exact``, a photo is confirmed if its score is high and no other assignment scores higher. All
+        other photos are confirmed if their parts lie in their places.
         """
         out, confirmed = list[Assignment | None]([None] * len(named)), [False] * len(named)
         named_pairs = [(view, photo) for view, photo in enumerate(named) if photo is not None]
@@ -179,11 +179,11 @@ class Assigner:
         scores = self.score_in_views(photo for _, photo in named_pairs)
         proposed = {view: Assignment(photo, self._stored_or_tagged(scores, view, photo)) for view, photo in named_pairs}
         columns = [scores.photos.index(photo) for _, photo in named_pairs]
-        best = scores.best()[np.ix_(list(proposed), columns)]  # of each proposed view with each proposed photo
-        own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)  # of each photo in its view
+        best = scores.best()[np.ix_(list(proposed), columns)]  # scores of each proposed view with each proposed photo
+        own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)  # of photos in their views
         matched = _match_columns(best)
-        # if the proposed photos together are right, half their median lies half-way from wrong pairs to right ones
         with_contrast = own[self.has_contrast[list(proposed)]]
+        # wrong pairs score about 0, and right ones about the median, so the threshold may lie in the middle
         least = min(SIGNIFICANT, median(with_contrast) / 2) if _exceed_noise(with_contrast) else SIGNIFICANT
         for row, (view, assignment) in enumerate(proposed.items()):
             score, highest = own[row], max(best[row, row], best[row, matched[row]])
@@ -215,17 +215,17 @@ class Assigner:
         return median(np.array(correlations)) > np.sqrt(MIN_EXPLAINED)
 
     def match_together(self, assignments: Sequence[Assignment | None]) -> bool:
-        """Return True if assigned photos together match their views better than equally many wrong pairs would."""
+        """Return True if assigned photos, taken together, match their views better than photos match other views."""
         scores = self.score_in_views(self._correlations)  # of all photos that were compared so far
-        own = [
+        own_scores = [
             scores.of(view, assignment)
             for view, assignment in enumerate(assignments)
             if assignment is not None and self.has_contrast[view]
         ]
-        return not own or _exceed_noise(np.array(own))
+        return not own_scores or _exceed_noise(np.array(own_scores))
 
     def _stored_or_tagged(self, scores: _Scores, view: int, photo: int) -> int:
-        """Return the orientation of a photo's tag if it scores clearly higher than the stored orientation, else 0."""
+        """Return the orientation in a photo's tag if it scores clearly higher than the stored orientation, else 0."""
         tag = self.candidates.tag(photo)
         stored, tagged = np.nan_to_num(scores.values[view, scores.photos.index(photo), [0, tag]], nan=-np.inf)
         return tag if tagged > stored + SIGNIFICANT else 0
@@ -242,7 +242,7 @@ class Assigner:
         scores = self.score_in_views(self._correlations)
 
         def compare(pair: tuple[int, Assignment]) -> float:
-            """Return the similarity of the parts, or, if they do not decide, a smaller number from the score."""
+            """Return the similarity of the parts, or a number below 1 that follows the score if they do not decide."""
             similarity = self.compare_parts(*pair)
             if similarity is not None:
                 return similarity
@@ -260,8 +260,8 @@ class Assigner:
             return {}
         step, tag = -(-len(photos) // FIRST_PHOTOS), self.candidates.tag
         compared = set(range(0, len(photos), step))  # indices into ``photos``
-        max_compared = 4  # photos with the highest scores that are compared with a view part by part
-        while True:
+        max_compared = 4  # number of photos that are compared with a view part by part
+        while True:  # until the best photos of all views have no neighbours that were not compared
             scores = self.score_in_views(photos[index] for index in sorted(compared))
             best = scores.best()
             columns = {view: np.argsort(-best[view], kind="stable")[:max_compared] for view in views}
@@ -273,6 +273,7 @@ class Assigner:
             compared, step = compared | neighbours, 1
 
         def list_assignments(view: int) -> list[Assignment]:
+            """List the likely photos of a view, in their likely orientations."""
             likely = [scores.photos[column] for column in columns[view] if np.isfinite(best[view, column])]
             return [Assignment(photo, scores.choose_orientation(view, photo, tag(photo))) for photo in likely]
 
@@ -293,37 +294,37 @@ def assign_photos(
         show: ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side.
         candidates: The photos.
         named: The photo that names or order propose for each view, or None.
-        exact: The proposal is by names. If most names prove right, a view whose name has no photo gets none, since each
-            other photo has the name of its own view.
+        exact: The proposal is by names. If most names prove right, a view without a photo of its name gets none,
+            because all photos have names of other views.
         stored: The photos as stored in their files, if ``candidates`` are resampled to the views.
 
     Returns:
         The assignment of each view, None where no photo shows it; and True if the proposed photos explain most views.
     """
     assigner = Assigner(show, candidates)
-    out, confirmed = assigner.confirm(named, exact=exact)
-    num_assigned = sum(assignment is not None for assignment in out)
-    most_match = 2 * num_assigned > len(out) and assigner.match_together(out)
-    explain_most = assigner.explain_most(out)
+    assignments, confirmed = assigner.confirm(named, exact=exact)
+    num_assigned = sum(assignment is not None for assignment in assignments)
+    most_match = 2 * num_assigned > len(assignments) and assigner.match_together(assignments)
+    explain_most = assigner.explain_most(assignments)
     if exact and most_match:  # search only for the views whose proposed photo was rejected
-        unknown = [view for view, photo in enumerate(named) if photo is not None and out[view] is None]
+        unknown = [view for view, photo in enumerate(named) if photo is not None and assignments[view] is None]
     else:
         unknown = [view for view, is_confirmed in enumerate(confirmed) if not is_confirmed]
     if not unknown:
-        return out, explain_most
-    used = {assigned.photo for view, assigned in enumerate(out) if assigned is not None and view not in unknown}
+        return assignments, explain_most
+    used = {assigned.photo for view, assigned in enumerate(assignments) if assigned and view not in unknown}
     if stored is not None:
         assigner = Assigner(show, stored)
     results = assigner.search(unknown, [photo for photo in range(candidates.count) if photo not in used])
     for view in unknown:
-        out[view] = results.get(view) or (out[view] if most_match else None)
-    return out, explain_most
+        assignments[view] = results.get(view) or (assignments[view] if most_match else None)
+    return assignments, explain_most
 
 
 def _exceed_noise(scores: np.ndarray) -> bool:
-    """Return True if the median of scores ``[n]`` is significantly above the median of equally many wrong pairs.
+    """Return True if the median of scores ``[n]`` is significantly above 0, the median of wrong pairs.
 
-    A single extreme score hardly moves the median.
+    The median is used because a single extreme score hardly moves it.
     """
     return bool(len(scores) and median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
 
@@ -347,9 +348,9 @@ def _choose_assignments(pairs: Sequence[tuple[int, Assignment]], scores: Sequenc
 
 
 def _match_columns(scores: np.ndarray) -> np.ndarray:
-    """Choose a column ``[r]`` for each row of ``scores [r,c]`` so that the sum is largest; -1 for a row without one.
+    """Choose a column ``[r]`` for each row of ``scores [r,c]``, so that the sum of the chosen scores is largest.
 
-    No column is chosen twice.
+    No column is chosen twice. A row that gets no column has -1.
     """
     best, out = scores.argmax(1), np.full(len(scores), -1)
     if len(set(best.tolist())) == len(best):  # the best columns differ, so no search is needed

@@ -1,10 +1,10 @@
 """Test whether a change of colours makes photos equal to what the Gaussians show.
 
-A change is a hypothesis with parameters: red and blue exchanged, a tone curve for each channel, or a linear map of
-colours. Pictures are cut into blocks, which are dealt into two halves like the squares of a chess board. The change of
-one half is fitted to the other half, so no block is scored by a change that was fitted to it. A change is accepted if
-it reduces the errors of blocks by more than their noise and by more than half. The error of a block is the error of its
-mean colour, because wrong depth displaces few Gaussians across a block.
+A change exchanges red and blue, applies a tone curve to each channel, or is a linear map of colours. Pictures are cut
+into blocks, half of which are black and half white like the squares of a chess board. The change of one half is fitted
+to the other half, so no block is scored by a change that was fitted to it. A change is accepted if it reduces the
+errors of blocks by more than their noise and by more than half. The error of a block is the error of its mean colour,
+because wrong depth displaces few Gaussians across a block.
 """
 
 from __future__ import annotations
@@ -115,14 +115,15 @@ def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
     """Return blocks of the photos after a tone curve, which is fitted to each group of views by :func:`_cross_fit`."""
     toned = pairs.photos.copy()
 
-    def fit(group: Sequence[int]) -> None:
+    def change_group(group: Sequence[int]) -> None:
+        """Fit a tone curve to a group of views, and apply it to their photos in ``toned``."""
         group_pairs = pairs[group]
         shown = group_pairs.shown
         toned[group] = _cross_fit(
             group_pairs.photos, shown.pictures, shown.weights, lambda *colors: partial(map_tones, fit_tones(*colors))
         )
 
-    parallel_map(fit, groups)
+    parallel_map(change_group, groups)
     return cut_blocks(pairs.with_photos(toned))
 
 
@@ -153,7 +154,7 @@ def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fi
     """Change each half of the blocks of photos ``[v,h,w,3]`` by the change that ``fit`` finds for the other half."""
     out, block_side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
     y, x = ((np.arange(size) / block_side).astype(int) for size in photos.shape[1:3])
-    black_squares = (y[:, None] + x) % 2 == 1  # of the chess board
+    black_squares = (y[:, None] + x) % 2 == 1  # like those of a chess board
     for fold in (black_squares, ~black_squares):
         colors, targets = photos[:, ~fold].reshape(-1, 3), pictures[:, ~fold].reshape(-1, 3)
         change = fit(colors, targets, weights[:, ~fold].reshape(-1))
@@ -164,7 +165,7 @@ def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fi
 def _join_quantiles(levels: np.ndarray, tones: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the curve ``[256]`` float32 that maps quantiles of ``levels`` to those of ``tones``.
 
-    Darker and brighter levels than all quantiles are mapped in proportion.
+    Levels below and above all quantiles are mapped in proportion.
     """
     used = weights > 0
     if not used.any():
@@ -172,8 +173,8 @@ def _join_quantiles(levels: np.ndarray, tones: np.ndarray, weights: np.ndarray) 
     before, after = (np.round(_weigh_quantiles(values[used], weights[used]), 6) for values in (levels, tones))
     is_distinct = np.concatenate([[True], np.diff(before) > 1 / 255]) & (before > 0) & (before < 1)
     x, y = before[is_distinct], np.maximum.accumulate(after[is_distinct].clip(0, 1))  # points of the curve
-    end = min(1.0, max(y[-1], y[-1] / x[-1])) if len(x) else 1.0
-    curve = np.interp(np.arange(256) / 255, [0, *x, 1], [0, *y, end])
+    last_y = min(1.0, max(y[-1], y[-1] / x[-1])) if len(x) else 1.0  # at x = 1: the last point, extended in proportion
+    curve = np.interp(np.arange(256) / 255, [0, *x, 1], [0, *y, last_y])
     return np.round(curve, 6).astype(np.float32)
 
 

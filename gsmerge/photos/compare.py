@@ -44,8 +44,8 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
 from gsmerge.types import PicturedScene
 
-# Signed differences of pixels are averaged over 5 x 5 pixels. So if a model blurs a photo by 1.5 pixels, only 0.5 % of
-# its pixels differ by EXPOSURE_STEP.
+# Signed differences of pixels are averaged over 5 x 5 pixels. If a model blurs a photo by 1.5 pixels, only 0.5 % of the
+# averages differ by EXPOSURE_STEP
 MEAN_WINDOW = np.full(5, 1 / 5, np.float32)
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 COMPARED_OPACITY = 0.05  # opacity below which a pixel's Gaussian is not compared
@@ -56,9 +56,9 @@ STRAY_PHOTOS = "do not show what the Gaussians show"  # in notes, of photos that
 def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedScene, tuple[int, ...]]:
     """Correct the photos of a canonical scene, and replace photos, or parts of them, that do not show it.
 
-    Returns the scene and the views whose photos show it. There are none if most photos do not show the scene, or if the
-    photos have another look. With ``look`` "photos" all photos count unchanged; with "scene" none counts. The record
-    gets notes and the choices ``photos_changed`` and ``photos_left_out``.
+    Returns the scene and the views whose photos show it. No view is returned if most photos do not show the scene, or
+    if the photos have another look. With ``look`` "photos", all photos count unchanged. With "scene", none counts. The
+    record gets notes and the choices ``photos_changed`` and ``photos_left_out``.
     """
     photo_views = scene.photo_views
     if look != "auto" or not photo_views:
@@ -69,9 +69,10 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         scene = _color_photos(scene, grey)
         pairs = pair_photos(scene, scene.images)
     matching = find_matching_views(scene, photo_views, list(scene.images), pairs.shown)
-    if _has_other_look(scene, pairs, matching or photo_views):
+    compared_views = matching or photo_views
+    if _has_other_look(scene, pairs, compared_views):
         problem = "the scene has another look than its photos, so it keeps its own colours"
-        if are_exchanged(pairs[matching or photo_views]):
+        if are_exchanged(pairs[compared_views]):
             problem = "red and blue are exchanged between Gaussians and photos: either f_dc_0 and f_dc_2 of the file or"
             problem += " the photos are in the order blue, green, red; the scene keeps its own colours"
         note(Doubt(f"{problem}; --set look=photos gives it the look of the photos"))
@@ -79,10 +80,10 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     stray = [view for view in photo_views if view not in matching]
     if stray and not _note_stray(scene, stray, photo_views):
         return scene, ()
-    tones = find_tones(pairs, matching)
+    curves = find_tones(pairs, matching)
     if pairs.shown.drawn and not have_other_tones(scene, matching):
-        tones = [None] * len(pairs)
-    changes = [PhotoChange(curve) for curve in tones]
+        curves = [None] * len(pairs)
+    changes = [PhotoChange(curve) for curve in curves]
     _note_tones(scene, changes, matching)
     hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
     if scene.has_own_pixels:
@@ -95,25 +96,25 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
 
 
 def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
-    """Find, for each view, the tone curve ``[3,256]`` from its photo to its Gaussians; None for the right tone.
+    """Find, for each view, the tone curve ``[3,256]`` from its photo to its Gaussians; None if their tones are equal.
 
-    If the Gaussians are drawn, all photos share a curve. If no photo changes by at least :data:`EXPOSURE_STEP`, no
-    curve counts, because models have a tone of their own. A curve from Gaussians to photos has to work, too. Otherwise
-    the cause is noise, which flattens the colours of the Gaussians.
+    If the Gaussians are drawn, all photos share a curve. If no photo changes by more than :data:`EXPOSURE_STEP`, no
+    curve counts, because models have a tone of their own. A curve counts only if the inverse curve, from Gaussians to
+    photos, reduces errors, too. It does not if the cause is noise, which flattens the colours of Gaussians.
     """
-    curves, is_clear = list[np.ndarray | None]([None] * len(pairs)), False
+    curves, is_large = list[np.ndarray | None]([None] * len(pairs)), False
     stored = cut_blocks(pairs)
     groups = [group for group in _group_by_curve(pairs, views) if is_visible(stored.errors(group))]
-    toned, back = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
+    toned, inverse = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
     for group in groups:
-        before = stored.errors(group)
-        if explains(before, toned.errors(group)) and stands_out(before - back.errors(group)):
-            is_clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > EXPOSURE_STEP)
+        errors = stored.errors(group)
+        if explains(errors, toned.errors(group)) and stands_out(errors - inverse.errors(group)):
+            is_large |= bool(np.nanmedian(stored.distances(toned.photos, group)) > EXPOSURE_STEP)
             colors, targets = (images[group].reshape(-1, 3) for images in (pairs.photos, pairs.shown.pictures))
             curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
             for view in group:
                 curves[view] = curve
-    return curves if is_clear else [None] * len(pairs)
+    return curves if is_large else [None] * len(pairs)
 
 
 def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
@@ -155,8 +156,8 @@ def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedSc
 def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
     """Return whether the base colours of all Gaussians have another tone than the photos of ``views``.
 
-    If depth is wrong, a drawing may have the tone of Gaussians that hide the right ones. But the base colours of all
-    Gaussians, hidden or not, come from the photos. So they show whether the tone really differs.
+    The base colours come from the photos, also those of hidden Gaussians. Drawings are a weaker test: if depth is
+    wrong, the Gaussians that hide others can give a drawing another tone.
     """
     solid = np.flatnonzero(scene.gaussians.opacities > COMPARED_OPACITY)
     step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
@@ -173,7 +174,8 @@ def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
 def _group_by_curve(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
     """Group the views whose photos share a tone curve.
 
-    All do if their pictures are drawings, because these show tones less exactly. Otherwise each view has its own curve.
+    If the pictures of the Gaussians are drawings, all views are one group, because drawings show tones less exactly.
+    Otherwise each view is a group of its own.
     """
     return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
@@ -183,14 +185,15 @@ def find_matching_views(
 ) -> list[int]:
     """Find which of ``views`` are shown by their ``photos [h,w,3]``; see :mod:`gsmerge.photos.assign`.
 
-    There are none if all photos together match no better than photos of other views would. Layers of one camera share
+    No view is returned if all photos together match no better than photos match other views. Views of one camera share
     one photo. ``shown`` are small pictures of the Gaussians in all views; if they are drawings, they are reused.
     """
-    kinds = camera_kinds(scene.cameras)
-    ids = sorted({kinds[view]: view for view in reversed(views)}.values())
-    candidates = Candidates(lambda photo: photos[ids[photo]], len(ids), lambda _: 0)
+    camera_ids = camera_kinds(scene.cameras)
+    ids = sorted({camera_ids[view]: view for view in reversed(views)}.values())  # the first view of each camera
+    candidates = Candidates(read=lambda photo: photos[ids[photo]], count=len(ids), tag=lambda _: 0)
 
     def show(side: int) -> ViewPictures:
+        """Make pictures of the views ``ids`` with up to ``side`` pixels on the longer side."""
         return (shown.shrink(side) if shown.drawn and side <= PICTURE_PIXELS else show_views(scene, side))[ids]
 
     assigner = Assigner(show, candidates)
@@ -198,17 +201,17 @@ def find_matching_views(
     if not assigner.match_together(confirmed_photos):
         return []
     # views without contrast cannot be compared, so they count as matching
-    rows = zip(ids, confirmed_photos, assigner.has_contrast, strict=True)
-    matching = {kinds[view] for view, photo, has_contrast in rows if photo is not None or not has_contrast}
-    return [view for view in views if kinds[view] in matching]
+    results = zip(ids, confirmed_photos, assigner.has_contrast, strict=True)
+    matching = {camera_ids[view] for view, photo, has_contrast in results if photo is not None or not has_contrast}
+    return [view for view in views if camera_ids[view] in matching]
 
 
 def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> bool:
     """Return whether a linear map of colours, but no tone curve, explains how the photos differ from Gaussians.
 
     The map may lead from photos to Gaussians, or from Gaussians to photos, for example to grey ones. Photos of another
-    scene do not have another look: a single colour explains them as well as the map, or they do not match their views
-    even after it. Only ``views`` are compared.
+    scene do not count as another look, because photos must match their views after the map, and because the map must
+    explain more than a single colour does. Only ``views`` are compared.
     """
     view_pairs = pairs[views]
     if _is_mapped(view_pairs):
@@ -230,19 +233,20 @@ def are_exchanged(pairs: Pairs) -> bool:
 
 
 def _is_mapped(pairs: Pairs) -> bool:
-    """Return whether a linear map of the photos' colours explains the pictures better than tones or one colour do."""
+    """Return whether a linear map of the photos' colours explains the pictures better than tone curves or a colour."""
     stored = cut_blocks(pairs)
     if not is_visible(stored.errors()):
         return False
     toned, mapped = tone_blocks(pairs, _group_by_curve(pairs, range(len(pairs)))), map_blocks(stored)
-    simpler = toned, plain_blocks(stored)
-    return is_visible(toned.errors()) and all(explains(blocks.errors(), mapped.errors()) for blocks in simpler)
+    return is_visible(toned.errors()) and all(
+        explains(blocks.errors(), mapped.errors()) for blocks in (toned, plain_blocks(stored))
+    )
 
 
 def _note_stray(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence[int]) -> bool:
     """Note and record the ``stray`` views, whose photos do not show the scene; return whether other photos are used.
 
-    They are, unless most photos are stray.
+    If more than half of the photos are stray, none is used.
     """
     names = [scene.names[view] for view in stray]
     record_choices(photos_left_out=names)
@@ -273,8 +277,8 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
     """Note in which photos of ``views`` something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
     max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
-    least_percent = 1  # of a photo; if less differs, there is no note
-    if max_percent < least_percent:
+    noted_percent = 1  # there is no note if less of every photo differs
+    if max_percent < noted_percent:
         return
     note(
         f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians"
@@ -285,11 +289,12 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
 
 
 def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[np.ndarray, np.ndarray]:
-    """Find the pixels ``[v,h,w]`` at which changed photos differ from their rows; also return the rows' pictures.
+    """Find the pixels ``[v,h,w]`` at which something covers the scene in its changed photos.
 
-    A pixel without a row takes the result of the nearest pixel with one. If a photo differs from the base colours of
-    its rows, these Gaussians are drawn from its camera, which takes longer. Where the photo looks like the drawing, it
-    does not differ.
+    Also returns pictures ``[v,h,w,3]`` of the colours of the views' own Gaussians. A photo is compared with the base
+    colours of these Gaussians. If it differs somewhere, it is also compared with a drawing of them, which takes longer.
+    Something covers the scene where the photo differs from both. A pixel without a Gaussian takes the result of the
+    nearest pixel with one.
     """
 
     def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -300,18 +305,19 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
         differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * convolve(weights, MEAN_WINDOW, MEAN_WINDOW))
         return fill_gaps(differs[..., None], known)[..., 0]
 
-    def differ_drawn(views: np.ndarray, rows: RowPicture) -> None:
+    def compare_drawn(views: np.ndarray, drawn: RowPicture) -> None:
+        """Compare the photos of ``views`` with a drawing, and replace their pixels in ``hidden`` and ``pictures``."""
         for view in views:
-            known = shown[view] & inside[view] & rows.known  # not where only neighbours' Gaussians reach into a pixel
-            pictures[view] = rows.picture
-            hidden[view] = differ(view, rows.picture, known) & differ(view, rows.drawing, known)
+            known = shown[view] & inside[view] & drawn.known  # a pixel needs a Gaussian of its own
+            pictures[view] = drawn.picture
+            hidden[view] = differ(view, drawn.picture, known) & differ(view, drawn.drawing, known)
 
     inside = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     pictures, pixels = row_pictures(scene), scene.get_pixels()
     shown = pixels.shown
     with_row = shown & (scene.gaussians.opacities[pixels.fronts] > COMPARED_OPACITY) & inside
     hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], with_row[view]), range(len(scene))))
-    picture_rows(scene, differ_drawn, np.asarray((hidden | ~inside).any((1, 2))))
+    picture_rows(scene, compare_drawn, np.asarray((hidden | ~inside).any((1, 2))))
     return hidden, pictures
 
 
@@ -324,9 +330,9 @@ def _change_photos(
 ) -> PicturedScene:
     """Change the photos of ``views``, and use the Gaussians' colours at ``hidden [v,h,w]`` pixels and in other views.
 
-    Small and large photos are changed alike. The Gaussians' colours are ``pictures [v,h,w,3]``; if these are None, they
-    are drawn. The pixels of the other views count only if their colours are those of the view's own Gaussians.
-    ``hidden`` is changed in place: other views and pixels outside masks become hidden.
+    Small and large photos are changed alike. The Gaussians' colours are ``pictures [v,h,w,3]``, or renders if these are
+    None. The pixels of other views count only if each view has Gaussians of its own. ``hidden`` is changed in place:
+    all other views and the pixels outside masks become hidden.
     """
     other_views = sorted({*range(len(scene))} - {*views})
     hidden[other_views] = True

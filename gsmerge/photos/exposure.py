@@ -1,15 +1,15 @@
 """Scene -> the scene in one exposure, if the exposures of its photos and Gaussians differ at random.
 
 Cameras choose exposure and white balance for each photo, and models copy them into their Gaussians, so one surface has
-several tones. Pixels of a view are looked up in other views that have Gaussians at the same depth. The median ratio of
-their colours, in each channel, is the ratio of this pair of views. The gains of all views follow from all pairs by
-least squares, with a geometric mean of one.
+several tones. Pixels of a view are looked up in other views that have Gaussians at the same depth. The ratio of two
+views is the median ratio of the colours of such pixels, in each channel. The gains of all views follow from the ratios
+of all pairs of views by least squares, with a geometric mean of one.
 
 Gains are removed if nothing predicts the gain of a new view, so that the mean of all gains is the best guess. Photos
 stay unchanged in two cases, in which the gain can be predicted. First, a camera that meters light makes bright places
-darker, also in new photos. Then photos with larger gains are not brighter. Second, exposure may drift along a video.
-Then neighbours have nearly the same gain. In both cases photos of mean exposure would be farther from new photos, by
-1.5 dB in a video of a kitchen.
+darker, also in new photos. In this case photos with larger gains are not brighter. Second, exposure may drift along a
+video. In this case neighbours have nearly the same gain. In both cases photos of mean exposure would be farther from
+new photos, by 1.5 dB in a video of a kitchen.
 """
 
 from __future__ import annotations
@@ -32,21 +32,22 @@ from gsmerge.types import Cameras, PicturedScene, Scene
 
 EXPOSURE_PIXELS = 2000  # pixels of a view that are looked up in the other views
 NOISE_LEVEL, CLIPPED_LEVEL = 0.05, 0.95  # colours in between are neither noise nor clipped
-# The bounds down to UNEXPECTED were chosen on the plain exports of 15 captures.
-# Exposures differ if the root mean square of the logarithmic gains is above this bound. It is for nine of ten draws of
-# random gains of 0.8 to 1.25 for five photos, and in six captures that were left as they are
+# The bounds from DIFFERENT to UNEXPECTED were chosen on the exports of 15 captures whose exposures were not changed.
+# Exposures differ if the root mean square of the logarithmic gains is above this bound. If five photos get random gains
+# of 0.8 to 1.25, it is above in nine of ten draws. It is also above in six of the captures
 DIFFERENT = 0.06
 # Brightness follows gains if the slope of photos' brightness over their gains, both as logarithms, is above FOLLOWS.
-# The slope is 0.61 to 1.11 for random gains of 0.5 to 2, and at most 0.41 if a camera metered light and gains are 0.1
-# or more. If places differ in brightness by more than the gains, the slope says little. So it counts only if gains
-# oppose the brightness of places, with a correlation below OPPOSED. For cameras that metered light it is -0.67 to -0.99
+# The slope is 0.61 to 1.11 for random gains of 0.5 to 2. It is at most 0.41 if a camera metered light and gains are 0.1
+# or more. If places differ in brightness by more than the gains, the slope says little. So a camera counts as metering
+# only if gains and the brightness of places have a correlation below OPPOSED, too. This correlation is -0.67 to -0.99
+# for cameras that metered light
 FOLLOWS, OPPOSED = 0.5, -0.6
-# Gains are unexpected if their distance from the mean gain of the two nearest views, divided by that of random gains,
-# is above this bound. It is 0.71 to 1.22 for random gains of 0.5 to 2, and 0.67 for four views in a row. It is 0.19 to
-# 0.57 if exposure drifts, and removing gains then loses 1.7 dB or more
+# Gains are unexpected if share_unexpected returns more than this. It returns 0.71 to 1.22 for random gains of 0.5 to 2,
+# and 0.67 for four views in a row. It returns 0.19 to 0.57 if exposure drifts. In that case results lose 1.7 dB or more
+# if gains are removed
 UNEXPECTED = 0.69
 COARSE_STEP = 4  # the brightness of a photo is measured on every COARSE_STEP-th pixel of every COARSE_STEP-th row
-BRIGHT_GAIN = 1.15  # gain from which on clipped pixels no longer count
+BRIGHT_GAIN = 1.15  # clipped pixels do not count in photos with a larger gain than this
 CLIPPED_NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
 # Numbers of nearest and of farther views with which a view is compared; see choose_partners
 NEAREST_VIEWS, FARTHER_VIEWS = 6, 2
@@ -54,7 +55,7 @@ NEAREST_VIEWS, FARTHER_VIEWS = 6, 2
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """How much brighter one view's pixels are in another view."""
+    """How much brighter another view shows the surfaces of a view's pixels."""
 
     view: int
     other: int
@@ -92,7 +93,7 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
 
 
 def _find_objection(scene: PicturedScene, views: Sequence[int], gains: np.ndarray) -> str:
-    """Return why photos should stay unchanged, or an empty text."""
+    """Return why photos should stay unchanged although their exposures differ; "" if there is no reason."""
     view_gains, photos = gains[list(views)], [scene.images[view][::COARSE_STEP, ::COARSE_STEP] for view in views]
     brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
     if is_metered(brightness, view_gains):
@@ -109,10 +110,10 @@ def root_mean_square(gains: np.ndarray) -> float:
 
 
 def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
-    """Return True if a camera that meters light seems to have chosen the gains, so that they offset bright surfaces.
+    """Return True if the gains look like those of a camera that meters light, and so makes all photos equally bright.
 
     ``brightness [v,3]`` of the photos and ``gains [v,3]`` are logarithms. If gains are random, photos with larger gains
-    are brighter. Metering makes all photos equally bright.
+    are brighter.
     """
     gains, brightness = gains - gains.mean(0), brightness - brightness.mean(0)
     slope = float((gains * brightness).sum() / max((gains * gains).sum(), 1e-12))
@@ -120,19 +121,20 @@ def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
 
 
 def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
-    """Measure the RMS distance of views' gains from the mean gains of their two nearest views; 1 for random gains.
+    """Measure the RMS distance of views' gains from the mean gains of their two nearest views.
 
-    ``gains [v,3]`` are logarithms; ``distances [v,v]`` are the distances between cameras.
+    The result is relative to the distance that is expected of random gains, so it is about 1 for random gains and less
+    if neighbours have similar gains. ``gains [v,3]`` are logarithms; ``distances [v,v]`` are those between cameras.
     """
     nearest = order_others(distances)[:, :2]
-    away = gains - gains[nearest].mean(1)
-    random = root_mean_square(gains) * np.sqrt(len(gains) / (len(gains) - 1) * (1 + 1 / nearest.shape[1]))
-    return float(np.sqrt((away * away).mean()) / max(random, 1e-9))
+    offsets = gains - gains[nearest].mean(1)
+    expected = root_mean_square(gains) * np.sqrt(len(gains) / (len(gains) - 1) * (1 + 1 / nearest.shape[1]))
+    return float(np.sqrt((offsets * offsets).mean()) / max(expected, 1e-9))
 
 
 @dataclass(frozen=True, eq=False)
 class _Pixels:
-    """Centres of the Gaussians in front of all pixels, and the pixels that count."""
+    """For each pixel, the centre of the Gaussian in front, and whether the pixel counts."""
 
     cameras: Cameras
     means: np.ndarray  # [v,h*w,3] canonical units
@@ -143,14 +145,15 @@ class _Pixels:
 
         Returns indices into ``rows``, and the pixels at which the other view shows the surface.
         """
-        poses = self.cameras.viewmats[other].astype(np.float64), self.cameras.Ks[other].astype(np.float64)
+        viewmat, K = self.cameras.viewmats[other].astype(np.float64), self.cameras.Ks[other].astype(np.float64)
         same_depth = 0.05  # difference of the logarithms of two depths of one surface
         return find_surfaces(
             self.means[view],
             rows,
             self.means[other],
             self.valid[other],
-            *poses,
+            viewmat,
+            K,
             self.cameras.width,
             NEAR_PLANE,
             same_depth,
@@ -168,17 +171,18 @@ def _pixels_of(scene: Scene) -> _Pixels:
 
 
 def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
-    """Measure the ratios of colours between views of ``views`` that show the same surfaces."""
+    """Measure the ratios of colours between those of ``views`` that show the same surfaces."""
     size, pixels = scene.pixels_per_view, _pixels_of(scene)
     photos = scene.images.reshape(len(scene), size, 3)
     sample = np.random.default_rng(0).permutation(size)[:EXPOSURE_PIXELS]
     partners = choose_partners(camera_distances(scene.cameras[list(views)]))
 
-    def measure_view(row: int) -> list[_Pair]:
-        view, pairs = views[row], list[_Pair]()
+    def measure_view(number: int) -> list[_Pair]:
+        """Measure the ratios between one of ``views`` and its partners."""
+        view, pairs = views[number], list[_Pair]()
         rows = sample[pixels.valid[view, sample]]
         min_pixels = 60  # least number of shared pixels from which a ratio is measured
-        for other in (views[column] for column in partners[row]):
+        for other in (views[partner] for partner in partners[number]):
             shared, other_rows = pixels.look_up(view, rows, other)
             here, there = photos[view].take(rows[shared], axis=0), photos[other].take(other_rows, axis=0)
             red, green, blue = (
@@ -208,7 +212,7 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
     """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; all are zero without pairs."""
     matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
-    max_weighted_pixels = 1000  # pixels up to which the weight of a pair of views grows
+    max_weighted_pixels = 1000  # more shared pixels give a pair of views no larger weight
     for pair in pairs:
         ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, max_weighted_pixels))
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])
@@ -227,7 +231,8 @@ def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
     order = order_others(camera_distances(scene.cameras))[:, :CLIPPED_NEIGHBOURS]
 
-    def confirm(view: int) -> np.ndarray:
+    def find_shown(view: int) -> np.ndarray:
+        """Return a mask ``[h*w]`` of the clipped pixels of a view whose surface another view shows unclipped."""
         rows, is_shown = np.flatnonzero(flat[view] & pixels.valid[view]), np.zeros_like(flat[view])
         for other in order[view]:
             shared, other_rows = pixels.look_up(view, rows, other)
@@ -235,7 +240,7 @@ def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
             rows = rows[~is_shown[rows]]
         return is_shown
 
-    return np.stack(parallel_map(confirm, range(len(scene)))).reshape(clipped.shape)
+    return np.stack(parallel_map(find_shown, range(len(scene)))).reshape(clipped.shape)
 
 
 def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
@@ -255,7 +260,6 @@ def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
     g, row_factors = scene.gaussians, factors[views][:, None]
     sh0 = rgb_to_sh0(sh0_to_rgb(g.sh0) * row_factors).astype(np.float32)
     gaussians = replace(g, sh0=sh0, shN=g.shN * row_factors)
-    large = scene.large_photos
-    large = None if large is None else change_large(large, changes)
+    large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
     new_masks = scene.masks if masks.all() else masks
     return replace(scene, images=images, gaussians=gaussians, masks=new_masks, large_photos=large)

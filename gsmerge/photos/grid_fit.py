@@ -1,8 +1,8 @@
 """Find which part of the photos the views show, and how photos were resized to the grid of a file's rows.
 
 Photos of another shape than their cameras may have bars, or show both eyes of a stereo camera or several pictures side
-by side. Where cameras were estimated, models resized photos without their aspect ratio or cropped them, and some cut a
-border off their output. Of all these possibilities, the one that best matches the pictures of the Gaussians is chosen.
+by side. If a file has no cameras, its model may have cropped the photos or changed their aspect ratio, and may have cut
+borders off its output. Of these possibilities, the one that best matches the pictures of the Gaussians is chosen.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gsmerge.photos.offsets import correlate_parts
 from gsmerge.photos.pictures import ViewPictures
 from gsmerge.photos.scores import stands_out
 
-_TILES = 4  # most pictures in a row or a column of a photo
+_TILES = 4  # largest number of pictures in a row or a column of a photo
 _HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
 
 
@@ -40,7 +40,7 @@ class PartFit:
     """The part of each photo that its view shows."""
 
     part: Part = WHOLE
-    # Size to whose aspect ratio the part is stretched, since stereo films squeeze both pictures; None: not stretched
+    # The part is stretched to the aspect ratio of this size, because stereo films squeeze pictures; None: not stretched
     shape: Size | None = None
 
     def cut(self, photo: np.ndarray) -> np.ndarray:
@@ -57,15 +57,15 @@ class PartFit:
         return round(scale * self.shape[0]), round(scale * self.shape[1])
 
     def describe(self, size: Size, *, bars: bool) -> str:
-        """Say in a note which part of photos of a ``size`` is used; ``bars`` means that only bars are cut off."""
-        before, part = "{} x {}".format(*size), part_size(size, self.part)
-        after, ratio = "{} x {}".format(*part), self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
+        """Return a note on which part of photos of a ``size`` is used; ``bars`` means that only bars are cut off."""
+        photo_text, part = "{} x {}".format(*size), part_size(size, self.part)
+        part_text, ratio = "{} x {}".format(*part), self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
         if bars:
-            return f"bars around the photos are cut off: {before} pixels become {after}"
+            return f"bars around the photos are cut off: {photo_text} pixels become {part_text}"
         corner = f" from column {round(size[0] * self.part[0])} and line {round(size[1] * self.part[1])} on"
         stretched = f", stretched to {max(ratio, 1 / ratio):.2f} times their {'width' if ratio > 1 else 'height'}"
-        what = "photos" if self.part == WHOLE else f"the {after} pixels{corner} of photos"
-        used = f"{what} of {before} are used{stretched if self.shape else ''}"
+        part_name = "photos" if self.part == WHOLE else f"the {part_text} pixels{corner} of photos"
+        used = f"{part_name} of {photo_text} are used{stretched if self.shape else ''}"
         return f"{used}, since they fit the Gaussians best"
 
 
@@ -92,10 +92,10 @@ def list_parts(size: Size, shape: Size | None, inner: Part) -> list[PartFit]:
 
 
 def round_to_cameras(inner: Part, size: Size, shape: Size) -> Part:
-    """Return the part ``inner`` of photos of a ``size``, rounded to the size ``shape`` of the cameras or a multiple.
+    """Round the part ``inner`` of photos of a ``size`` to the size ``shape`` of the cameras, or to a multiple of it.
 
-    ``inner`` is the part inside of bars. JPEG files mix the pixels of a block, so its measured size may be up to a
-    block too small or too large. It stays as it is if it would change by more, or if it would not fit into the photos.
+    ``inner`` is the part inside of bars. JPEG files mix the pixels of a block, so its measured size may be wrong by up
+    to a block. The part is returned unchanged if it would change by more, or would not fit into the photos.
     """
     width, height = part_size(size, inner)
     times = max(1, round(width / shape[0]))
@@ -107,17 +107,17 @@ def round_to_cameras(inner: Part, size: Size, shape: Size) -> Part:
     ):
         return inner
     left, top = (
-        min(max(0, round((whole * (low + high) - side) / 2)), whole - side) / whole
-        for whole, side, low, high in zip(size, sides, inner, inner[2:], strict=False)
+        min(max(0, round((photo_side * (low + high) - side) / 2)), photo_side - side) / photo_side
+        for photo_side, side, low, high in zip(size, sides, inner, inner[2:], strict=False)
     )
     return left, top, left + sides[0] / size[0], top + sides[1] / size[1]
 
 
 @dataclass(frozen=True)
 class GridFit:
-    """The resizing and cropping by which a model made the pixels of a grid of rows from photos."""
+    """How a model resized and cropped photos to the grid of pixels whose Gaussians are the rows of a file."""
 
-    size: Size  # of the grid
+    size: Size  # size of the grid
     crops: bool = False  # True: resized in proportion and cropped at the centre; False: resized without proportion
     trim: tuple[int, int] = (0, 0)  # columns and lines that the model cut off its output at each side
 
@@ -180,6 +180,7 @@ def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: S
     views = [view for view, photo in enumerate(photos) if photo is not None]
 
     def correlate(fit: FitT) -> np.ndarray:
+        """Return the correlations of all parts of all photos after a fit."""
         return np.concatenate([
             correlate_parts(shown, view, fit.cut(photos[view]))  # type: ignore[arg-type]
             for view in views

@@ -68,7 +68,7 @@ class MaskFiles:
         """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
         photo, counts, importance = self.photos[view] if self.photos else None, None, None
         alpha = None if photo is None else decode_alpha(photo)
-        min_level = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
+        min_level = 191  # level of 255; a pixel counts if three quarters of its pixels in the file count
         if alpha is not None:
             opaque = cut_part(turn_picture(alpha, self.turns[view]), self.part) * _WHITE
             counts = self._reduce(opaque, view) > min_level
@@ -103,7 +103,7 @@ class MaskFiles:
         return whole
 
     def _reduce(self, levels: np.ndarray, view: int) -> np.ndarray:
-        """Average the brightness of a mask over each pixel of the view."""
+        """Reduce a mask to the size of the view, by the mean of its ``levels`` in each pixel."""
         whole = cv2.resize(levels, self.stored, interpolation=cv2.INTER_NEAREST)
         shown = self.cut(view, whole[..., None].repeat(3, -1))[..., 0]
         size = self.cameras.width, self.cameras.height
@@ -120,8 +120,8 @@ def read_masks(
 ) -> tuple[Masks, list[str]]:
     """Read the masks of a scene's photos; return them and notes.
 
-    Masks that the cameras' file names are used rather than those beside the scene. ``stored`` and ``cut`` are those of
-    :class:`MaskFiles`. SceneError if masks are photos.
+    If the cameras' file names masks, these are used, and otherwise masks beside the scene. ``stored`` and ``cut`` are
+    fields of :class:`MaskFiles`. SceneError if masks are photos.
     """
     paths = photos.paths
     views = [view for view in range(len(camera_file)) if not paths or paths[view] is not None]  # with a photo
@@ -165,7 +165,7 @@ def _refuse_photos(
     """
     of_views = {view: mask for view, mask in enumerate(masks) if mask is not None}
     doubts = parallel_map(lambda view: _doubt_mask(of_views[view], photos, view), of_views)
-    if 2 * sum(doubts) > len(of_views):
+    if 2 * sum(doubts) > len(of_views):  # a single mask with an infinite doubt is enough
         doubtful = [of_views[view].name for view, doubt in zip(of_views, doubts, strict=True) if doubt]
         expected = f"expected black, white and grey pictures for --{option}, found {len(doubtful)} of {len(of_views)}"
         problem = f"{expected} that look like photos, {list_some(doubtful)}"
@@ -173,10 +173,10 @@ def _refuse_photos(
 
 
 def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
-    """Return whether a mask looks like a photo: infinity if it is one for certain, 1 if it may be one, 0 otherwise.
+    """Return infinity if a mask is a photo for certain, 1 if it may be a photo, and 0 otherwise.
 
-    A picture of several colours is a photo for certain. A grey picture may be one if it changes from pixel to pixel as
-    the photo of its view does. But if most of its pixels have one of two levels, it is a mask with soft edges.
+    A picture of several colours is a photo for certain. A grey picture may be a photo if it changes from pixel to
+    pixel as the photo of its view does. But if most of its pixels have one of two levels, it is a mask with soft edges.
     """
     picture = np.rint(decode_small(mask, OFFSET_PIXELS) * _WHITE)
     spread = np.ptp(picture, axis=-1)
@@ -229,7 +229,7 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
 
 
 def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], list[str]]:
-    """Find the mask of each view that a camera file names; return the masks and a note on files that are not there.
+    """Find the masks that a camera file names; return the mask of each view, and a note on masks that do not exist.
 
     SceneError for a file outside the folder of the cameras.
     """
@@ -251,7 +251,7 @@ def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple
     counts = masks.counts
     if counts is None:
         return masks, []
-    share = float(1 - counts.mean())  # of the pixels that masks leave out
+    share = float(1 - counts.mean())  # share of the pixels that masks leave out
     max_share = 0.98  # masks that leave out more are not used
     if share < max_share:
         count = int((~counts.all((1, 2))).sum())

@@ -2,7 +2,7 @@
 
 Pictures of neighbouring views are similar as a whole, but their parts are displaced. Each part of the view's picture is
 searched for around the same place in the photo. The offset of a part counts if its best place stands out from all other
-places. It is zero in the photo of the view itself, but not in the photo of a neighbour.
+places. Offsets are zero in the photo of the view itself, but not in the photo of a neighbour.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class PhotoOffsets:
     def verdict(self) -> bool | None:
         """True if the photo was taken from the view, False if it was taken from elsewhere, None in doubt.
 
-        The photo was taken from the view if more parts are in place than moved together, and from elsewhere if fewer
-        are. The difference of the two numbers must exceed the standard error of tosses of a fair coin.
+        The number of parts in place is compared with the number of parts that moved together. The larger one decides if
+        the two differ by more than the standard error of as many tosses of a fair coin.
         """
         in_place, together = self.num_in_place, self.num_moved_together
         return in_place > together if abs(in_place - together) > np.sqrt(in_place + together) else None

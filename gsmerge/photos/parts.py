@@ -39,15 +39,15 @@ def has_bars(scene: Scene) -> bool:
 def choose_part(
     scene: Scene, proposal: Proposal, camera_file: CameraFile, grid_fit: GridFit | None = None
 ) -> Proposal | None:
-    """Find the part of the proposed photos that shows the views, and return a proposal that uses it.
+    """Find the part of the proposed photos that shows the views, and return a proposal that uses this part.
 
-    None if no part fits better than whole photos, or if the best part does not explain the views either
-    (:meth:`Assigner.explain_most`). None also if photos differ in shape or have orientation tags. ``grid_fit`` is the
-    fit of whole photos to a grid whose cameras were estimated.
+    None if no part fits better than whole photos, or if even the best part does not look like the views
+    (:meth:`Assigner.explain_most`). None also if photos differ in shape or have orientation tags. ``grid_fit`` is how
+    whole photos were resized, if the cameras were estimated.
     """
     proposal = proposal.without_broken() or proposal
     named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
-    max_compared = 8  # most photos whose parts are compared with their views
+    max_compared = 8  # largest number of photos whose parts are compared with their views
     views, photos = zip(*(named[i] for i in pick_views(len(named), max_compared)), strict=True) if named else ((), ())
     sizes = [image_size(proposal.pool[photo]) for photo in photos]
     shapes_differ = not all(same_shape(size, sizes[0]) for size in sizes)
@@ -66,16 +66,17 @@ def choose_part(
 
     pictures, bars = zip(*parallel_map(read, range(len(photos))), strict=True)
     left, above, right, below = np.median(bars, 0).tolist()
-    inner = left, above, 1 - right, 1 - below
-    shape = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
-    fits: list[GridFit | PartFit] = [] if grid_fit is None else [grid_fit]
+    inner = left, above, 1 - right, 1 - below  # the part inside of bars
+    view_size = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
     if grid_fit is None:
-        inner = round_to_cameras(inner, sizes[0], shape)
-    fits += list_parts(sizes[0], shape if grid_fit is None else None, inner)
+        inner = round_to_cameras(inner, sizes[0], view_size)
+        fits: list[GridFit | PartFit] = [*list_parts(sizes[0], view_size, inner)]
+    else:  # cameras were estimated, so parts may have any shape
+        fits = [grid_fit, *list_parts(sizes[0], None, inner)]
     fit = choose_fit(show_views(scene, OFFSET_PIXELS)[views], pictures, fits)
     if isinstance(fit, GridFit) or fit == WHOLE_FIT:
         return None
-    candidates = Candidates(lambda photo: fit.cut(pictures[photo]), len(photos), lambda _: 0)
+    candidates = Candidates(read=lambda photo: fit.cut(pictures[photo]), count=len(photos), tag=lambda _: 0)
     assigner = Assigner(lambda side: show_views(scene, side)[views], candidates)
     is_right = assigner.explain_most([Assignment(photo, 0) for photo in range(len(photos))])
     note = fit.describe(sizes[0], bars=fit.part == inner != WHOLE)

@@ -52,6 +52,7 @@ def change_large(large: LargePhotos, changes: Sequence[PhotoChange]) -> LargePho
     """Return the large photos so that each is changed when it is read."""
 
     def read(view: int) -> np.ndarray:
+        """Read the large photo of a view, and change it."""
         photo = large.read(large.ids[view])
         if not changes[view]:
             return photo

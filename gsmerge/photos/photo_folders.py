@@ -36,9 +36,9 @@ def find_named_photos(
 ) -> tuple[Path, list[Path], list[Path | None]] | None:
     """Find the folder at or below ``roots`` in which most cameras, and more than ``num_known``, have a photo by name.
 
-    If several folders have as many, a folder is preferred whose files have the whole names, with endings; then one
-    below the first root, which is near the cameras; then one whose photos have colours, unlike masks and depths; then
-    one whose photos have the size of the cameras, or their shape, or more pixels.
+    Of folders with equally many photos, the best one is chosen by these criteria in turn: files with the whole names of
+    the cameras, with endings; a place below the first root, which is near the cameras; photos with colours, unlike
+    masks and depths; photos of the cameras' size, or of their shape; photos with more pixels.
 
     Returns the folder, the photos of this and of the next best folders, and the photo of each camera, None without one.
     Returns None if there is no such folder.
@@ -59,11 +59,12 @@ def find_named_photos(
         first = next(filter(count_pixels, filter(None, proposed)), None)
         if first is None:
             return 0, folder
-        own, size = sizes[proposed.index(first)], image_size(first)
+        camera_size, size = sizes[proposed.index(first)], image_size(first)
+        has_other_shape = min(camera_size) > 1 and not same_shape(camera_size, size)
         count, num_exact = len({*proposed} - {None}), sum(path.name in file_names for path in filter(None, proposed))
-        look = is_grey(first), size != own, min(own) > 1 and not same_shape(own, size), -count_pixels(first)
-        nested = len(pools[folder]), -len(folder.parts), folder  # the folder itself rather than one above it
-        return -count, -num_exact, not folder.is_relative_to(roots[0]), *look, *nested
+        look = is_grey(first), size != camera_size, has_other_shape, -count_pixels(first)
+        depth = len(pools[folder]), -len(folder.parts), folder  # the innermost of several folders with the same photos
+        return -count, -num_exact, not folder.is_relative_to(roots[0]), *look, *depth
 
     max_folders = 4  # folders whose photos are compared with the views
     best = [folder for count, *_, folder in sorted(map(rank, pools)) if -count > num_known][:max_folders]

@@ -82,7 +82,7 @@ def fit_size(size: Sequence[int], side: int) -> tuple[int, int]:
 
 
 def average(pictures: np.ndarray, weights: np.ndarray, small: np.ndarray) -> np.ndarray:
-    """Average pictures ``[v,h,w,3]`` by ``weights [v,h,w]`` to the size of ``small [v,H,W]``, the shrunk weights."""
+    """Shrink pictures ``[v,h,w,3]`` by averages with ``weights [v,h,w]``; ``small [v,H,W]`` are the shrunk weights."""
     sums = shrink_pictures((pictures * weights[..., None]).astype(np.float32), small.shape[2], small.shape[1])
     return np.asarray(
         np.divide(sums, small[..., None], out=np.zeros_like(sums), where=small[..., None] > LEAST_OPACITY)

@@ -1,9 +1,9 @@
 """Scene without photos -> the scene with the colours of its rows as photos; each view needs Gaussians of its own.
 
 Feed-forward models take the colour of a pixel's Gaussian from the photo. These colours are compared with a drawing of
-the view's own Gaussians from its own camera, after both are blurred. A solid drawing replaces the colours where the two
-disagree, and where the Gaussians of a pixel are so faint that their colours mean little. Pixels with neither a colour
-nor a solid drawing do not count.
+the view's own Gaussians from its own camera, after both are blurred. A solid drawing replaces the colours if they
+differ from it, and if the Gaussians of a pixel are so faint that their colours mean little. Pixels with neither a
+colour nor a solid drawing do not count.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
-# Names of pictures in messages: the photos that a fit uses, and the pictures with which results are compared. Without
-# photos these are the colours of the rows, or, if rows belong to no pixels, renders
+# Names in messages of the pictures to which results are fitted and with which they are compared. If photos are missing,
+# these are the colours of the rows, or renders if the rows belong to no pixels
 OWN_PHOTOS = "the scene's own photos"
 PHOTOS = "photos"
 ROW_COLORS = "the model's own pixels"
@@ -42,18 +42,18 @@ T = TypeVar("T")
 def add_row_colors(scene: Scene, *, has_photos: bool = False) -> PicturedScene:
     """Use the colours of each view's own Gaussians as the photos of a canonical scene, with a note.
 
-    ``has_photos``: the scene has photos, which do not count. Then an earlier note has said so, and this function makes
-    a note only if drawings are used.
+    ``has_photos`` means that the scene has photos, but an earlier note has said that they do not count. Then this
+    function makes a note only if drawings are used.
     """
     shape = len(scene), scene.cameras.height, scene.cameras.width
     images, masks = np.zeros((*shape, 3), np.float32), np.full(shape, False)
 
-    def keep(views: np.ndarray, rows: RowPicture) -> int:
-        """Store the pictures of a camera's views, and return how many of their pixels are drawn."""
-        images[views], masks[views] = rows.picture, rows.known
-        return len(views) * int(rows.by_drawing.sum())
+    def store(views: np.ndarray, picture: RowPicture) -> int:
+        """Store the picture of a camera for its views; return in how many of their pixels it is a drawing."""
+        images[views], masks[views] = picture.picture, picture.known
+        return len(views) * int(picture.by_drawing.sum())
 
-    num_drawn = sum(picture_rows(scene, keep))
+    num_drawn = sum(picture_rows(scene, store))
     share = num_drawn / masks.size
     detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE_SHARE else ""
     if detail or not has_photos:
@@ -72,9 +72,10 @@ class RowPicture:
 
 
 def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T], mask: np.ndarray | None = None) -> list[T]:
-    """Call ``use(views, picture)`` for every camera with its views, which are its layers, and return the results.
+    """Draw the picture of every camera, and return the results of ``use(views, picture)``.
 
-    With ``mask [v]``, only cameras with a view in the mask are drawn.
+    ``views`` are the views of the camera. There are several if its pixels have several layers of Gaussians. With ``mask
+    [v]``, only cameras with a view in the mask are drawn.
     """
     kinds = camera_kinds(scene.cameras)
     groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]
@@ -83,7 +84,7 @@ def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T], mask:
 
 
 def _picture_camera(scene: Scene, views: np.ndarray) -> RowPicture:
-    """Draw the Gaussians of all ``views`` of one camera, and choose for each pixel their colours or the drawing."""
+    """Draw the Gaussians of all ``views`` of one camera, and choose their colours or the drawing for each pixel."""
     layers = subset(scene, views.tolist())
     if len(layers.gaussians) == 0:
         no_pixel = np.zeros((scene.cameras.height, scene.cameras.width), bool)
@@ -95,17 +96,18 @@ def _picture_camera(scene: Scene, views: np.ndarray) -> RowPicture:
     colors = sh0_to_rgb(layers.gaussians.sh0[:, 0])
     colors[tiled.ids] = tiled_colors
     row_picture, opacity = _blend_layers(layers, colors.clip(0, 1))
-    alpha = 1 - transmittance
-    drawn = (drawing / np.maximum(alpha, np.float32(1e-3))[..., None]).clip(0, 1)
-    weights = np.minimum(opacity, alpha)  # pixels that are faint in one of the two pictures count less
-    red, green, blue = np.moveaxis(np.abs(blur((row_picture - drawn) * weights[..., None], ROW_BLUR_PIXELS)), -1, 0)
-    disagreement = 0.2  # mean difference of the blurred colours over the channels (sRGB) from which on they disagree
+    drawn_opacity = 1 - transmittance
+    drawn_colors = (drawing / np.maximum(drawn_opacity, np.float32(1e-3))[..., None]).clip(0, 1)
+    weights = np.minimum(opacity, drawn_opacity)  # pixels that are faint in one of the two pictures count less
+    differences = (row_picture - drawn_colors) * weights[..., None]
+    red, green, blue = np.moveaxis(np.abs(blur(differences, ROW_BLUR_PIXELS)), -1, 0)
+    disagreement = 0.2  # largest mean difference over the channels (sRGB) at which blurred colours agree
     agree = (red + green + blue) / (3 * np.maximum(blur(weights, ROW_BLUR_PIXELS), np.float32(1e-6))) < disagreement
-    solid = transmittance < COVERED_TRANSMITTANCE
-    by_row = (opacity > 0) & ~(solid & ((opacity < FAINT_OPACITY) | ~agree))
-    known = by_row | solid
-    picture = fill_gaps(np.where(by_row[..., None], row_picture, drawn), known)
-    return RowPicture(picture, known, known & ~by_row, drawing.clip(0, 1))
+    is_solid = transmittance < COVERED_TRANSMITTANCE
+    by_row = (opacity > 0) & ~(is_solid & ((opacity < FAINT_OPACITY) | ~agree))  # pixels with the Gaussians' colours
+    known = by_row | is_solid
+    picture = fill_gaps(np.where(by_row[..., None], row_picture, drawn_colors), known)
+    return RowPicture(picture, known, by_drawing=known & ~by_row, drawing=drawing.clip(0, 1))
 
 
 def _blend_layers(layers: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

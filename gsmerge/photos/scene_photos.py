@@ -74,7 +74,7 @@ class ScenePhotos:
 
     @property
     def file_size(self) -> Size | None:
-        """Most frequent size of the used part of upright photos, the largest of several. None without files."""
+        """Most frequent size of the used part of upright photos, or the largest of several; None for no photos."""
         sizes = [
             part_size(_upright_size(path, turn), self.part)
             for path, turn in zip(self.paths, self.turns, strict=True)
@@ -91,7 +91,7 @@ class Proposal:
     pool: tuple[Path, ...]  # all files
     named: tuple[int | None, ...]  # for each camera, the index of its file in the pool; None without a proposed file
     exact: bool  # True: names propose the files; False: their order does
-    faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None without a reason
+    faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None if it can
     by_names: bool = False  # True: the folder was found by the names of its files
     fit: PartFit = WHOLE_FIT  # the part of each photo that is used
     notes: tuple[str, ...] = ()  # on this part
@@ -192,8 +192,8 @@ def _find_photos_near(files: SceneFiles, camera_file: CameraFile) -> tuple[Path,
     folder = capture_folder(path)
     named = [find_image(folder, name, path, option=files.photo_option) for name in names]
     pool = list(dict.fromkeys(path for path in named if path is not None))
-    is_nameless = all(name.removeprefix("view ").isdecimal() for name in names)
-    if not pool and is_nameless:
+    are_numbers = all(name.removeprefix("view ").isdecimal() for name in names)  # the cameras have no names of photos
+    if not pool and are_numbers:
         folder = files.ply.parent  # AnySplat writes its Gaussians among the photos
         beside = (path for path in folder.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
         pool = natural_order(path for path in beside if path.is_file())
@@ -207,10 +207,10 @@ def _describe_missing_file(folder: Path, name: str) -> str:
         with suppress(OSError, ValueError):
             same_stem |= {file for file in os.listdir(place) if PurePath(file).stem == inner.stem}
     unread = {file for file in same_stem if PurePath(file).suffix.lower() not in IMAGE_SUFFIXES}
-    shown = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner
+    short = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner  # without the folder's name
     if not unread:
-        return f"{shown}: no such file"
-    return f"{shown}: no such file, and the format of {min(unread)} is not read; {CONVERT}"
+        return f"{short}: no such file"
+    return f"{short}: no such file, and the format of {min(unread)} is not read; {CONVERT}"
 
 
 def _find_fault(path: Path, *, decode: bool = False) -> str | None:
@@ -262,7 +262,7 @@ def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_
     """
     paths = tuple(None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen)
     turns = tuple(0 if assignment is None else assignment.orientation for assignment in chosen)
-    photos = ScenePhotos((), paths, turns, proposal.fit.part)
+    photos = ScenePhotos(paths=paths, turns=turns, part=proposal.fit.part)
     size = photos.file_size
     if size is None:
         return ScenePhotos()
@@ -336,7 +336,7 @@ def assign_to_views(
     Args:
         scene: The scene.
         proposal: The files.
-        read: True: the photos of the scene are the proposed ones, and are compared. False: files are read small.
+        read: True if the proposed files were read, and are the photos of the scene. Otherwise small versions are read.
         guessed: Views that get no photo.
         fit: How files are resized and cropped to the pixels of a grid.
 
@@ -357,7 +357,7 @@ def assign_to_views(
 
 
 def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
-    """List the views whose cameras are guesses: the views without Gaussians, if cameras were estimated from these."""
+    """List the views whose cameras are only guesses, because cameras were estimated and a view has no Gaussians."""
     if camera_file.source != ESTIMATED or scene.pixels is None:
         return []
     return np.flatnonzero(~scene.pixels.shown.any((1, 2))).tolist()
@@ -366,10 +366,9 @@ def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
 def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
     """Find how the photos that show a scene's views were resized and cropped to the grid of its rows."""
     fits = list_fits((scene.cameras.width, scene.cameras.height))
-    views = range(len(scene))
     shown, chosen = show_views(scene, OFFSET_PIXELS), list[np.ndarray | None]()
     assigner = Assigner(partial(show_views, scene), _list_candidates(proposal, None))
-    for view, likely in assigner.list_likely(views, range(len(proposal.pool))).items():
+    for view, likely in assigner.list_likely(range(len(scene)), range(len(proposal.pool))).items():
         photos = [turn_picture(assigner.candidates.read(photo), turn) for photo, turn in likely]
         scores = [float(correlate_parts(shown, view, fits[0].cut(photo)).mean()) for photo in photos]
         chosen.append(photos[int(np.argmax(scores))] if photos else None)
@@ -394,6 +393,7 @@ def has_nearer_colors(scene: Scene, other: Scene) -> bool:
     assert images is not None
 
     def measure_errors(shown: ViewPictures) -> np.ndarray:
+        """Return the errors ``[n]`` of blocks between pictures and the scene's photos."""
         return cut_blocks(Pairs(shrink_pictures(images, *shown.weights.shape[2:0:-1]), shown)).errors()
 
     return stands_out(
@@ -416,13 +416,13 @@ def name_by_photos(
         for name, file in zip(camera_file.names, files, strict=True)
     ]
     turns = [0 if assignment is None else assignment.orientation for assignment in chosen]
-    size = ScenePhotos((), tuple(files), tuple(turns), proposal.fit.part).file_size
+    photo_size = ScenePhotos(paths=tuple(files), turns=tuple(turns), part=proposal.fit.part).file_size
     named = replace(camera_file, names=tuple(names))
-    return named if fit is None or size is None else fit.cameras(named, size)
+    return named if fit is None or photo_size is None else fit.cameras(named, photo_size)
 
 
 def _short_path(path: Path, proposal: Proposal) -> str:
-    """Return the path of a file from the folder of photos on; of a file outside, its name and that of its folder."""
+    """Return the path of a file relative to the folder of photos, or the names of its folder and file if outside it."""
     folder = proposal.folder
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else f"{path.parent.name}/{path.name}"
 
@@ -432,7 +432,7 @@ def describe_assignment(
 ) -> list[str]:
     """Describe where the assigned photos differ from names and tags, and why views have no photo.
 
-    ``are_pixels``: the rows are pixels of the views, see :func:`_describe_spare`.
+    ``are_pixels`` is explained at :func:`_describe_spare`.
     """
     folders = dict.fromkeys(str(proposal.pool[assignment.photo].parent) for assignment in chosen if assignment)
     place = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
@@ -446,9 +446,8 @@ def describe_assignment(
         text = f"{len(turned)} of {count} photos are turned or mirrored relative to their orientation tags"
         notes.append(f"{text}: {list_some(turned)}")
     moved = [
-        f"photo {_short_path(proposal.pool[assignment.photo], proposal)} for view {camera_file.names[view]}".replace(
-            "view view ", "view "
-        )
+        f"photo {_short_path(proposal.pool[assignment.photo], proposal)}"
+        f" for view {camera_file.names[view].removeprefix('view ')}"
         for view, assignment in enumerate(chosen)
         if assignment is not None and assignment.photo != proposal.named[view]
     ]
@@ -474,8 +473,8 @@ def _explain_absence(proposal: Proposal, view: int, name: str) -> str:
 def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, are_pixels: bool) -> list[str]:
     """Note the photos without a camera in the folders of the used photos, since they may show other parts of the scene.
 
-    If rows are pixels (``are_pixels``), their own cameras see all of the scene. Then photos without a camera are noted
-    only if names propose photos, and if they are fewer than the used ones.
+    If each Gaussian belongs to a pixel of a view (``are_pixels``), the cameras of the views see the whole scene. Then
+    photos without a camera are noted only if names propose photos, and if fewer photos are without a camera than used.
     """
     used = [proposal.pool[assignment.photo] for assignment in chosen if assignment is not None]
     named = [proposal.pool[photo] for photo in proposal.named if photo is not None]
@@ -489,13 +488,13 @@ def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, 
 
 
 def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | None, *, is_right: bool) -> str | None:
-    """Describe which views of a grid have no camera in the file ``stored``; None if that may be of another scene.
+    """Describe which views have no camera in the file ``stored``; None if this file may belong to another scene.
 
     Args:
-        names: Names of the views; those of their photos, where photos show them.
+        names: Names of the views. A view has the name of its photo, if a photo shows it.
         stored: The cameras of the file, or why it cannot be read, or None.
-        is_right: True: the cameras of the file see the Gaussians. False: they do not, so the file counts only if every
-            camera has the name of a view.
+        is_right: True if the cameras of the file see the Gaussians. Otherwise the file counts only if every camera has
+            the name of a view.
     """
     if not isinstance(stored, CameraFile):
         return None
@@ -504,8 +503,8 @@ def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | Non
     are_named = len(lacking) == count > 0
     if not (are_named or is_right):
         return None
-    which = f" ({list_some(lacking)})" if are_named else ""
-    text = f"{count} of {len(names)} views {'has' if count == 1 else 'have'} no camera in {stored.path}{which}"
+    examples = f" ({list_some(lacking)})" if are_named else ""
+    text = f"{count} of {len(names)} views {'has' if count == 1 else 'have'} no camera in {stored.path}{examples}"
     return f"{text}: the poses and focal length of all views are estimated from the Gaussians' own grid"
 
 

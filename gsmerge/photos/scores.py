@@ -1,9 +1,9 @@
 """Score how similar photos and pictures of views are, in units of the noise of wrong pairs.
 
-A photo and a view are a wrong pair if the photo does not show the view. A photo and a picture are compared by the
-correlation of their local contrast at two sizes. Exposure, white balance and soft colours hardly change it. Fisher's z
-of a correlation has the same spread for all values. Nearly all pairs of a scene are wrong, so the median absolute
-deviation of all z is the noise of wrong pairs.
+A photo and a view are a wrong pair if the photo does not show the view. The similarity of a photo and a picture is the
+correlation of their local contrast at two sizes. Exposure, white balance and soft colours hardly change it.
+Correlations are converted to Fisher's z, whose noise does not depend on its value. Nearly all pairs of a scene are
+wrong, so the median absolute deviation of all z is the noise of wrong pairs.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def fisher_z(correlations: np.ndarray) -> np.ndarray:
 
 
 def find_contrast(picture: np.ndarray, weight: np.ndarray | None = None, side: int | None = None) -> np.ndarray:
-    """Subtract the local mean from the colours of a picture ``[h,w,3]``.
+    """Return the differences between the colours of a picture ``[h,w,3]`` and their local mean.
 
     The local mean is a Gaussian blur with a standard deviation of a sixth of ``side``, by default of the longer side of
     the picture. ``weight [h,w]`` are weights of the pixels, by default 1.
@@ -54,7 +54,7 @@ class _Filters:
     orientations: tuple[int, ...]  # the t orientations
     products: np.ndarray  # [v·t,h·w·3] weight times contrast, normalised to length 1
     weights: np.ndarray  # [v·t,h·w]
-    lengths: np.ndarray  # [v] of the products before they were normalised
+    lengths: np.ndarray  # [v] lengths of the products before these were normalised
 
 
 class Comparer:
@@ -65,7 +65,7 @@ class Comparer:
         self._small = small = [shown.shrink(side) for side in SCORE_PIXELS]
         width, height = small[0].weights.shape[2:0:-1]
         self._portrait, self._square = height > width, height == width
-        self.least_noise = 1 / np.sqrt(width * height)  # of Fisher's z, if all pixels are independent
+        self.least_noise = 1 / np.sqrt(width * height)  # noise of Fisher's z if all pixels are independent
         self._empty = small[0].weights.max((1, 2)) < LEAST_OPACITY  # views without Gaussians
 
     @cached_property
@@ -108,7 +108,10 @@ class Comparer:
 
 
 def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
-    """Make filters for photos that are stored turned by one of these numbers of quarter turns, mirrored or not."""
+    """Make filters for photos that are stored turned by any of the numbers ``quarters`` of quarter turns.
+
+    There is one filter for each view and number, and one more for the mirrored photo.
+    """
     orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
     products, weights, lengths = [], [], []
     for picture, weight in zip(small.pictures, small.weights, strict=True):
@@ -124,7 +127,7 @@ def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
 
 
 def _correlate(photos: Sequence[np.ndarray], filters: _Filters) -> np.ndarray:
-    """Return the correlations ``[p,v·t]`` of the contrast of photos with all filters."""
+    """Return the correlations ``[p,v·t]`` of the contrast of p photos with the filters of v views in t orientations."""
     contrast = np.stack([find_contrast(shrink_pictures(photo[None], *filters.size)[0]) for photo in photos])
     products = matmul(filters.products, contrast.reshape(len(photos), -1).T)
     squares = matmul(filters.weights, (contrast * contrast).sum(-1).reshape(len(photos), -1).T)

@@ -1,6 +1,6 @@
-"""Choose the views of an input, held-out views (as the paper does: supplement A, "View sampling") and scored views.
+"""Choose which views of a scene are used, held out and scored, and select the cameras and Gaussians of chosen views.
 
-Also select the cameras and the Gaussians of chosen views.
+Views are held out as in the paper (supplement A, "View sampling").
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 
 from gsmerge.types import PER_PIXEL, Cameras, Pixels, Scene, SceneT
 
-MAX_SCORED_VIEWS = 24  # most views of a scene that are scored if a decision depends on the score
-REPORT_VIEWS = 8  # most views that are scored if only the report needs the score
+MAX_SCORED_VIEWS = 24  # largest number of scored views if a decision depends on the score
+REPORT_VIEWS = 8  # largest number of scored views if only the report needs the score
 BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of a scene that have an entry for each view
 
 
@@ -30,7 +30,7 @@ def even_views(num_views: int, count: int) -> list[int]:
 def scored_views(num_views: int) -> list[int]:
     """Return the ids of the views on which a whole scene is scored: all, or ``MAX_SCORED_VIEWS`` evenly spaced ones.
 
-    The unmerged input is rendered in each of them. With all views of a large scene this would take most of a run.
+    The limit saves time, because the unmerged input is rendered in each of these views.
     """
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
@@ -44,7 +44,7 @@ def pick_views(num_views: int, max_count: int) -> list[int]:
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
     """Return the index of the candidate nearest to the middle of each two consecutive ``contexts``.
 
-    Both are positions along the capture. Two contexts without a candidate between them are left out.
+    Contexts and candidates are positions along the capture. Two contexts without a candidate between them are left out.
     """
     midpoints = []
     for low, high in pairwise(sorted(contexts)):
@@ -63,9 +63,9 @@ def camera_kinds(cameras: Cameras) -> np.ndarray:
 
 
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
-    """Return the ids of distinct views, which equal no earlier view, and for every view which of these it equals.
+    """Return the ids of the views that repeat no earlier view, and the index of every view in this list.
 
-    The second list has indices into the first. Two views are equal if camera, photo, masks and Gaussians are.
+    Two views are equal if their cameras, photos, masks and Gaussians are equal.
     """
     kinds = camera_kinds(scene.cameras)
     distinct, indices = list[int](), list[int]()

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Names in annotations, each with its words in messages and its test of a value. CLASSES are all other known names
+# Name in annotations -> its words in messages, and a function that tests a value. CLASSES are all other known names
 ARGUMENT_KINDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "None": ("", lambda value: value is None),
     "StrPath": ("a path", lambda value: isinstance(value, str | os.PathLike)),
@@ -30,7 +30,7 @@ CLASSES = (
     "Pixels", "LargePhotos", "Region", "Scene", "Gaussians", "Cameras", "Views", "CameraFile", "CompactOptions",
     "EvaluateOptions",
 )  # fmt: skip
-# How annotations of containers begin, and the types that such values may have
+# Beginning of the annotation of a container -> the types that its values may have
 CONTAINERS = {"Mapping[str, ": Mapping, "Sequence[": list | tuple, "tuple[": list | tuple}
 REMEDIES = {
     "Scene": "gsmerge.read_scene(path) reads one; tensors go to gsmerge.compact_tensors",
@@ -39,10 +39,10 @@ REMEDIES = {
 
 
 def check_arguments(function: Function) -> Function:
-    """Decorate a public function so that arguments of other types than it declares raise TypeError, with one line.
+    """Decorate a public function, so that arguments of other types than it declares raise a TypeError of one line.
 
-    Only parameters are checked whose annotations consist of names from :data:`ARGUMENT_KINDS` and :data:`CLASSES`, and
-    of lists and mappings of these.
+    A parameter is checked if its annotation consists of names from :data:`ARGUMENT_KINDS` and :data:`CLASSES`, or of
+    lists and mappings of these.
     """
     signature = inspect.signature(function)
     checked = {name: str(p.annotation) for name, p in signature.parameters.items() if _is_known(str(p.annotation))}
@@ -50,7 +50,7 @@ def check_arguments(function: Function) -> Function:
     @wraps(function)
     def call(*args: Any, **named: Any) -> Any:
         arguments = signature.bind(*args, **named).arguments
-        for name in filter(checked.get, arguments):
+        for name in [name for name in arguments if name in checked]:
             is_variadic = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
             for value in arguments[name] if is_variadic else [arguments[name]]:
                 _check_value(name, checked[name], value)
@@ -68,7 +68,7 @@ def check_fields(value: Any) -> None:
 
 @cache
 def _split_annotation(annotation: str) -> list[tuple[str, str]]:
-    """Split an annotation at each |; return the container of each part ("" if it has none) and the name in the part."""
+    """Split an annotation at each |; return the container of each part ("" for none) and the name inside it."""
     matches = [re.fullmatch(r"(Mapping\[str, |Sequence\[|tuple\[)?(.*?)(?:, \.\.\.)?\]?", part.strip())
                for part in re.split(r"\|(?![^\[]*\])", annotation)]  # fmt: skip
     return [(match[1] or "", match[2]) for match in matches if match]
@@ -84,7 +84,7 @@ def _is_known(annotation: str) -> bool:
 
 
 def _check_value(name: str, annotation: str, value: Any) -> None:
-    """Raise TypeError, with the expected types, if the value of an argument has none of the types of its annotation."""
+    """Raise TypeError, with the expected types, if the value of an argument has another type than its annotation."""
     if _has_type(annotation, value):
         return
     words = re.sub(

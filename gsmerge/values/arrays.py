@@ -54,7 +54,7 @@ def check_numbers(name: str, values: Any) -> None:
 def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> int:
     """Return the length of an array; TypeError for anything but an array or tensor, ValueError for another shape.
 
-    An axis whose expected length is a name may have any length. ``name`` is the array's name in messages.
+    ``shape`` is the expected shape, in which a name stands for any length. ``name`` is the array's name in messages.
     """
     if not hasattr(array, "ndim"):
         raise TypeError(f"{name}: expected an array or a tensor, got {type(array).__name__}")
@@ -149,7 +149,7 @@ def concat_columns(parts: Sequence[Array]) -> Array:
 
 
 def is_equal(one: Any, other: Any) -> bool:
-    """Return whether two values are equal; of arrays or tensors, shapes and numbers count, and NaN equals NaN."""
+    """Return whether two values are equal. Arrays and tensors are equal if shapes and numbers are; NaN equals NaN."""
     if one is other:
         return True
     if getattr(one, "ndim", 0) or getattr(other, "ndim", 0):
@@ -159,5 +159,5 @@ def is_equal(one: Any, other: Any) -> bool:
 
 
 def shorten(value: Any) -> str:
-    """Describe a value in one line: an array or a tensor by its shape alone."""
+    """Describe a value in one line; of an array or a tensor, only its type and shape."""
     return f"{type(value).__name__}{list(value.shape)}" if getattr(value, "ndim", 0) else repr(value)

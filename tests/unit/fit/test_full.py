@@ -235,7 +235,7 @@ def test_held_out_patches_teach_nothing_while_they_judge(truth: Gaussians, photo
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
     options = scenes.tuned(replace(QUICK, half_res_share=1.0), ssim_lambda=0.0)
     start = scenes.spoil(truth)
-    weights = prepare_fit(FitJob(photos, options)).weights
+    weights = prepare_fit(FitJob(photos, options)).score_weights
     painted = photos[1].images.copy()
     for image, weight in zip(painted, weights, strict=True):
         image[weight == 0] = 1 - image[weight == 0]

@@ -63,7 +63,7 @@ def test_a_fit_is_taken_though_held_out_patches_get_worse(truth: Gaussians, phot
     """As they do where few views see a place: the photos as a whole decide."""
     start, half = scenes.spoil(truth), photos[1]
     state, images = start_state(start), half.images.copy()
-    for view, weight in enumerate(prepare_fit(FitJob(photos, LONG)).weights):
+    for view, weight in enumerate(prepare_fit(FitJob(photos, LONG)).score_weights):
         drawn = composite(tile_view(state.splats, **half.camera(view)), state.colors)[0]
         images[view][weight == 0] = drawn.clip(0, 1)[weight == 0]  # patches show the start
     _, report = fit_gaussians(start, FitJob((photos[0], replace(half, images=images)), LONG))
