@@ -272,7 +272,7 @@ def _write_parts(add: AddOutput, path: Path, first: Path, contents: Contents) ->
 
 PARTS = Format(
     ".parts", "a format of three files", None, None, 0, write=_write_parts, levels="",
-    has_cameras=True, lost="no harmonics in {ending}",
+    has_cameras=True, harmonics_note="no harmonics in {ending}",
 )  # fmt: skip
 
 

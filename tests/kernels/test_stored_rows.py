@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsmerge.io.formats import arrays
-from gsmerge.io.formats.read import _convert, _convert_columns, _convert_plain
+from gsmerge.io.formats.read import _convert, _convert_with_kernel, _convert_with_numpy
 
 N = 200
 ODD = {
@@ -34,7 +34,7 @@ def empty_arrays(num_higher: int, means: str = "f4") -> dict[str, np.ndarray]:
 
 def assert_same(rows: np.ndarray, num_higher: int, means: str = "f4") -> None:
     fast, slow = empty_arrays(num_higher, means), empty_arrays(num_higher, means)
-    assert _convert(rows, fast) == _convert_columns(rows, slow)
+    assert _convert(rows, fast) == _convert_with_numpy(rows, slow)
     for name, values in slow.items():
         assert fast[name].tobytes() == values.tobytes(), name
 
@@ -42,7 +42,7 @@ def assert_same(rows: np.ndarray, num_higher: int, means: str = "f4") -> None:
 @pytest.mark.parametrize("num_higher", [0, 3, 15])
 def test_plain_rows_are_converted_at_once(num_higher: int) -> None:
     rows = make_rows(num_higher)
-    assert _convert_plain(rows, empty_arrays(num_higher)) == N
+    assert _convert_with_kernel(rows, empty_arrays(num_higher)) == N
     assert_same(rows, num_higher)
 
 
@@ -51,7 +51,7 @@ def test_plain_rows_are_converted_at_once(num_higher: int) -> None:
 def test_rows_from_an_odd_one_on_are_taken_by_columns(name: str, value: float, row: int) -> None:
     rows = make_rows(3)
     rows[name][row] = value
-    assert (_convert_plain(rows, empty_arrays(3)) == N) == (value == 9e12)
+    assert (_convert_with_kernel(rows, empty_arrays(3)) == N) == (value == 9e12)
     assert_same(rows, 3)
 
 
@@ -60,7 +60,7 @@ def test_rotations_of_zero_and_tiny_ones(size: float) -> None:
     rows = make_rows(0)
     for name in arrays.QUATS:
         rows[name][70] *= np.float32(size)
-    assert _convert_plain(rows, empty_arrays(0)) == (64 if size < 1e-14 else N)
+    assert _convert_with_kernel(rows, empty_arrays(0)) == (64 if size < 1e-14 else N)
     assert_same(rows, 0)
 
 
@@ -68,5 +68,5 @@ def test_rotations_of_zero_and_tiny_ones(size: float) -> None:
 def test_other_types_are_taken_by_columns(kinds: dict[str, str]) -> None:
     rows = make_rows(0)
     other = rows.astype([(name, kinds.get(name, "<f4")) for name in rows.dtype.names or ()])
-    assert _convert_plain(other, empty_arrays(0)) == 0
+    assert _convert_with_kernel(other, empty_arrays(0)) == 0
     assert_same(other, 0, "f8" if "x" in kinds else "f4")
