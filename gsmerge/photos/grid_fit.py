@@ -17,6 +17,7 @@ import numpy as np
 from gsmerge.cameras import TRIMS
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.photo_files import (
+    ASPECT_TOLERANCE,
     WHOLE,
     Part,
     PhotoTransform,
@@ -27,10 +28,12 @@ from gsmerge.io.photo_files import (
     resize_to,
     same_shape,
 )
+from gsmerge.kernels.pictures import count_bars
 from gsmerge.photos.offsets import correlate_parts
 from gsmerge.photos.pictures import ViewPictures
 from gsmerge.photos.scores import stands_out
 
+BAR_SPREAD = 8  # largest difference of the colours within a bar, of 255
 _TILES = 4  # largest number of pictures in a row or a column of a photo
 _HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
 
@@ -192,3 +195,13 @@ def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: S
         if stands_out(correlations - best_correlations):
             best, best_correlations = fit, correlations
     return best
+
+
+def has_bars(images: np.ndarray | None) -> bool:
+    """Return True if the first of the photos ``[v,h,w,3]`` has bars on opposite sides that change its shape."""
+    if images is None:
+        return False
+    above, below, left, right = count_bars(images[0], BAR_SPREAD / 255)
+    height, width = images.shape[1:3]
+    is_letterbox = min(above, below) > 0 and above + below > ASPECT_TOLERANCE * height
+    return is_letterbox or (min(left, right) > 0 and left + right > ASPECT_TOLERANCE * width)

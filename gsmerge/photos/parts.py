@@ -12,28 +12,16 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of
-from gsmerge.io.photo_files import ASPECT_TOLERANCE, WHOLE, decode_image, image_size, limit_size, resize_to, same_shape
+from gsmerge.io.photo_files import WHOLE, decode_image, image_size, limit_size, resize_to, same_shape
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.photos.assign import Assigner, Assignment, Candidates
-from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_parts, round_to_cameras
+from gsmerge.photos.grid_fit import BAR_SPREAD, WHOLE_FIT, GridFit, PartFit, choose_fit, list_parts, round_to_cameras
 from gsmerge.photos.offsets import OFFSET_PIXELS
 from gsmerge.photos.pictures import show_views
 from gsmerge.photos.scene_photos import Proposal
 from gsmerge.photos.views import pick_views
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
-
-_BAR_SPREAD = 8  # largest difference of the colours within a bar, of 255
-
-
-def has_bars(scene: Scene) -> bool:
-    """Return True if the first photo of a scene has bars on opposite sides, so wide that they change its shape."""
-    if scene.images is None:
-        return False
-    above, below, left, right = count_bars(scene.images[0], _BAR_SPREAD / 255)
-    height, width = scene.images.shape[1:3]
-    is_letterbox = min(above, below) > 0 and above + below > ASPECT_TOLERANCE * height
-    return is_letterbox or (min(left, right) > 0 and left + right > ASPECT_TOLERANCE * width)
 
 
 def choose_part(
@@ -59,7 +47,7 @@ def choose_part(
         size = sizes[number]
         with suppress(SceneError):
             whole = decode_image(proposal.pool[photos[number]], size)
-            above, below, left, right = count_bars(whole, _BAR_SPREAD)
+            above, below, left, right = count_bars(whole, BAR_SPREAD)
             small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
             return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
         return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)

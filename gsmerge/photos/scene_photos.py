@@ -42,7 +42,7 @@ from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
 from gsmerge.photos.colors import cut_blocks
-from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
+from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, has_bars, list_fits
 from gsmerge.photos.offsets import OFFSET_PIXELS, correlate_parts
 from gsmerge.photos.photo_folders import capture_folder, count_pixels, find_named_photos
 from gsmerge.photos.pictures import Pairs, ViewPictures, show_views
@@ -148,6 +148,22 @@ class Proposal:
         """Return a copy for ``cameras`` alone."""
         named = tuple(self.named[camera] for camera in cameras)
         return replace(self, named=named, faults=tuple(self.faults[camera] for camera in cameras))
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPhotos:
+    """The photo of each view of a scene, as the content of the photos shows it."""
+
+    proposal: Proposal  # the files; views with a guessed camera have a fault
+    chosen: list[Assignment | None]  # for each view, its file and orientation; None without a photo
+    explain_most: bool  # True: the proposed photos explain most views
+    may_be_parts: bool  # True: only a part of each photo may show its view
+    fit: GridFit | None  # how files are resized and cropped to the grid of rows; None if cameras are not estimated
+
+
+def is_without_names(camera_file: CameraFile) -> bool:
+    """Return whether cameras were estimated and no photo has named them yet; photos may then have any size."""
+    return camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED
 
 
 def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | None:
@@ -328,42 +344,35 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
     return Candidates(read, len(proposal.pool), proposal.tag)
 
 
-def assign_to_views(
-    scene: Scene, proposal: Proposal, *, read: bool, guessed: Sequence[int] = (), fit: GridFit | None = None
-) -> tuple[list[Assignment | None], bool]:
+def assign_to_views(scene: Scene, proposal: Proposal, camera_file: CameraFile, *, read: bool) -> ViewPhotos:
     """Assign files to the views of a scene; see :func:`gsmerge.photos.assign.assign_photos`.
+
+    A view gets no photo if its camera is only a guess, because cameras were estimated and the view has no Gaussians.
 
     Args:
         scene: The scene.
         proposal: The files.
+        camera_file: The cameras of the views.
         read: True if the proposed files were read, and are the photos of the scene. Otherwise small versions are read.
-        guessed: Views that get no photo.
-        fit: How files are resized and cropped to the pixels of a grid.
-
-    Returns:
-        The file of each view with its orientation, None without a photo; and True if the proposed photos explain most
-        views.
     """
-    stored, images = _list_candidates(proposal, fit), scene.images
-    candidates = stored
+    fit = _fit_to_grid(scene, proposal) if is_without_names(camera_file) and proposal.pool else None
+    guessed = list[int]()
+    if camera_file.source == ESTIMATED and scene.pixels is not None:
+        guessed = np.flatnonzero(~scene.pixels.shown.any((1, 2))).tolist()
+    proposal, images = proposal.without_views(guessed), scene.images
+    candidates = stored = _list_candidates(proposal, fit)
     if read and images is not None:
         view_of_photo = {photo: view for view, photo in enumerate(proposal.named) if photo is not None}
         candidates = replace(stored, read=lambda photo: images[view_of_photo[photo]])
     # a view whose mask leaves out all pixels is compared as a whole
     masks = None if scene.masks is None else scene.masks | ~scene.masks.any((1, 2), keepdims=True)
     show = partial(show_views, replace(scene, masks=masks))
-    chosen, explain_most = assign_photos(show, candidates, proposal.named, exact=proposal.exact, stored=stored)
-    return [None if view in guessed else assignment for view, assignment in enumerate(chosen)], explain_most
+    assigned, explain_most = assign_photos(show, candidates, proposal.named, exact=proposal.exact, stored=stored)
+    chosen = [None if view in guessed else assignment for view, assignment in enumerate(assigned)]
+    return ViewPhotos(proposal, chosen, explain_most, not explain_most or has_bars(images), fit)
 
 
-def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
-    """List the views whose cameras are only guesses, because cameras were estimated and a view has no Gaussians."""
-    if camera_file.source != ESTIMATED or scene.pixels is None:
-        return []
-    return np.flatnonzero(~scene.pixels.shown.any((1, 2))).tolist()
-
-
-def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
+def _fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
     """Find how the photos that show a scene's views were resized and cropped to the grid of its rows."""
     fits = list_fits((scene.cameras.width, scene.cameras.height))
     shown, chosen = show_views(scene, OFFSET_PIXELS), list[np.ndarray | None]()
@@ -401,15 +410,14 @@ def has_nearer_colors(scene: Scene, other: Scene) -> bool:
     )
 
 
-def name_by_photos(
-    camera_file: CameraFile, proposal: Proposal, chosen: Sequence[Assignment | None], fit: GridFit | None
-) -> CameraFile:
+def name_by_photos(camera_file: CameraFile, photos: ViewPhotos) -> CameraFile:
     """Name estimated cameras by the photos of their views, and adapt the cameras to the ``fit`` of the photos.
 
     Cameras that were read from a file stay as they are.
     """
     if camera_file.source != ESTIMATED:
         return camera_file
+    proposal, chosen = photos.proposal, photos.chosen
     files = [None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen]
     names = [
         name if file is None else _short_path(file, proposal)
@@ -418,7 +426,7 @@ def name_by_photos(
     turns = [0 if assignment is None else assignment.orientation for assignment in chosen]
     photo_size = ScenePhotos(paths=tuple(files), turns=tuple(turns), part=proposal.fit.part).file_size
     named = replace(camera_file, names=tuple(names))
-    return named if fit is None or photo_size is None else fit.cameras(named, photo_size)
+    return named if photos.fit is None or photo_size is None else photos.fit.cameras(named, photo_size)
 
 
 def _short_path(path: Path, proposal: Proposal) -> str:
@@ -427,13 +435,12 @@ def _short_path(path: Path, proposal: Proposal) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else f"{path.parent.name}/{path.name}"
 
 
-def describe_assignment(
-    proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile, *, are_pixels: bool
-) -> list[str]:
+def describe_assignment(photos: ViewPhotos, camera_file: CameraFile, *, are_pixels: bool) -> list[str]:
     """Describe where the assigned photos differ from names and tags, and why views have no photo.
 
     ``are_pixels`` is explained at :func:`_describe_spare`.
     """
+    proposal, chosen = photos.proposal, photos.chosen
     folders = dict.fromkeys(str(proposal.pool[assignment.photo].parent) for assignment in chosen if assignment)
     place = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
     count, notes = len(chosen), [place] if proposal.by_names else []

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsmerge.cameras import ESTIMATED, NO_CAMERAS_USED, AlignmentResult, align, check_pixels
+from gsmerge.cameras import NO_CAMERAS_USED, AlignmentResult, align, check_pixels
 from gsmerge.errors import Doubt, DoubtWarning, SceneError, name_notes
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
@@ -25,18 +25,16 @@ from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, r
 from gsmerge.photos.assign import Assignment
 from gsmerge.photos.grid_fit import WHOLE_FIT
 from gsmerge.photos.masks import NO_MASKS, CameraMaskError, Masks, check_masks
-from gsmerge.photos.parts import choose_part, has_bars
+from gsmerge.photos.parts import choose_part
 from gsmerge.photos.scene_photos import (
-    UNNAMED,
     Proposal,
     ScenePhotos,
     assign_to_views,
     describe_assignment,
     describe_missing,
     explain_mismatch,
-    fit_to_grid,
     has_other_shape,
-    list_guessed,
+    is_without_names,
     name_by_photos,
     photos_inside,
     propose_photos,
@@ -350,8 +348,8 @@ def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Pro
 
     Notes name photos that cannot be read, and views without a photo. Returns the error if no photo shows any view.
     """
-    cameras_are_estimated = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED
-    shapes_differ = not cameras_are_estimated and has_other_shape(proposal, camera_file)
+    has_no_names = is_without_names(camera_file)
+    shapes_differ = not has_no_names and has_other_shape(proposal, camera_file)
     make_without_photos = partial(make_scene, replace(camera_file, lenses=()), ScenePhotos())
     # 1. Parts of photos of another shape
     if shapes_differ:
@@ -360,20 +358,18 @@ def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Pro
             return _assign_photos(make_scene, camera_file, parts)
     # 2. The base: the scene with the proposed photos, or without photos
     proposed: Loaded | SceneError | None = None  # None if no photos are proposed
-    if not cameras_are_estimated and any(proposal.choice):
+    if not has_no_names and any(proposal.choice):
         proposed, proposal = _make_with_proposed_photos(make_scene, camera_file, proposal)
     base = proposed if isinstance(proposed, Loaded) else _read_or_error(make_without_photos)
     if isinstance(base, SceneError):
         return proposed or base
     # 3. The photo of each view, whole or in part
-    fit = fit_to_grid(base.scene, proposal) if cameras_are_estimated and proposal.pool else None
-    guessed = list_guessed(base.scene, camera_file)
-    proposal = proposal.without_views(guessed)
-    chosen, explain_most = assign_to_views(base.scene, proposal, read=base is proposed, guessed=guessed, fit=fit)
-    may_be_parts = proposal.fit == WHOLE_FIT and not shapes_differ and (not explain_most or has_bars(base.scene))
-    if may_be_parts and (parts := choose_part(base.scene, proposal, camera_file, fit)) is not None:
+    photos = assign_to_views(base.scene, proposal, camera_file, read=base is proposed)
+    proposal, chosen = photos.proposal, photos.chosen
+    may_be_parts = photos.may_be_parts and proposal.fit == WHOLE_FIT and not shapes_differ
+    if may_be_parts and (parts := choose_part(base.scene, proposal, camera_file, photos.fit)) is not None:
         return _assign_photos(make_scene, camera_file, parts)
-    if not any(chosen) or (shapes_differ and not explain_most):
+    if not any(chosen) or (shapes_differ and not photos.explain_most):
         # an error of photos of another shape says nothing, unless lenses may have changed the shape
         if isinstance(proposed, SceneError) and (not shapes_differ or any(camera_file.lenses)):
             return proposed
@@ -381,11 +377,11 @@ def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Pro
     # 4. The scene with the photos of its views, unless these were proposed
     load: Loaded | SceneError = base
     if base is not proposed or chosen != proposal.choice:
-        load = _make_with_photos(make_scene, name_by_photos(camera_file, proposal, chosen, fit), proposal, chosen)
+        load = _make_with_photos(make_scene, name_by_photos(camera_file, photos), proposal, chosen)
     if isinstance(load, SceneError):
         return load
-    described = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
-    return replace(load, notes=(*proposal.notes, *load.notes, *described), photos_explain=explain_most)
+    described = describe_assignment(photos, camera_file, are_pixels=base.scene.has_own_pixels)
+    return replace(load, notes=(*proposal.notes, *load.notes, *described), photos_explain=photos.explain_most)
 
 
 def _make_with_proposed_photos(
