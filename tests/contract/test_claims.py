@@ -151,11 +151,11 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"its opacity is below {fog.FOG_EMPTY:g} in the whole square of {fog.EROSION_PIXELS} x {fog.EROSION_PIXELS}"
         " pixels around",
         f"those whose mean depth in the result is below {fog.VEIL_SHARE:g} of the input's",
-        f"with an opacity above {fog.FOG_SOLID:g} in the input: those with one below {fog.FOG_OPEN:g} in the result",
+        f"with an opacity above {fog.FOG_SOLID:g} in the input, the share with one below {fog.FOG_OPEN:g} in the result",
         f"Such a Gaussian is at least {word(int(fog.RATIOS[0]))} times as long as its second axis",
-        f"it is longer than {percent(fog.LONG)} of the width",
+        f"it is longer than {percent(fog.LONG)} of the picture's width",
         f"There are up to {outside.PLACES} of them, or as many as photos if these are more",
-        f"steps back by {outside.STEP_BACK_LOW[0]:g} d to {outside.STEP_BACK_HIGH[0]:g} d",
+        f"They step back by {outside.STEP_BACK_LOW[0]:g} d to {outside.STEP_BACK_HIGH[0]:g} d",
         f"Far fog above {fit_report.HAZE:g} and worst veils above {fog.VEILED:g} are plain to see",
     ),
     HOW_MANY: (
