@@ -127,7 +127,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f" {percent(new_views.MOST_SHARE)} as many Gaussians as pixels",
         f"the depth of {confirm_depths.CONFIRM_PIXELS:,} pixels of each view is compared with its nearest views, up to"
         f" {confirm_depths.CONFIRM_NEIGHBORS} of them",
-        f"If they confirm less than {part(confirm_depths.POOR_SHARE)}, a note says that the result will be poor",
+        f"If they confirm less than {part(confirm_depths.POOR_SHARE)} of these depths, a note says that the result will"
+        " be poor",
         f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input",
         f"and less than {distance.WRONG_DB:g} dB of PSNR",
         f"They show the photos at most {plan.FIDELITY_LOSS:g} dB worse than it does",
@@ -151,7 +152,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"its opacity is below {fog.FOG_EMPTY:g} in the whole square of {fog.EROSION_PIXELS} x {fog.EROSION_PIXELS}"
         " pixels around",
         f"those whose mean depth in the result is below {fog.VEIL_SHARE:g} of the input's",
-        f"with an opacity above {fog.FOG_SOLID:g} in the input, the share with one below {fog.FOG_OPEN:g} in the result",
+        f"with an opacity above {fog.FOG_SOLID:g} in the input, the share with one below {fog.FOG_OPEN:g} in the"
+        " result",
         f"Such a Gaussian is at least {word(int(fog.RATIOS[0]))} times as long as its second axis",
         f"it is longer than {percent(fog.LONG)} of the picture's width",
         f"There are up to {outside.PLACES} of them, or as many as photos if these are more",
