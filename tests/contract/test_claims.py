@@ -19,8 +19,8 @@ from gsmerge import plan, types
 from gsmerge.cameras import rows_first, score
 from gsmerge.cameras import score as cameras_off
 from gsmerge.cameras.registration import register
-from gsmerge.compaction import blocks, curve, left_out, new_views, partition, scores, seams, search
-from gsmerge.facts import confirm_depths, holes, move_poses, scene_size
+from gsmerge.compaction import blocks, curve, distance, left_out, new_views, partition, scores, seams, search
+from gsmerge.facts import confirm_depths, draw_outside, holes, move_poses, scene_size
 from gsmerge.fit import outside, photo_sizes, schedule, stage
 from gsmerge.fit import report as fit_report
 from gsmerge.io import bounds, photo_files
@@ -123,15 +123,21 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",
         f"--effort fast`: {plan.EFFORTS['fast'].steps} steps",
         f"--effort best`: {plan.EFFORTS['best'].steps} steps",
-        f"An estimate needs {word(left_out.LEAST_VIEWS)} photos, a result of at most {percent(new_views.MOST_SHARE)} of"
-        " the Gaussians",
-        f"If they confirm less than {part(confirm_depths.POOR_SHARE)}, a note says that the result will be poor",
-        f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input".replace(" 0.", " ."),
+        f"An estimate needs at least {word(left_out.LEAST_VIEWS)} photos, a result with at most"
+        f" {percent(new_views.MOST_SHARE)} as many Gaussians as pixels",
+        f"the depth of {confirm_depths.CONFIRM_PIXELS:,} pixels of each view is compared with its nearest views, up to"
+        f" {confirm_depths.CONFIRM_NEIGHBORS} of them",
+        f"If they confirm less than {part(confirm_depths.POOR_SHARE)} of these depths, a note says that the result will"
+        " be poor",
+        f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input",
+        f"and less than {distance.WRONG_DB:g} dB of PSNR",
         f"They show the photos at most {plan.FIDELITY_LOSS:g} dB worse than it does",
         f"at least {plan.FIDELITY_PSNR:g} dB against the input's",
-        f"moved by up to {cameras_off.MAX_PX:g} pixels",
+        f"moved by up to {cameras_off.MAX_PX:g} pixels, in small pictures by up to {percent(cameras_off.MAX_SHARE)}",
+        f"If the views miss {percent(draw_outside.LEAST_OUTSIDE)} of the Gaussians or more",
         f"With more than {word(plan.USUAL_VIEWS)} views the fit takes more steps. Scenes of more than"
-        f" {million(plan.WHOLE_GAUSSIANS)} Gaussians or {plan.WHOLE_VIEWS} views are compacted in blocks",
+        f" {million(plan.WHOLE_GAUSSIANS)} Gaussians are compacted in blocks of views, which takes less memory. So are"
+        f" scenes of more than {plan.WHOLE_VIEWS} views",
         f"{part(1 / scores.INPUT_EVERY)} of the input's pixels and {part(1 / scores.RESULT_EVERY)} of the result's in"
         f" {word(views.REPORT_VIEWS)} photos (in drafts: {word(plan.EFFORTS['draft'].report_views)})",
     ),
@@ -146,11 +152,12 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"its opacity is below {fog.FOG_EMPTY:g} in the whole square of {fog.EROSION_PIXELS} x {fog.EROSION_PIXELS}"
         " pixels around",
         f"those whose mean depth in the result is below {fog.VEIL_SHARE:g} of the input's",
-        f"with an opacity above {fog.FOG_SOLID:g} in the input: those with one below {fog.FOG_OPEN:g} in the result",
+        f"with an opacity above {fog.FOG_SOLID:g} in the input, the share with one below {fog.FOG_OPEN:g} in the"
+        " result",
         f"Such a Gaussian is at least {word(int(fog.RATIOS[0]))} times as long as its second axis",
-        f"it is longer than {percent(fog.LONG)} of the width",
+        f"it is longer than {percent(fog.LONG)} of the picture's width",
         f"There are up to {outside.PLACES} of them, or as many as photos if these are more",
-        f"steps back by {outside.STEP_BACK_LOW[0]:g} d to {outside.STEP_BACK_HIGH[0]:g} d",
+        f"They step back by {outside.STEP_BACK_LOW[0]:g} d to {outside.STEP_BACK_HIGH[0]:g} d",
         f"Far fog above {fit_report.HAZE:g} and worst veils above {fog.VEILED:g} are plain to see",
     ),
     HOW_MANY: (
@@ -163,7 +170,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f" confirm {percent(confirm_depths.WRONG_SHARE)} or less",
         f"tries up to {word(search.MAX_LEFT_OUT_BUILDS)} numbers, or {word(search.MAX_BUILDS)}"
         " where no photo is left out",
-        f"With {word(left_out.LEAST_VIEWS)} views or more, both leave out some views",
+        f"With {word(left_out.LEAST_VIEWS)} photos or more, both leave out some views",
     ),
     PHOTOS: (
         f"differs by {colors.EXPOSURE_STEP:g} of the range, averaged over"
