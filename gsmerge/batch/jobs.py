@@ -138,7 +138,7 @@ class Job:
 
     @property
     def memory(self) -> int:
-        """Estimate the memory of the call in bytes, up to a factor of about two."""
+        """Estimate the memory of the call in bytes, up to a factor of about three."""
         return memory_bytes(self.num_gaussians, num_rest=self.num_rest)
 
     def find_files(self) -> SceneFiles:

@@ -101,7 +101,7 @@ def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
     metadata, arrays = read_tensors(path, "a .gsm file", REMEDY)
     header = _parse_header(path, metadata)
     if kind not in (None, header["kind"]):
-        remedy = f"decode them with gsmerge compact {path} --k 2, or write their arrays with gsmerge convert"
+        remedy = f"decode them with gsmerge compact {path} --k 2"
         raise SceneError(path, "expected results in the .gsm, found Feature Gaussians", remedy)
     file, stored, actual = GsmFile(path, header, arrays), header.get("checksums"), _checksums(header, arrays)
     if stored != actual:
