@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.types import PER_PIXEL, Cameras, Pixels, Scene, SceneT
+from gsmerge.types import PER_PIXEL, Cameras, Pixels, SceneT
 
 MAX_SCORED_VIEWS = 24  # largest number of scored views if a decision depends on the score
 REPORT_VIEWS = 8  # largest number of scored views if only the report needs the score
@@ -60,34 +60,6 @@ def camera_kinds(cameras: Cameras) -> np.ndarray:
     numbers = [tuple(row) for row in rows.tolist()]
     kinds = {kind: i for i, kind in enumerate(sorted(set(numbers)))}
     return np.array([kinds[kind] for kind in numbers], np.int64)
-
-
-def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
-    """Return the ids of the views that repeat no earlier view, and the index of every view in this list.
-
-    Two views are equal if their cameras, photos, masks and Gaussians are equal.
-    """
-    kinds = camera_kinds(scene.cameras)
-    distinct, indices = list[int](), list[int]()
-    for view, kind in enumerate(kinds):
-        equal = (
-            i for i, earlier in enumerate(distinct) if kinds[earlier] == kind and _equal_views(scene, earlier, view)
-        )
-        indices.append(next(equal, len(distinct)))
-        if indices[-1] == len(distinct):
-            distinct.append(view)
-    return distinct, indices
-
-
-def _equal_views(scene: Scene, first: int, second: int) -> bool:
-    """Return whether two views of one camera have the same photo, mask, importance and Gaussians."""
-    for pictures in (scene.images, scene.masks, scene.importance):
-        if pictures is not None and not np.array_equal(pictures[first], pictures[second]):
-            return False
-    if not scene.has_own_pixels:
-        return True
-    a, b = (scene.get_pixels().rows_of_views[view] for view in (first, second))
-    return all(np.array_equal(values[a], values[b]) for values in vars(scene.gaussians).values())
 
 
 def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import scenes
 
+from gsmerge.facts.prepare import distinct_views
 from gsmerge.photos.views import (
     MAX_SCORED_VIEWS,
     REPORT_VIEWS,
-    distinct_views,
     even_views,
     midpoint_views,
     pick_views,
