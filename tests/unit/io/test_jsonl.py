@@ -67,7 +67,7 @@ def values(path: Path) -> list[object]:
     return [value for _, value in each_line(path)]
 
 
-def test_every_way_to_cut_the_last_line(tmp_path: Path) -> None:
+def test_a_cut_last_line_is_replaced_by_the_next_one(tmp_path: Path) -> None:
     path = tmp_path / "lines.jsonl"
     append_line(path, {"a": "odd \u2028 line\n"})
     start = path.stat().st_size
@@ -86,7 +86,7 @@ def test_a_damaged_line_in_the_middle_costs_that_line_alone(tmp_path: Path) -> N
     assert values(path) == [{"a": 1}, None, None, {"b": 2}]
 
 
-def test_what_is_no_json_is_refused_and_leaves_the_file_alone(tmp_path: Path) -> None:
+def test_a_value_that_is_no_json_is_refused_before_it_is_written(tmp_path: Path) -> None:
     path = tmp_path / "lines.jsonl"
     append_line(path, {"a": 1})
     with pytest.raises(ValueError, match="JSON"):
@@ -94,7 +94,7 @@ def test_what_is_no_json_is_refused_and_leaves_the_file_alone(tmp_path: Path) ->
     assert values(path) == [{"a": 1}]
 
 
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with refuses(SceneError, "lines.jsonl", "exists", "--output"):
         append_line(tmp_path / "file" / "lines.jsonl", {})

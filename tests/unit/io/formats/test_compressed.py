@@ -82,7 +82,9 @@ def made() -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("rest", [0, 9, 24, 45])
 @pytest.mark.parametrize("ranged", [False, True])
-def test_what_was_packed_comes_back(tmp_path: Path, made: dict[str, np.ndarray], rest: int, ranged: bool) -> None:
+def test_packed_values_are_read_within_the_width_of_a_bit(
+    tmp_path: Path, made: dict[str, np.ndarray], rest: int, ranged: bool
+) -> None:
     write_compressed(tmp_path / "a.ply", made, rest, ranged)
     ply = read_ply(tmp_path / "a.ply")
     assert sum(ply.info.bytes_by_attribute.values()) == (16 + rest) * len(ply.gaussians) < ply.info.file_bytes
@@ -101,7 +103,7 @@ def test_what_was_packed_comes_back(tmp_path: Path, made: dict[str, np.ndarray],
         assert np.abs(g.shN[:, j, channel] - made["sh"][:, i]).max() < 8 / 256
 
 
-def test_no_opacity_and_full_opacity(tmp_path: Path, made: dict[str, np.ndarray]) -> None:
+def test_packed_opacities_of_zero_or_one_are_exact(tmp_path: Path, made: dict[str, np.ndarray]) -> None:
     made["opacities"][:2] = (0, 1)
     write_compressed(tmp_path / "a.ply", made)
     ply = read_ply(tmp_path / "a.ply")
