@@ -1,4 +1,4 @@
-"""Settings of a batch, and its jobs: each scene once, and no two written to one file."""
+"""Each scene of a batch is one job, and no two jobs write to one file."""
 
 from __future__ import annotations
 

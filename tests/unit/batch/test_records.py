@@ -95,10 +95,13 @@ def test_a_pipe_in_place_of_a_result_is_not_waited_for(tmp_path: Path) -> None:
     assert not DoneResult("k", FILES, "in/a.ply").holds(tmp_path, "k")
 
 
-def test_an_output_folder_is_made_or_refused_before_the_work(tmp_path: Path) -> None:
+def test_an_output_folder_below_a_file_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with refuses(SceneError, "out", *NO_FOLDER, "--output"):
         prepare_folder(tmp_path / "file" / "out")
+
+
+def test_an_output_folder_is_made_with_its_records(tmp_path: Path) -> None:
     prepare_folder(tmp_path / "new" / "out")
     assert (tmp_path / "new" / "out" / RECORDS).exists()
 

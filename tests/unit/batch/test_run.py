@@ -1,9 +1,10 @@
-"""One scene at a time: what is done, skipped, refused, locked, and what a kill at any moment leaves."""
+"""A scene of a batch is made, skipped or refused, and a kill at any moment leaves nothing half done."""
 
 from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from batches import QUICK, InlinePool, one_job, records, results, statuses
@@ -189,18 +191,16 @@ def test_results_in_other_formats_are_skipped_until_a_file_is_missing(ending: st
     assert run(scene, out, said)["status"] == DONE
 
 
-def test_unexpected_errors_are_recorded_in_one_line(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: Any, **__: Any) -> None:
-        raise ZeroDivisionError("odd\nthing")
-
-    monkeypatch.setattr(calls, "compact_files", broken)
-    assert run(scene, out)["error"] == "ZeroDivisionError: odd thing"
-
-    def greedy(*_: Any, **__: Any) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(calls, "compact_files", greedy)
-    assert run(scene, out)["error"].startswith("out of memory")
+@pytest.mark.parametrize(
+    ("error", "recorded"),
+    [(ZeroDivisionError("odd\nthing"), "ZeroDivisionError: odd thing"), (MemoryError(), "out of memory.*")],
+    ids=["two lines", "no memory"],
+)
+def test_unexpected_errors_are_recorded_in_one_line(
+    error: Exception, recorded: str, scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calls, "compact_files", Mock(side_effect=error))
+    assert re.fullmatch(recorded, run(scene, out)["error"])
 
 
 def test_a_failure_says_that_the_earlier_result_stays(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

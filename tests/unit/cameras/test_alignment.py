@@ -1,4 +1,4 @@
-"""Poses that are in another convention than their format has."""
+"""Poses in another convention than that of their format are recognised."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that lack pixels, with cameras and without."""
+"""The grid of files that lack pixels is found, with cameras or without."""
 
 from __future__ import annotations
 

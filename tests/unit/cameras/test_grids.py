@@ -1,4 +1,4 @@
-"""Cameras, photos and Gaussian grid of different sizes."""
+"""Cameras, photos and grids of Gaussians may have different sizes."""
 
 from __future__ import annotations
 

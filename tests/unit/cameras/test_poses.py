@@ -31,8 +31,7 @@ def large() -> Tiny:
 
 
 def cameras_of(tiny: Tiny, viewmats: np.ndarray | None = None) -> Cameras:
-    w2c = tiny.w2c if viewmats is None else viewmats
-    return Cameras(w2c, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
+    return Cameras(tiny.w2c if viewmats is None else viewmats, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
 
 
 def moved_viewmats(tiny: Tiny, degrees: float, shift: float) -> np.ndarray:

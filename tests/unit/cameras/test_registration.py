@@ -1,4 +1,4 @@
-"""Scenes of one place, each in a frame and a unit of its own, found in one another and joined."""
+"""Scenes of one place, each in its own frame and unit, are found in one another and joined."""
 
 from __future__ import annotations
 

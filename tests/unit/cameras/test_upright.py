@@ -1,4 +1,4 @@
-"""Rows that were centred, rescaled and turned upright by amounts that no file says, with pixels dropped or fused."""
+"""Rows that were centred, rescaled and turned upright by unknown amounts are matched with photos."""
 
 from __future__ import annotations
 

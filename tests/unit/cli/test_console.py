@@ -1,4 +1,4 @@
-"""What a terminal shows while a command runs."""
+"""Commands show their progress as bars, as lines or as events."""
 
 from __future__ import annotations
 

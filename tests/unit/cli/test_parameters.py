@@ -1,4 +1,4 @@
-"""Settings and hints by name, as ``--set`` and ``--hint`` read them."""
+"""Settings and hints are given by name with ``--set`` and ``--hint``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes in blocks: as good and as large as in one piece, cut where they meet."""
+"""Scenes in blocks become as good and as large as in one piece."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run is said to take before it begins."""
+"""The time and the fit of a run are estimated before it begins."""
 
 from __future__ import annotations
 

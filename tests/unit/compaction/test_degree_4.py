@@ -1,4 +1,4 @@
-"""Harmonics of degree 4, which splat-transform and gsply refuse in a ``.ply``: results have three, and notes say so."""
+"""Results of degree 4, which splat-transform and gsply refuse in a ``.ply``, get degree 3 and a note."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""No result that is clearly worse than its input: how that is told, and in which ways a run goes on."""
+"""A result that is far from its input is recognised, and the run goes on in another way."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_distances_are_those_of_a_slow_reference(prepared: Prepared) -> None:
     assert [float(value) for value in re.findall(r"([\d.]+) dB", text)] == pytest.approx([distance, error], abs=0.3)
 
 
-def test_the_input_and_usual_results_are_not_far(room: Scene, prepared: Prepared) -> None:
+def test_neither_the_input_nor_a_usual_result_is_far(room: Scene, prepared: Prepared) -> None:
     assert describe_far(prepared.scene.gaussians, prepared) is None
     for settings in ({}, {"fit": "none"}, {"superpixels": "1%"}):
         assert not compact(room, effort="draft", **settings).report.is_far

@@ -1,4 +1,4 @@
-"""What a new viewpoint gains, as a report expects it."""
+"""A report says what gain to expect at a new viewpoint."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from gsmerge.compaction.partition import (
     SHARED,
+    Block,
     Covisibility,
     count_factors,
     measure_covisibility,
@@ -159,6 +160,4 @@ def test_blocks_that_see_the_same_need_more_gaussians(two_sides: Scene) -> None:
 
 
 def partition_of(*owns: list[int]) -> list:
-    from gsmerge.compaction.partition import Block
-
     return [Block(tuple(own), ()) for own in owns]

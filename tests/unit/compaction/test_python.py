@@ -1,4 +1,4 @@
-"""What a user of Python meets: results that save themselves, warnings of doubts, notes in a log, and clear errors."""
+"""In Python, results save themselves, doubts are warnings, notes are logged, and errors are clear."""
 
 from __future__ import annotations
 
@@ -51,6 +51,9 @@ def test_a_result_saves_all_files_of_its_format(
 def test_names_of_views_are_saved(result: gsmerge.CompactResult, scene: Scene, tmp_path: Path) -> None:
     result.save(tmp_path / "a.ply")
     assert gsmerge.read_cameras(tmp_path / "a.cameras.json").names == scene.names == result.names
+
+
+def test_saving_under_an_unknown_ending_is_refused(result: gsmerge.CompactResult, tmp_path: Path) -> None:
     with pytest.raises(gsmerge.GsmergeError, match="ends in"):
         result.save(tmp_path / "a.xyz")
 

@@ -1,4 +1,4 @@
-"""How many Gaussians: limits, the scene's curve, and the search for a quality."""
+"""The number of Gaussians follows from limits, the scene's curve and the search for a quality."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussians in memory: the same kind out as in, and conventions that are named when they are wrong."""
+"""Gaussians in memory keep their kind of array, and a wrong convention is named."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from messages import noted, refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
-from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate, render
+from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate, read_scene, render
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels import elementary
 from gsmerge.scene.input import check_scene
@@ -145,10 +145,6 @@ def test_gaussians_without_pixels_are_compacted(scene: Scene) -> None:
         compact_tensors(**given | {"viewmats": np.linalg.inv(given["viewmats"])}, order="none", **FAST)
 
 
-def invert(viewmats: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(viewmats)
-
-
 def flip(viewmats: np.ndarray) -> np.ndarray:
     return np.diag([1.0, -1, -1, 1]) @ viewmats
 
@@ -158,9 +154,9 @@ WRONG: list[tuple[str, Change, list[object]]] = [
     ("opacities", lambda o: elementary.log(o / (1 - o)), ["[0, 1]", "torch.sigmoid(opacities)"]),
     ("quats", lambda q: 3 * q, ["wxyz", "100 %", "3 to 3"]),
     ("quats", lambda q: q[:, :3], ["[n, 4]", [5184, 3]]),
-    ("viewmats", invert, ["camera-to-world", "OpenCV", "inverse"]),
+    ("viewmats", np.linalg.inv, ["camera-to-world", "OpenCV", "inverse"]),
     ("viewmats", flip, ["world-to-camera", "OpenGL", "row"]),
-    ("viewmats", lambda m: invert(flip(m)), ["camera-to-world", "OpenGL", "column"]),
+    ("viewmats", lambda m: np.linalg.inv(flip(m)), ["camera-to-world", "OpenGL", "column"]),
     ("viewmats", lambda m: m.transpose(0, 2, 1), ["last row", "transposed"]),
     ("viewmats", lambda m: m[:2], ["[3, 3, 4]", "[3, 4, 4]", [2, 4, 4]]),
     ("Ks", lambda K: K / np.array([48, 36, 1])[:, None], ["pixels", 1, "divided"]),
@@ -249,8 +245,6 @@ def test_cameras_that_fit_stay_as_they_were_given(scene: Scene) -> None:
 
 
 def test_compact_takes_a_path_in_place_of_a_scene(tiny_folder: Path) -> None:
-    from gsmerge import read_scene
-
     result = compact(tiny_folder / "scene.ply", **FAST)
     assert len(result.gaussians) == len(compact(read_scene(tiny_folder), **FAST).gaussians)
     assert len(compact(str(tiny_folder), **FAST).gaussians) == len(result.gaussians)

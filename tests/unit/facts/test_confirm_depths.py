@@ -1,4 +1,4 @@
-"""How far the views of a scene confirm each other's depth."""
+"""The views of a scene confirm or contradict each other's depth."""
 
 from __future__ import annotations
 

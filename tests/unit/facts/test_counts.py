@@ -1,4 +1,4 @@
-"""How many Gaussians a budget, a file size and a device mean."""
+"""A budget, a file size or a device means a number of Gaussians."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of the input where no view looks: what is added, to which scenes, and what it is worth."""
+"""Pictures of the input are drawn where no view looks."""
 
 from __future__ import annotations
 
@@ -89,8 +89,8 @@ def test_drawings_from_outside_do_not_change_own_views(drawings: tuple[PicturedS
 
 
 def test_larger_photos_get_larger_drawings(drawings: tuple[PicturedScene, PicturedScene]) -> None:
-    part, drawn = drawings
     """Those of the views are read as before, by their own numbers."""
+    part, drawn = drawings
     photos = drawn.large_photos
     assert [photos.read(number)[0, 0, 0] for number in photos.ids[: len(part)]] == [7, 4]
     np.testing.assert_allclose(photos.Ks, drawn.cameras.Ks * DOUBLE)

@@ -1,4 +1,4 @@
-"""Large parts of photos in which a scene shows nothing: they stay empty, unless photos are asked for."""
+"""Large parts of photos in which a scene shows nothing stay empty, unless photos are asked for."""
 
 from __future__ import annotations
 
@@ -24,15 +24,10 @@ def room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
 
 
-def keep(scene: Scene, valid: np.ndarray) -> Scene:
-    """Return the scene without the rows of some pixels."""
-    return scenes.shown_in(scene, valid)
-
-
 def without_top(scene: Scene) -> Scene:
     valid = scene.pixels.shown.copy()
     valid[:, :THIRD] = False
-    return keep(scene, valid)
+    return scenes.shown_in(scene, valid)
 
 
 def ball_alone(scene: Scene) -> Scene:
@@ -79,7 +74,7 @@ def test_borders_and_small_holes_are_filled(room: Scene) -> None:
     valid = np.zeros_like(room.pixels.shown)
     valid[:, 3:-3, 3:-3] = True
     valid[:, 30:35, 40:45] = False
-    _, after, notes = compare_extents(keep(room, valid))
+    _, after, notes = compare_extents(scenes.shown_in(room, valid))
     assert after.mean() > 0.95
     assert after[:, 30:35, 40:45].mean() > 0.9
     assert notes == []

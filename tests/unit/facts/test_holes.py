@@ -1,4 +1,4 @@
-"""Gaussians for pixels that the views show and no Gaussian covers."""
+"""Pixels that the views show and no Gaussian covers are filled with Gaussians."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ K = np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]])
 
 
 def make_walls(*, moved: float = 0.5, floor: int = FLOOR) -> PicturedScene:
-    """Make three views, each ``moved`` to the right, of a far wall above a near one; rows of it and of borders lack."""
+    """Make three views, each ``moved`` to the right, of a far wall above a near one; the near one alone has rows."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     depth = np.where(y < floor, FAR, NEAR)
     viewmats = np.tile(np.eye(4), (3, 1, 1))

@@ -1,4 +1,4 @@
-"""Scenes that have another look than their photos: which of the two a result has."""
+"""A result has the look of its Gaussians, unless that of the photos is asked for."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def test_gaussians_moved_with_their_view_stay_at_their_pixels(scene: Scene) -> N
         np.testing.assert_allclose(*axes, atol=1e-5)
 
 
-def test_views_that_agree_are_left_alone(scene: Scene) -> None:
+def test_views_that_agree_are_not_moved(scene: Scene) -> None:
     assert move_poses(scene, VIEWS) is None
 
 
@@ -94,7 +94,7 @@ def test_wrong_poses_of_views_with_highlights_are_mended(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("views", [slice(None), slice(1, 2)], ids=["all", "one"])
-def test_views_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None:
+def test_views_with_wrong_poses_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None:
     wrong = motions.disagreeing(scene, views=views)
     before = worst_error(wrong, scene)
     found = move_poses(wrong, VIEWS)

@@ -1,4 +1,4 @@
-"""Homes and fronts of Gaussians in any order, and of such that are wider apart than pixels; least sizes."""
+"""Gaussians in any order get homes and fronts in the views, and those that are hidden a least size."""
 
 from __future__ import annotations
 

@@ -44,8 +44,7 @@ def test_cameras_look_to_all_sides_from_near_the_place_of_the_viewer() -> None:
     ("share", "power"), [(0.3, 1.0), (1.0, 0.0)], ids=["a part of the directions", "sizes of one object"]
 )
 def test_no_cameras_are_placed_inside_other_scenes(share: float, power: float) -> None:
-    gaussians = scene_around(share, power)
-    assert place_inside(gaussians) is None
+    assert place_inside(scene_around(share, power)) is None
 
 
 def test_outliers_do_not_move_the_place() -> None:

@@ -1,4 +1,4 @@
-"""A scene of which no view is known: the views that judge its results."""
+"""Placed views judge the results of a scene of which no view is known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes of which no score says anything: Gaussians as no capture has, and views of one flat colour."""
+"""Scenes unlike captures, and views of one flat colour, get no score."""
 
 from __future__ import annotations
 
@@ -44,11 +44,16 @@ def test_colours_beyond_a_bound_are_unlike_captures(value: float, is_odd: bool, 
     assert odd is None or "base colours have coefficients beyond 11" in odd
 
 
-def test_gaussians_of_one_colour_or_all_faint_are_unlike_captures(room: Scene) -> None:
-    flat = replace(room.gaussians, sh0=np.full_like(room.gaussians.sh0, 0.3))
-    faint = replace(room.gaussians, opacities=np.full_like(room.gaussians.opacities, 0.001))
-    assert noted([unlike_captures(flat) or ""], "one flat colour")
-    assert noted([unlike_captures(faint) or ""], "opacities")
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [("sh0", 0.3, "one flat colour"), ("opacities", 0.001, "opacities")],
+    ids=["flat", "faint"],
+)
+def test_gaussians_of_one_colour_or_all_faint_are_unlike_captures(
+    name: str, value: float, words: str, room: Scene
+) -> None:
+    odd = replace(room.gaussians, **{name: np.full_like(getattr(room.gaussians, name), value)})
+    assert noted([unlike_captures(odd) or ""], words)
 
 
 def test_a_third_or_a_handful_of_odd_gaussians_is_like_captures(room: Scene) -> None:

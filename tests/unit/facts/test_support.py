@@ -1,4 +1,4 @@
-"""In how many views a Gaussian takes part, against a count by alpha compositing pixel by pixel."""
+"""The number of views that show a Gaussian is that of compositing pixel by pixel."""
 
 from __future__ import annotations
 

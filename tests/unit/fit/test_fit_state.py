@@ -1,4 +1,4 @@
-"""The optimiser's state, and growing it."""
+"""The state of a fit is made of Gaussians, grown, and judged on held-out patches."""
 
 from __future__ import annotations
 
@@ -270,6 +270,9 @@ def test_growth_spends_the_count_on_what_can_be_seen(gaussians: Gaussians, photo
     assert len(grown.x) == len(gaussians) + 9
     assert not np.isin(grown.origins, np.arange(len(gaussians))[::7]).any()
     assert grown.splats.opacities.min() > FADED
+
+
+def test_chosen_rows_of_a_state_keep_their_past(gaussians: Gaussians) -> None:
     rows = state_with_past(gaussians)[np.array([4, 2])]
     for name in ("x", "x0", "m", "v", "units", "box_shares", "min_sizes"):
         np.testing.assert_array_equal(getattr(rows, name), getattr(state_with_past(gaussians), name)[[4, 2]])

@@ -1,4 +1,4 @@
-"""The full fit, on a tiny scene whose photos some known Gaussians made."""
+"""The full fit finds known Gaussians again from the photos that they made."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def test_short_fits_do_not_grow(truth: Gaussians, photos: Pair) -> None:
 # safety
 
 
-def test_held_out_patches_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
+def test_a_fit_does_not_learn_from_held_out_patches(truth: Gaussians, photos: Pair) -> None:
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
     options = scenes.tuned(replace(QUICK, half_res_share=1.0), ssim_lambda=0.0)
     start = scenes.spoil(truth)
@@ -297,12 +297,15 @@ def test_progress_shows_the_mean_error_of_whole_photos_alone(
     assert {call[3] for call in calls} == {0.5}
     assert {round(call[2]) for call in calls[:15]} == {20}
     assert {round(call[2]) for call in calls[15:]} == {10}
+
+
+def test_progress_counts_the_first_steps_as_quicker() -> None:
+    """So that the time left is about right."""
     said: list[tuple[str, int, int]] = []
     with record_run(lambda *stage: said.append(stage)):
         report_steps(10, 20, 20.0, 0.5)
         report_steps(15, 20, 10.0, 0.5)
         report_steps(20, 20, 10.0, 0.5)
-    # the first steps are quicker, so that the time left is about right
     assert said[0] == ("fit: photos 20.0 dB", round(20 * SAMPLE_COST / (1 + SAMPLE_COST)), 20)
     assert said[1][0] == "fit: photos 10.0 dB"
     assert said[0][1] < said[1][1] < 20

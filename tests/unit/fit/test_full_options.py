@@ -1,4 +1,4 @@
-"""Masks, dropout and moving cameras of the full fit."""
+"""The full fit follows masks, drops Gaussians out, and moves cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views from outside: what shows where the scene is empty, or hides what it shows, goes."""
+"""Views from outside keep a fit from filling what is empty and from hiding what is seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cutting the Gaussians of a fit at the edges of its photos."""
+"""Gaussians of a fit are cut and split at the edges of its photos."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The photos of a fit: at which size, read how often, and which of them a step looks at."""
+"""A fit chooses the size of its photos, reads them once, and looks at one size in each step."""
 
 from __future__ import annotations
 

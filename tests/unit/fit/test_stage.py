@@ -1,4 +1,4 @@
-"""The stage: what stays, and which fit is taken."""
+"""The fit stage prunes, fits, and refuses a fit that shows the photos worse."""
 
 from __future__ import annotations
 

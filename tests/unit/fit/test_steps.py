@@ -1,4 +1,4 @@
-"""Steps of the full fit: the same bits as those of a slow twin, whatever the threads."""
+"""Steps of the full fit give the bits of a slow twin with any number of threads."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def test_cameras_that_do_not_fit_are_an_alignment_problem(tiny_folder: Path, tin
     assert noted(actual["notes"], "transforms.json", "and the photos in", "left out", "expected JSON")
 
 
-def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
+def test_odd_values_of_a_ply_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
     opacities, quats, scales = (getattr(tiny.gaussians, f).copy() for f in ("opacities", "quats", "scales"))
     opacities[:4], opacities[4:9] = 1, 0
     scales[3] = 1e14
@@ -83,7 +83,7 @@ def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
     assert actual["alignment"] is not None
 
 
-def test_outliers_and_large_scales_are_shares(tiny_folder: Path, tiny: Tiny) -> None:
+def test_outliers_and_large_scales_are_reported_as_shares(tiny_folder: Path, tiny: Tiny) -> None:
     means, scales = tiny.gaussians.means.copy(), tiny.gaussians.scales.copy()
     means[:7] += 1000
     scales[:21, 1] = 50

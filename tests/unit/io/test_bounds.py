@@ -1,4 +1,4 @@
-"""Limits on what a file may ask for."""
+"""Limits bound what a file may ask for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photos with more pixels than the grid: found, read late, and showing what the grid shows."""
+"""Photos with more pixels than the grid are found, read late, and show what the grid shows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Safetensors files: the same arrays as its own reader gives, and what is refused."""
+"""Safetensors files are read as by the library's own reader, or refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Paths through a scene: where the cameras of the frames stand, and how they look."""
+"""Cameras of a video stand along a spline or an orbit through the scene."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return elementary.arccos(cosines.clip(-1, 1))
 
 
-def pose_steps(path: Cameras, depth: float = DEPTH) -> np.ndarray:
+def step_lengths(path: Cameras, depth: float = DEPTH) -> np.ndarray:
     """Return how far each camera is from the one before, turns by what they move at the depth."""
     shifts = np.linalg.norm(np.diff(camera_centres(path.viewmats), axis=0), axis=1)
     turns = angles_between(path.viewmats[1:], path.viewmats[:-1])
@@ -63,7 +63,7 @@ def pose_steps(path: Cameras, depth: float = DEPTH) -> np.ndarray:
 def test_a_spline_passes_through_all_cameras_at_even_speed(walk: Cameras) -> None:
     path = spline(walk, DEPTH, 400)
     np.testing.assert_allclose(path.viewmats[[0, -1]], walk.viewmats[[0, -1]], atol=1e-12)
-    steps = pose_steps(path)
+    steps = step_lengths(path)
     assert steps.max() / steps.min() < 1.03
     for viewmat in walk.viewmats:
         away = np.linalg.norm(camera_centres(path.viewmats) - camera_centres(viewmat), axis=1)
@@ -91,6 +91,9 @@ def test_a_spline_of_cameras_that_only_turn_turns_evenly() -> None:
 def test_repeated_cameras_count_once_in_a_spline(walk: Cameras) -> None:
     path = spline(walk[[0, 0, 1, 2, 3, 3, 3, 4, 5]], DEPTH, 50)
     np.testing.assert_allclose(path.viewmats, spline(walk, DEPTH, 50).viewmats, atol=1e-12)
+
+
+def test_a_spline_of_one_camera_is_refused(walk: Cameras) -> None:
     with refuses(ValueError, "spline", 2, 1):
         spline(walk[[2, 2, 2]], DEPTH, 50)
 

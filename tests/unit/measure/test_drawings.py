@@ -1,4 +1,4 @@
-"""Which view a name means."""
+"""A view is found by its name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evaluation: figures agree with scikit-image and with the metrics by hand, and say what they are of."""
+"""Scores of an evaluation agree with scikit-image, and say what they compare."""
 
 from __future__ import annotations
 
@@ -191,7 +191,6 @@ def expect_equal(actual: Evaluation, expected: Evaluation) -> None:
 
 
 def test_a_photo_side_gives_the_scores_of_views_resized_by_hand(scene: Scene, half: Gaussians) -> None:
-    options = PLAIN
     unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     masks = np.ones(scene.images.shape[:3], bool)
     masks[:, :, :9] = False
@@ -199,15 +198,15 @@ def test_a_photo_side_gives_the_scores_of_views_resized_by_hand(scene: Scene, ha
     by_hand = Scene(scene.gaussians, small.cameras, small.images, None, scene.names)
     own = {"half": scene.cameras[[1, 2, 0]]}  # of a result that moved them
     actual = evaluate(
-        replace(unaligned, masks=masks), {"half": half}, held_out(), replace(options, photo_side=24), cameras=own
+        replace(unaligned, masks=masks), {"half": half}, held_out(), replace(PLAIN, photo_side=24), cameras=own
     )
     expected = evaluate(
         replace(by_hand, masks=~(np.arange(24) < 5) & np.ones((3, 18, 1), bool)), {"half": half}, halved(held_out()),
-        options, cameras={"half": small.cameras[[1, 2, 0]]},
+        PLAIN, cameras={"half": small.cameras[[1, 2, 0]]},
     )  # fmt: skip
     expect_equal(actual, expected)
     assert actual.results[0].scores[0].visible < 0.9  # without what the masks leave out, in part too
-    usual = evaluate(unaligned, {"half": half}, held_out(), options)
+    usual = evaluate(unaligned, {"half": half}, held_out(), PLAIN)
     assert actual.results[0].mean("target") != usual.results[0].mean("target")
 
 

@@ -1,4 +1,4 @@
-"""Fog, veils and holes of cases that can be worked out: curtains of a known opacity, walls with pieces missing."""
+"""Fog, veils and holes are measured in cases that can be worked out by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras, photos and masks at other sizes."""
+"""Cameras, photos and masks are resized together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's visibility mask, against one loop over all samples."""
+"""The paper's visibility mask is that of one loop over all samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras of one size, and cameras whose lens is no pinhole."""
+"""Camera files become cameras of one size, and photos of a lens are undistorted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""COLMAP models, as text and binary, whole and damaged."""
+"""COLMAP models are read as text or binary, and damaged ones are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a program moved its cameras into the Gaussians' world: nerfstudio's file beside the scene, and Metashape's."""
+"""Cameras are moved into the frame of Gaussians by the file that nerfstudio leaves beside a scene."""
 
 from __future__ import annotations
 

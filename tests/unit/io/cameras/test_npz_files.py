@@ -1,4 +1,4 @@
-"""Cameras and arrays in ``.npz``."""
+"""Cameras and arrays are read from ``.npz``."""
 
 from __future__ import annotations
 

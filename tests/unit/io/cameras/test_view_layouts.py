@@ -1,4 +1,4 @@
-"""Files of each declared layout: all views are read, and what is wrong is named by file, view and key."""
+"""Files of each declared layout are read, and what is wrong is named by file, view and key."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def test_unused_columns_are_in_one_note(more: tuple[str, ...], said: tuple[str, 
     assert ply.info.extra_columns == (*more, "label", "semantic_0", "red", "confidence")
 
 
-def test_whole_numbers_that_are_unknown_have_no_note(tmp_path: Path) -> None:
+def test_unknown_columns_of_whole_numbers_have_no_note(tmp_path: Path) -> None:
     assert file_notes(read_ply(with_columns(tmp_path / "a.ply", "foo", kind="u1")).info) == ()
 
 

@@ -247,7 +247,7 @@ def test_settings_start_a_viewer_at_the_middle_view(scene: Scene, tmp_path: Path
     write_scene(path, scene)  # beside settings that stay
 
 
-def test_settings_that_a_user_wrote_stay(scene: Scene, tmp_path: Path) -> None:
+def test_settings_of_a_user_beside_a_sog_stay(scene: Scene, tmp_path: Path) -> None:
     path, settings = tmp_path / "a.sog", tmp_path / "a.settings.json"
     write_scene(path, scene)
     settings.write_text("{}")

@@ -1,4 +1,4 @@
-"""Marks of how viewers are to render Gaussians, and of the vertical axis: kept through formats and joins."""
+"""Marks of the render mode and of the vertical axis are kept through formats and joins."""
 
 from __future__ import annotations
 

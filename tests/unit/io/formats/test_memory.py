@@ -1,4 +1,4 @@
-"""Reading takes at most 64 MB and 20 times a file's bytes, in every format: measured in processes of their own."""
+"""Reading takes at most 64 MB and 20 times a file's bytes, as processes of their own measure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``.sog``: textures without loss, and codebooks and palettes that stand for many values."""
+"""A ``.sog`` has textures without loss, and codebooks and palettes that stand for many values."""
 
 from __future__ import annotations
 

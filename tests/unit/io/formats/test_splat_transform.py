@@ -1,4 +1,4 @@
-"""The program splat-transform, which writes levels, and the formats that it converts."""
+"""The program splat-transform is run, or named for the formats that it converts."""
 
 from __future__ import annotations
 

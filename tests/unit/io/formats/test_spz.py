@@ -1,4 +1,4 @@
-"""``.spz`` of all versions: what Niantic's own program writes, older and newer ones, damage, and a missing library."""
+"""All versions of ``.spz`` are read, and damaged files are refused."""
 
 from __future__ import annotations
 

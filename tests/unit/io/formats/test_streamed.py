@@ -1,4 +1,4 @@
-"""Streamed SOG: written by splat-transform or a stand-in, read, replaced whole; damage in one line."""
+"""Streamed SOG is written by splat-transform or a stand-in, read, and replaced as a whole."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_failures_leave_existing_files_and_nothing_else(tmp_path: Path, program: None) -> None:
+def test_failures_leave_existing_files_alone_in_the_folder(tmp_path: Path, program: None) -> None:
     index = tmp_path / "scene" / "lod-meta.json"
     bad = corners()
     bad.opacities[1] = np.nan

@@ -1,4 +1,4 @@
-"""Formats of results: read back by slow, obvious readers, and by splat-transform where that is installed."""
+"""Slow, obvious readers, and splat-transform where it is installed, read back what is written."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_the_file_name_chooses_the_format() -> None:
 
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
-def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: Path) -> None:
+def test_failures_leave_existing_files_alone_in_the_folder(ending: str, tmp_path: Path) -> None:
     bad, path = replace(corners(), opacities=np.array([0.0, float("nan"), 0.5], np.float32)), tmp_path / f"a{ending}"
     with refuses(ValueError, "", "finite", 1):
         write_gaussians(path, bad)
