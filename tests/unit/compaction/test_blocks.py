@@ -53,7 +53,7 @@ def test_blocks_are_as_good_as_one_piece() -> None:
     ]
     scores = [[scenes.psnr_of(result.gaussians, between) for result in pair] for pair in results]
     one, other = np.mean(scores, 0)
-    assert other > one - 0.3
+    assert other > one - 0.3  # dB that nobody sees
     whole, parts = results[0]
     assert len(parts.gaussians) == pytest.approx(len(whole.gaussians), rel=0.1)
     scenes.assert_invariants(parts.gaussians, scene)
@@ -98,7 +98,7 @@ def test_blocks_without_photos_take_the_colours_of_their_rows(scene: Scene) -> N
     whole, report = (compact(bare, blocks=blocks, **SETTINGS).report for blocks in ("none", 2))
     assert whole.psnr_reference == report.psnr_reference == ROW_COLORS
     assert report.psnr_before == pytest.approx(whole.psnr_before, abs=0.5)
-    assert report.psnr_after > whole.psnr_after - 1
+    assert report.psnr_after > whole.psnr_after - 1  # dB
     assert sum(ROW_COLORS in note for note in report.notes) == 1
 
 
@@ -108,7 +108,7 @@ def test_blocks_without_a_fit_show_the_photos_as_one_piece_does(scene: Scene, ch
     settings = SETTINGS | {"checkpoint": checkpoint, "fit": "none"}
     whole, result = (compact(scene, blocks=blocks, **settings) for blocks in ("none", 2))
     scenes.assert_invariants(result.gaussians, scene)
-    assert scenes.psnr_of(result.gaussians, scene) > scenes.psnr_of(whole.gaussians, scene) - 1
+    assert scenes.psnr_of(result.gaussians, scene) > scenes.psnr_of(whole.gaussians, scene) - 1  # dB
     assert any(names(note, "2 blocks of views", "exposures", "not estimated") for note in result.report.notes)
     assert len(np.unique(result.gaussians.means, axis=0)) == len(result.gaussians)
 

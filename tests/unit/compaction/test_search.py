@@ -28,7 +28,7 @@ def log2(number: float) -> float:
     return float(elementary.log(number) / elementary.log(2))
 
 
-def points(*values: tuple[int, float, float]) -> list[CurvePoint]:
+def curve_points(*values: tuple[int, float, float]) -> list[CurvePoint]:
     return [CurvePoint(*value) for value in values]
 
 
@@ -121,7 +121,7 @@ def test_counts_of_levels_end_where_a_view_would_have_none() -> None:
 
 
 def test_count_within_is_read_off_the_curve() -> None:
-    curve = points((100, 20.0, 0), (200, 22.0, 0), (400, 23.0, 0), (800, 22.5, 0))
+    curve = curve_points((100, 20.0, 0), (200, 22.0, 0), (400, 23.0, 0), (800, 22.5, 0))
     assert count_within(curve, 0.0) == 400
     assert count_within(curve, 0.5) == math.ceil(200 * 2**0.5)
     assert count_within(curve, 1.0) == 200
@@ -130,24 +130,24 @@ def test_count_within_is_read_off_the_curve() -> None:
 
 
 def test_count_within_falls_as_more_may_be_lost() -> None:
-    curve = points((100, 20.0, 0), (200, 24.0, 0), (400, 23.5, 0), (800, 26.0, 0), (1600, 26.1, 0))
+    curve = curve_points((100, 20.0, 0), (200, 24.0, 0), (400, 23.5, 0), (800, 26.0, 0), (1600, 26.1, 0))
     counts = [count_within(curve, drop / 10) for drop in range(80)]
     assert counts == sorted(counts, reverse=True)
 
 
 def test_knee_is_where_the_curve_stops_rising() -> None:
-    flat_after_400 = points((100, 20, 0.5), (200, 22, 0.6), (400, 23, 0.7), (800, 23, 0.7), (1600, 23, 0.7))
+    flat_after_400 = curve_points((100, 20, 0.5), (200, 22, 0.6), (400, 23, 0.7), (800, 23, 0.7), (1600, 23, 0.7))
     assert 283 <= curve_knee(flat_after_400) <= 566  # between the middles of the steep and of the flat part
-    assert curve_knee(points((100, 20, 0.5), (200, 22, 0.6), (400, 24, 0.7))) == 400
-    assert curve_knee(points((100, 24, 0.7), (200, 22, 0.6), (400, 20, 0.5))) == 100
-    assert curve_knee(points((100, 24, 0.7))) == 100
+    assert curve_knee(curve_points((100, 20, 0.5), (200, 22, 0.6), (400, 24, 0.7))) == 400
+    assert curve_knee(curve_points((100, 24, 0.7), (200, 22, 0.6), (400, 20, 0.5))) == 100
+    assert curve_knee(curve_points((100, 24, 0.7))) == 100
 
 
 def test_knee_weighs_structure_against_psnr() -> None:
     """A blurred scene can have the better PSNR; it is not the knee while structure still grows."""
     psnr_falls = [(100, 22.0), (200, 21.9), (400, 21.8), (800, 21.7)]
-    without = points(*((count, psnr, 0.7) for count, psnr in psnr_falls))
-    grows = points(*((count, psnr, 0.60 + 0.04 * i) for i, (count, psnr) in enumerate(psnr_falls)))
+    without = curve_points(*((count, psnr, 0.7) for count, psnr in psnr_falls))
+    grows = curve_points(*((count, psnr, 0.60 + 0.04 * i) for i, (count, psnr) in enumerate(psnr_falls)))
     assert curve_knee(without) == 100
     assert curve_knee(grows) == 800
 
@@ -160,11 +160,11 @@ def rises(count: int) -> float:
 def search(curve: Callable[[int], float], target: float, start: int, least: int, most: int) -> CountSearch:
     """Run a search on a curve that is known, instead of building scenes."""
     counts = CountSearch(make_plan(target_psnr=target, least=least, most=most), start)
-    counts.run(lambda count: built(count, curve(count)))
+    counts.run(lambda count: fake_result(count, curve(count)))
     return counts
 
 
-def built(count: int | None, psnr: float) -> Any:
+def fake_result(count: int | None, psnr: float) -> Any:
     record = SimpleNamespace(seconds={})
     return SimpleNamespace(count=count, psnr=psnr, deciding_psnr=psnr, gaussians=range(count or 0), record=record)
 
@@ -181,7 +181,7 @@ def test_search_finds_the_fewest_gaussians_that_meet_the_target(start: int, targ
     assert len(actual.psnrs) <= MAX_BUILDS
 
 
-def test_search_near_the_answer_ends_close_to_it() -> None:
+def test_search_that_starts_near_the_answer_ends_close_to_the_answer() -> None:
     count = search(rises, 24.0, 3000, 10, 100_000).best.count
     assert 4000 <= count <= 4000 * 1.3
 
@@ -212,16 +212,18 @@ def test_search_begins_within_its_limits(default: int, first: int) -> None:
     assert search_count(prepared, plan, cast("Build", None)).first == first
 
 
-def keep(curve: Callable[[int], float], default: int, most: int, *, rendered: bool = True) -> CountSearch:
+def search_as_good_as_input(
+    curve: Callable[[int], float], default: int, most: int, *, rendered: bool = True
+) -> CountSearch:
     """Run the search that keeps the input by default: 32.5 dB of its renders, or of photos."""
     plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_fidelity=True)
     counts = CountSearch(plan, default, rendered)
-    counts.run(lambda count: built(count, curve(count)))
+    counts.run(lambda count: fake_result(count, curve(count)))
     return counts
 
 
 def test_the_usual_count_is_kept_where_it_is_good_enough() -> None:
-    actual = keep(lambda _: 40.0, 1000, 20_000)
+    actual = search_as_good_as_input(lambda _: 40.0, 1000, 20_000)
     assert list(actual.psnrs) == [1000]  # not fewer, and no further run
     assert actual.notes == []
 
@@ -229,7 +231,7 @@ def test_the_usual_count_is_kept_where_it_is_good_enough() -> None:
 @pytest.mark.parametrize("slope", [2.0, 3.0, 5.0])
 @pytest.mark.parametrize("needed", [1.1, 2.0, 7.0])
 def test_the_count_rises_until_renders_of_the_input_are_kept(slope: float, needed: float) -> None:
-    actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 20_000)
+    actual = search_as_good_as_input(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 20_000)
     assert actual.best.psnr >= 32.5
     assert actual.best.count <= 1.4 * 1000 * needed
     assert len(actual.psnrs) <= 5
@@ -237,7 +239,7 @@ def test_the_count_rises_until_renders_of_the_input_are_kept(slope: float, neede
 
 
 def test_all_gaussians_of_a_compact_scene_are_kept() -> None:
-    actual = keep(lambda count: 120.0 if count == 5000 else 25.0, 220, 5000)
+    actual = search_as_good_as_input(lambda count: 120.0 if count == 5000 else 25.0, 220, 5000)
     assert actual.best.count == 5000
     assert noted(actual.notes, "compact already", "5,000 of 5,000")
     assert actual.facts(actual.best).unmet is None
@@ -247,7 +249,9 @@ def test_all_gaussians_of_a_compact_scene_are_kept() -> None:
 @pytest.mark.parametrize("needed", [1.1, 3.0, 12.0])
 def test_the_count_rises_until_photos_are_shown_as_by_the_input(slope: float, needed: float) -> None:
     """Beyond the four times the usual count that a quality may take."""
-    actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 40_000, rendered=False)
+    actual = search_as_good_as_input(
+        lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 40_000, rendered=False
+    )
     assert actual.is_met
     assert actual.best.count <= 1000 * needed * 2 ** (FIDELITY_LOSS / slope) * SAME_COUNT_RATIO
     assert len(actual.psnrs) <= 5
@@ -257,14 +261,14 @@ def test_the_count_rises_until_photos_are_shown_as_by_the_input(slope: float, ne
 @pytest.mark.parametrize("curve", [lambda _: 12.0, lambda count: 13 - log2(count / 1000)])
 def test_search_ends_early_where_no_count_shows_the_photos(curve: Callable[[int], float]) -> None:
     """As of another scene. The best is kept, even if it is the usual count."""
-    actual = keep(curve, 1000, 20_000, rendered=False)
+    actual = search_as_good_as_input(curve, 1000, 20_000, rendered=False)
     assert len(actual.psnrs) <= MAX_BUILDS
     assert (actual.best.count, actual.is_met, actual.facts(actual.best).unmet) == (1000, False, None)
     assert actual.notes == []
 
 
 def test_the_note_says_that_the_largest_count_is_too_few() -> None:
-    actual = keep(lambda count: 20 + log2(count / 1000), 1000, 3000, rendered=False)
+    actual = search_as_good_as_input(lambda count: 20 + log2(count / 1000), 1000, 3000, rendered=False)
     assert actual.best.count == 3000
     assert noted(actual.notes, "each of the 2 counts", "over 0.3 dB worse")
 
@@ -272,7 +276,7 @@ def test_the_note_says_that_the_largest_count_is_too_few() -> None:
 @pytest.mark.parametrize("first", [300, None])
 def test_one_count_is_built_where_no_quality_is_asked_for(first: int | None) -> None:
     counts = CountSearch(make_plan(), first)
-    counts.run(lambda count: built(count, 20.0))
+    counts.run(lambda count: fake_result(count, 20.0))
     assert [candidate.count for candidate in counts.candidates] == [first]
 
 
@@ -280,7 +284,7 @@ def judge_left_out(curve: Callable[[int], float], target: float, most: int | Non
     """Run a search that photos judge which the builds leave out."""
     photos = cast("LeftOut", SimpleNamespace(photos=range(2)))
     counts = CountSearch(make_plan(target_psnr=target, least=10, most=100_000), 1000, left_out=photos, most=most)
-    counts.run(lambda count: built(count, curve(count)))
+    counts.run(lambda count: fake_result(count, curve(count)))
     return counts
 
 

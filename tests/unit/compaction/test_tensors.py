@@ -42,13 +42,13 @@ def changed(scene: Scene, name: str, change: Change) -> dict[str, Any]:
     return given | {name: change(np.array(given[name]))}
 
 
-def same(small: CompactResult, gaussians: Gaussians) -> bool:
+def has_values_of(small: CompactResult, gaussians: Gaussians) -> bool:
     return all(np.array_equal(np.asarray(getattr(small.gaussians, name)), getattr(gaussians, name)) for name in FIELDS)
 
 
 def test_compact_tensors_of_arrays_gives_what_compact_gives(scene: Scene) -> None:
     small, result = compact_tensors(**tensors_of(scene), **FAST), compact(scene, **FAST)
-    assert same(small, result.gaussians)
+    assert has_values_of(small, result.gaussians)
     assert isinstance(small.gaussians.means, np.ndarray)
     assert small.report.psnr_after == result.report.psnr_after
     assert len(small.gaussians) == small.report.num_output < 0.2 * len(scene.gaussians)
@@ -66,7 +66,7 @@ def test_compact_tensors_of_tensors_gives_tensors(scene: Scene, torch: Any) -> N
     assert len(small.coarser) == 1
     assert small.gaussians.device == given["means"].device
     assert not small.gaussians.means.requires_grad
-    assert same(small, compact(scene, **FAST).gaussians)
+    assert has_values_of(small, compact(scene, **FAST).gaussians)
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
@@ -89,7 +89,7 @@ def test_bfloat16_is_read_as_float32(scene: Scene, torch: Any) -> None:
 def test_the_layout_of_arrays_does_not_change_the_result(scene: Scene, change: Change) -> None:
     plain = {name: np.array(value, np.float32) for name, value in tensors_of(scene).items()}
     given = {name: change(value) for name, value in plain.items()}
-    assert same(compact_tensors(**given, **FAST), compact_tensors(**plain, **FAST).gaussians)
+    assert has_values_of(compact_tensors(**given, **FAST), compact_tensors(**plain, **FAST).gaussians)
 
 
 WITHOUT_NUMBERS: dict[str, Callable[[Any, Any], Any]] = {  # by a word of their description
@@ -118,7 +118,7 @@ def test_tensors_without_values_are_refused_by_render(scene: Scene) -> None:
         render(scene.gaussians.to("meta"), scene.cameras)
 
 
-def test_colors_stand_for_harmonics(scene: Scene) -> None:
+def test_colors_may_be_given_in_place_of_harmonics(scene: Scene) -> None:
     colors = sh0_to_rgb(scene.gaussians.sh0[:, 0])
     small = compact_tensors(**tensors_of(scene, sh0=None, colors=colors), **FAST)
     expected = compact_tensors(**tensors_of(scene), **FAST).gaussians.sh0
@@ -218,7 +218,7 @@ def test_colors_of_bytes_and_channel_major_harmonics_are_named(scene: Scene) -> 
             compact_tensors(**tensors_of(scene, **more), **FAST)
 
 
-def test_wrong_sizes_are_named(scene: Scene) -> None:
+def test_arrays_of_wrong_sizes_are_named(scene: Scene) -> None:
     for changes, place, *found in (
         ({"images": None, "shape": (3, 35, 48)}, "means", 5040, 5184), ({"images": None}, "shape", "neither"),
         ({"shape": (3, 35, 48)}, "images", [3, 35, 48, 3], [3, 36, 48, 3]), ({"shape": (36, 48)}, "shape", [36, 48]),

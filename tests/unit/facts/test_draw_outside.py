@@ -138,5 +138,5 @@ def test_gaussians_that_no_view_sees_stay_in_a_result(room: Scene, monkeypatch: 
     assert noted(result.report.notes, "no view sees 5 % of the Gaussians", "from 1 places")
     monkeypatch.setattr("gsmerge.facts.prepare.draw_outside", lambda scene: scene)
     scores = [scenes.psnr_of(gaussians, away) for gaussians in (result.gaussians, compact_part().gaussians)]
-    assert scores[0] > scores[1] + 4
-    assert scores[0] > scenes.psnr_of(part.gaussians, away) - 3
+    assert scores[0] > scores[1] + 4  # dB: without drawings a part is missing
+    assert scores[0] > scenes.psnr_of(part.gaussians, away) - 3  # dB: a result of 300 Gaussians is coarser

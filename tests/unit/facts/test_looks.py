@@ -73,7 +73,7 @@ def test_a_scene_keeps_its_look_beside_other_photos(look: Callable[[Colors], Col
     assert result.report.psnr_reference == ROW_COLORS
     assert len([note for note in result.report.notes if "--set look=photos" in note]) == 1
     own, photos = distances(result, scene)
-    assert own < 0.6 * photos
+    assert own < 0.6 * photos  # clearly nearer to its own look
 
 
 @pytest.mark.parametrize("look", [grey, false_colors, styled])
@@ -83,7 +83,7 @@ def test_the_look_of_photos_is_taken_where_that_is_asked_for(look: Callable[[Col
     assert result.report.psnr_reference == PHOTOS
     assert not noted(result.report.notes, "look")
     own, photos = distances(result, scene)
-    assert photos < 0.6 * own
+    assert photos < 0.6 * own  # clearly nearer to the look of the photos
 
 
 def test_photos_of_another_scene_are_noted_as_no_look(room: Scene) -> None:

@@ -99,7 +99,7 @@ def test_views_with_wrong_poses_are_moved_to_where_they_agree(views: slice, scen
     before = worst_error(wrong, scene)
     found = move_poses(wrong, VIEWS)
     degrees, distance = worst_error(found, scene)
-    assert degrees < 0.25 * before[0]
+    assert degrees < 0.25 * before[0]  # most of the error is gone
     assert distance < 0.25 * before[1]
     common = motion_vectors(wrong.cameras.viewmats, found.cameras.viewmats)
     np.testing.assert_allclose(np.median(common, 0), 0, atol=2e-3)
@@ -186,7 +186,7 @@ def test_compacting_notes_the_views_that_it_moved(scene: Scene) -> None:
     assert after > before + 1  # over all views: a draft's report is of two
 
 
-def test_a_run_with_right_poses_is_that_with_fixed_ones(scene: Scene) -> None:
+def test_a_run_with_right_poses_gives_the_result_of_fixed_poses(scene: Scene) -> None:
     settings = {"fit_steps": 12, "superpixels": "2%"}
     fixed, auto = (compact(scene, **settings, poses=poses) for poses in ("fixed", "auto"))
     np.testing.assert_array_equal(fixed.gaussians.means, auto.gaussians.means)

@@ -55,7 +55,7 @@ def state_with_past(gaussians: Gaussians) -> FitState:
     return state
 
 
-def covars_of(x: np.ndarray) -> np.ndarray:
+def covariances_of(x: np.ndarray) -> np.ndarray:
     made = x.astype(np.float64)
     return covariances(made[:, QUAT:LOGIT], elementary.exp(made[:, SIZE:QUAT]))
 
@@ -120,18 +120,18 @@ def test_growing_a_state_doubles_it_at_most(gaussians: Gaussians, photos: Photos
     assert len(grow(state, masses, 3)[0].x) == len(gaussians)
 
 
-def test_halves_have_their_parents_moments(gaussians: Gaussians, photos: Photos) -> None:
+def test_two_halves_have_the_moments_of_their_parent(gaussians: Gaussians, photos: Photos) -> None:
     """Mean and covariance of the pair are those of the parent: exactly, the axes across included."""
     state = start_state(gaussians)
     n = len(gaussians)
     grown, _ = grow(state, error_masses(state, photos), 2 * n)
     first, second = grown.x[:n], grown.x[n:]
     np.testing.assert_allclose((first[:, :3] + second[:, :3]) / 2, state.x[:, :3], atol=1e-6)
-    own = covars_of(first)
-    np.testing.assert_array_equal(covars_of(second), own)
+    own = covariances_of(first)
+    np.testing.assert_array_equal(covariances_of(second), own)
     apart = (second - first)[:, :3].astype(np.float64) / 2
     pair = own + apart[:, :, None] * apart[:, None]
-    expected = covars_of(state.x)
+    expected = covariances_of(state.x)
     assert (np.abs(pair - expected).max((1, 2)) <= 1e-4 * np.abs(expected).max((1, 2))).all()
     longest = state.x[:, SIZE:QUAT].max(1)
     np.testing.assert_allclose(np.linalg.norm(apart, axis=1), 0.7 * np.exp(longest), rtol=1e-4)
@@ -139,7 +139,7 @@ def test_halves_have_their_parents_moments(gaussians: Gaussians, photos: Photos)
     np.testing.assert_array_equal(first[:, QUAT:LOGIT], state.x[:, QUAT:LOGIT])
 
 
-def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: Scene, photos: Photos) -> None:
+def test_two_halves_cover_what_their_parent_covered(gaussians: Gaussians, scene: Scene, photos: Photos) -> None:
     """Each is clearer than the parent; both together cover a little more, so as to close gaps."""
     state = start_state(gaussians)
     n = len(gaussians)
@@ -254,9 +254,9 @@ def test_holdout_psnr_sets_exposure_aside(photos: Photos) -> None:
     factors /= elementary.exp(elementary.log(factors).mean())
     images = [0.5 * photo / factor for photo, factor in zip(photos.images, factors, strict=True)]
     halved = replace(photos, images=0.5 * photos.images)
-    assert holdout_psnr(images, halved, weights, 1.15) > 60
-    assert holdout_psnr(images, halved, weights, np.inf) < 40
-    assert holdout_psnr(images, photos, weights, 1.15) < 15
+    assert holdout_psnr(images, halved, weights, 1.15) > 60  # dB: equal but for rounding
+    assert holdout_psnr(images, halved, weights, np.inf) < 40  # dB: the exposures of 0.8 and 1.25 count
+    assert holdout_psnr(images, photos, weights, 1.15) < 15  # dB: all views are half as bright
 
 
 # what has faded

@@ -31,13 +31,13 @@ def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Pic
     images = [cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC) for image in scene.images]
     stored = [np.rint(255 * image.clip(0, 1)).astype(np.uint8) for image in images]
 
-    def one(photo: int) -> np.ndarray:
+    def read_stored(photo: int) -> np.ndarray:
         if read is not None:
             read.append(photo)
         return stored[photo]
 
     shape = np.array([[width / scene.cameras.width], [height / scene.cameras.height], [1.0]])
-    large = LargePhotos(scene.cameras.Ks * shape, width, height, tuple(range(len(scene))), one)
+    large = LargePhotos(scene.cameras.Ks * shape, width, height, tuple(range(len(scene))), read_stored)
     return PicturedScene.with_pictures(replace(scene, large_photos=large), scene.images, scene.masks)
 
 

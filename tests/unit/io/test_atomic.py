@@ -68,11 +68,14 @@ def test_missing_folders_stay_only_below_a_finished_output(tmp_path: Path) -> No
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
 
 
-def test_outputs_below_a_file_or_at_a_folder_are_refused(tmp_path: Path) -> None:
+def test_outputs_below_a_file_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for place, named in (("file/out.txt", "out.txt"), ("file/deeper/out.txt", "deeper")):
         with refuses(SceneError, named, *NO_FOLDER), atomic_output(tmp_path / place):
             pass
+
+
+def test_an_output_in_the_place_of_a_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="found a folder"), atomic_output(tmp_path, overwrite=True):
         pass
 
@@ -83,23 +86,24 @@ def temporary_file_of(pid: int, path: Path) -> Path:
     return ours.with_name(ours.name.replace(f"-{os.getpid()}-", f"-{pid}-"))
 
 
-def dead_process() -> int:
+def pid_of_ended_process() -> int:
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return process.pid
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no call asks for a process there")
-def test_temporary_files_are_removed_of_dead_processes_alone(tmp_path: Path) -> None:
+def test_only_temporary_files_of_dead_processes_are_removed(tmp_path: Path) -> None:
     dead = [
-        temporary_file_of(dead_process(), tmp_path / name) for name in ("out.ply", "other name.tar.gz", "no suffix")
+        temporary_file_of(pid_of_ended_process(), tmp_path / name)
+        for name in ("out.ply", "other name.tar.gz", "no suffix")
     ]
     kept = [
         temporary_file_of(os.getpid(), tmp_path / "out.ply"),
         *(temporary_file_of(pid, tmp_path / "out.ply") for pid in (os.getppid(), 1)),
         tmp_path / ".out-00112233.ply",
     ]
-    elsewhere = [temporary_file_of(dead_process(), tmp_path / name) for name in ("out.ply", "old.ply")]
+    elsewhere = [temporary_file_of(pid_of_ended_process(), tmp_path / name) for name in ("out.ply", "old.ply")]
     recent, old = [path.with_name(path.name.replace(atomic._machine_hash(), "00000000")) for path in elsewhere]
     for path in (*dead, *kept, recent, old):
         path.touch()
@@ -157,7 +161,7 @@ def write_three(folder: Path, *, overwrite: bool = True) -> None:
             add(folder / name).write_text("new")
 
 
-def contents(folder: Path) -> list[str | None]:
+def texts_of_three(folder: Path) -> list[str | None]:
     """Return the texts of the three files, after a look that nothing else is there."""
     names = ["a.txt", "b.txt", "c.txt"]
     assert {path.name for path in folder.iterdir()} <= set(names)
@@ -173,7 +177,7 @@ def test_a_rename_that_fails_leaves_each_file_old_or_new(
     fail_at(monkeypatch, call, OSError(errno.EIO, "Input/output error"))
     with refuses(SceneError, "a.txt", "Input/output error"):
         write_three(tmp_path)
-    assert contents(tmp_path) == ["new"] * call + ["old", "old", None][call:]
+    assert texts_of_three(tmp_path) == ["new"] * call + ["old", "old", None][call:]
 
 
 @pytest.mark.parametrize("linked", [True, False], ids=["links", "no links"])
@@ -187,7 +191,7 @@ def test_a_name_that_appears_meanwhile_is_not_replaced(
         for name in ("a.txt", "b.txt"):
             add(tmp_path / name).write_text("new")
         (tmp_path / "b.txt").write_text("another's")
-    assert contents(tmp_path) == [None, "another's", None]
+    assert texts_of_three(tmp_path) == [None, "another's", None]
 
 
 def test_an_output_inside_an_output_is_the_same_file(tmp_path: Path) -> None:

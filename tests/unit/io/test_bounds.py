@@ -104,5 +104,8 @@ def test_the_content_hash_is_of_names_and_bytes(tmp_path: Path) -> None:
     renamed = content_hash([folder])
     (folder / "a.png").write_bytes(b"3")
     assert len({before, renamed, content_hash([folder])}) == 3
+
+
+def test_the_content_hash_of_a_missing_file_is_refused(tmp_path: Path) -> None:
     with refuses(SceneError, "nothing", "No such file"):
         content_hash([tmp_path / "nothing"])

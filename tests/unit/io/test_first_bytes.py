@@ -48,7 +48,7 @@ def test_other_content_in_the_place_of_a_photo_is_named(content: bytes, found: s
         ("a.ppm", b"P3\n1 1\n255\n0 0 0\n"),
     ],
 )  # fmt: skip
-def test_right_files_are_let_through(name: str, content: bytes, tmp_path: Path) -> None:
+def test_files_of_the_right_content_are_accepted(name: str, content: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     assert check_file(tmp_path / name) == len(content)
 

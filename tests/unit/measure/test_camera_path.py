@@ -98,7 +98,7 @@ def test_a_spline_of_one_camera_is_refused(walk: Cameras) -> None:
         spline(walk[[2, 2, 2]], DEPTH, 50)
 
 
-def test_a_spline_of_two_cameras_is_straight_in_all_its_values(walk: Cameras) -> None:
+def test_a_spline_of_two_cameras_runs_straight_between_them(walk: Cameras) -> None:
     two = walk[[0, 2]]
     two.Ks[1, 0, 0] = 80
     path = spline(two, DEPTH, 5)

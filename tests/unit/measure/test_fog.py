@@ -114,13 +114,15 @@ def test_far_pixels_of_a_narrow_picture_are_no_nearer_than_near_ones() -> None:
 
 
 def test_a_veil_is_what_stands_before_seven_tenths_of_the_depth() -> None:
-    """Behind which depth it begins, and that cameras count alike, whatever they see of the input."""
     for depth, veil in ((0.69, 1), (0.71, 0)):
         result = curtain(0.95, (0, 0, depth * (DEPTH + 1) - 1), size=50)
         assert fog_of(wall(), result)["back"].veil == pytest.approx(veil / 2, abs=0.01)
         assert fog_of(wall(), result)["back"].veil_worst == pytest.approx(veil, abs=0.01)
     near = curtain(0.95, (0, 0, -0.51), size=50)  # nearer to one camera than a quarter of the depth
     assert fog_of(wall(), Gaussians.concat([wall(), near]))["back"].veil == pytest.approx(0.5, abs=0.01)
+
+
+def test_cameras_count_alike_in_a_veil_whatever_they_see() -> None:
     seen, half, ones = np.full((4, 4), 0.95), np.repeat([[2.0, 0.5]], 4, 0).repeat(2, 1), np.ones((4, 4))
     few = np.zeros((4, 4))
     few[0, 3] = 0.95

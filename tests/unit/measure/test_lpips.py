@@ -239,6 +239,9 @@ def test_a_package_without_weights_of_a_network_counts_as_absent(package: Path) 
     assert lpips_available("vgg")
     assert not lpips_available("alex")
     assert lpips(FIRST, SECOND) == lpips(FIRST, SECOND, "vgg")
+
+
+def test_weights_of_an_unknown_network_are_refused() -> None:
     with refuses(ValueError, "net", "VGG"):
         lpips_available("VGG")
 

@@ -79,5 +79,5 @@ def test_visible_pixels_are_the_same_far_from_the_origin() -> None:
     here = scenes.make_scene(scenes.room(), scenes.arc(3, 24, 18, span=2.0))
     there = scenes.move(here, np.eye(3), 1.0, shift)
     masks = [visible_pixels(context_points(subset(s, [0]), 0.01), s.cameras, 0.01) for s in (here, there)]
-    assert (masks[0] == masks[1]).mean() > 0.999
+    assert (masks[0] == masks[1]).mean() > 0.999  # rounding may move a sample to the next pixel
     assert 0.2 < masks[0][2].mean() < 0.98

@@ -44,7 +44,7 @@ def test_all_views_of_a_layout_are_read(tmp_path: Path, name: str) -> None:
     assert (find_cameras(tmp_path) or find_other_cameras(tmp_path)) == path
 
 
-def test_a_new_layout_needs_no_function(tmp_path: Path) -> None:
+def test_a_new_layout_is_declared_without_a_function(tmp_path: Path) -> None:
     """It has quaternions, numbers that all views share, and alternative keys."""
     path = tmp_path / "new.json"
     views = [

@@ -118,7 +118,7 @@ def test_axis_y_of_other_writers_points_up(scene: Scene, tmp_path: Path) -> None
     assert_same_gaussians(read_gaussians(tmp_path / "a.glb").gaussians, expected)
 
 
-def test_nodes_move_their_gaussians(scene: Scene, tmp_path: Path) -> None:
+def test_nodes_of_a_glb_move_their_gaussians(scene: Scene, tmp_path: Path) -> None:
     """Two copies, of which one is moved by its node's parts, and one by the matrices of two nodes."""
     gaussians = drawn(scene, 0)
     turn = np.array([0.5, 0.1, -0.7, 0.2])
@@ -172,7 +172,7 @@ def test_a_glb_is_known_to_hold_gaussians_by_its_extension(scene: Scene, tmp_pat
 
 
 @pytest.mark.parametrize(("num_more", "is_doubtful"), [(3, False), (12, True)])
-def test_bytes_beyond_the_stated_length_of_a_glb_are_a_doubt(
+def test_more_than_padding_beyond_the_stated_length_of_a_glb_is_a_doubt(
     scene: Scene, tmp_path: Path, num_more: int, is_doubtful: bool
 ) -> None:
     write_gaussians(tmp_path / "a.glb", scene.gaussians)
@@ -186,7 +186,7 @@ def test_a_viewers_first_picture_is_that_of_the_middle_view(scene: Scene, tmp_pa
     """A camera node projects points as the view does, whose pixels are those of a picture of glTF's camera."""
     path = tmp_path / "a.glb"
     write_scene(path, scene)
-    document, _ = _read_document(path)
+    document, _ = read_document(path)
     nodes = [node for node in document["nodes"] if "camera" in node]
     assert [node["name"] for node in nodes] == [scene.names[view] for view in order_views(scene.cameras)]
     view, lens = order_views(scene.cameras)[0], document["cameras"][nodes[0]["camera"]]["perspective"]
@@ -201,7 +201,7 @@ def test_a_viewers_first_picture_is_that_of_the_middle_view(scene: Scene, tmp_pa
     np.testing.assert_allclose((1 + ndc * (1, -1)) / 2 * (width, height), pixels, atol=1e-2)
 
 
-def _read_document(path: Path) -> tuple[Document, int]:
+def read_document(path: Path) -> tuple[Document, int]:
     content = path.read_bytes()
     (length,) = struct.unpack_from("<I", content, 12)
     return json.loads(content[20 : 20 + length]), length
@@ -214,7 +214,7 @@ def test_viewers_of_a_scene_without_cameras_start_at_a_placed_one(ending: str, s
     write_scene(path, replace(scene, cameras=scene.cameras[:0], names=(), pixels=None, images=None))
     assert not path.with_name("a.cameras.json").exists()
     if ending == ".glb":
-        (node,) = (node for node in _read_document(path)[0]["nodes"] if "camera" in node)
+        (node,) = (node for node in read_document(path)[0]["nodes"] if "camera" in node)
         pose = np.reshape(node["matrix"], (4, 4)).T
         position, forward = pose[:3, 3] * (-1, -1, 1), -pose[:3, 2] * (-1, -1, 1)
     else:

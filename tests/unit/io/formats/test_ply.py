@@ -89,7 +89,9 @@ def test_a_file_that_was_read_takes_no_memory(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "is_doubtful"), [("none", False), ("newline", False), ("padding", False), ("row", True), ("file", True)]
 )
-def test_bytes_after_the_last_row_are_a_doubt(tmp_path: Path, kind: str, more: str, is_doubtful: bool) -> None:
+def test_more_than_padding_after_the_last_row_is_a_doubt(
+    tmp_path: Path, kind: str, more: str, is_doubtful: bool
+) -> None:
     """Elements after the vertices are none: the packed harmonics follow them."""
     path = save(tmp_path / "a.ply", columns(300, num_rest=45), text=kind == "text")
     if kind == "packed":

@@ -153,7 +153,7 @@ def test_gzip_streams_are_the_same_at_any_time_on_any_system(how: tuple[int, ...
     assert data[:10] == gzip_bytes([b""])[:10]
 
 
-def test_a_wrong_version_leaks_no_warning(tmp_path: Path) -> None:
+def test_a_spz_of_a_wrong_version_raises_no_warning(tmp_path: Path) -> None:
     data = gzip.decompress(spz_bytes(some_gaussians(0, 2000)))
     (tmp_path / "a.spz").write_bytes(gzip.compress(data[:4] + struct.pack("<I", 1) + data[8:]))
     assert 0 < read_gaussians(tmp_path / "a.spz").info.num_nonfinite < 2000  # warnings are errors in tests
@@ -180,7 +180,7 @@ def test_damage_that_a_checksum_shows_is_refused(tmp_path: Path, monkeypatch: py
 
 @pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
 @pytest.mark.parametrize(("num_more", "is_doubtful"), [(15, False), (16, True)])
-def test_bytes_after_the_streams_are_a_doubt(
+def test_more_than_padding_after_the_streams_is_a_doubt(
     tmp_path: Path, write: Callable[[Gaussians], bytes], num_more: int, is_doubtful: bool
 ) -> None:
     (tmp_path / "a.spz").write_bytes(write(some_gaussians(0)) + bytes(num_more))

@@ -87,7 +87,7 @@ def test_splat_transform_writes_each_level(scene: Scene, tmp_path: Path, capsys:
     assert {path.name for path in index.parent.iterdir()} == {index.name, *used}
 
 
-def content(folder: Path) -> dict[str, bytes]:
+def files_in(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -98,7 +98,7 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_failures_leave_existing_files_alone_in_the_folder(tmp_path: Path, program: None) -> None:
+def test_failures_leave_only_existing_files(tmp_path: Path, program: None) -> None:
     index = tmp_path / "scene" / "lod-meta.json"
     bad = corners()
     bad.opacities[1] = np.nan
@@ -107,12 +107,12 @@ def test_failures_leave_existing_files_alone_in_the_folder(tmp_path: Path, progr
             write_levels(index, levels)
     assert not index.parent.exists()
     write_levels(index, [corners()])
-    before = content(tmp_path)
+    before = files_in(tmp_path)
     with refuses(SceneError, "lod-meta.json", "exists"):
         write_levels(index, [corners()])
     with refuses(ValueError, "", "finite", 1):
         write_levels(index, [bad], overwrite=True)
-    assert content(tmp_path) == before
+    assert files_in(tmp_path) == before
     with refuses(SceneError, "scene", *NO_FOLDER):
         write_levels(index / "scene" / "lod-meta.json", [corners()])
     with refuses(UsageError, "levels.json", "lod-meta.json"):
@@ -130,7 +130,7 @@ def test_a_streamed_set_is_replaced_as_a_whole(tmp_path: Path, program: None) ->
         (index.parent / name).write_bytes(data)
     for path in (index, alone):
         write_levels(path, [corners(), corners()[:1]], overwrite=True)
-    assert content(index.parent) == {**content(alone.parent), **mine}
+    assert files_in(index.parent) == {**files_in(alone.parent), **mine}
 
 
 @pytest.mark.parametrize("call", [0, 8])

@@ -110,7 +110,7 @@ def test_rotations_are_the_same_up_to_a_sign(ending: str, tmp_path: Path) -> Non
     assert float(np.abs(actual.means - means).max()) < 0.5
 
 
-def test_harmonics_without_room_are_noted() -> None:
+def test_harmonics_that_a_format_cannot_store_are_noted() -> None:
     assert limit_notes("a.ply", 3, 1) == []
     assert noted(limit_notes("a.ply", 4, 1), "above degree 3", ".ply")
     assert limit_notes("a.spz", 3, 1) == []
@@ -141,7 +141,7 @@ def test_the_file_name_chooses_the_format() -> None:
 
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
-def test_failures_leave_existing_files_alone_in_the_folder(ending: str, tmp_path: Path) -> None:
+def test_failures_leave_only_existing_files(ending: str, tmp_path: Path) -> None:
     bad, path = replace(corners(), opacities=np.array([0.0, float("nan"), 0.5], np.float32)), tmp_path / f"a{ending}"
     with refuses(ValueError, "", "finite", 1):
         write_gaussians(path, bad)
@@ -159,6 +159,9 @@ def test_failures_leave_existing_files_alone_in_the_folder(ending: str, tmp_path
 def test_comments_are_written_into_the_header(tmp_path: Path) -> None:
     write_gaussians(tmp_path / "a.ply", corners(), comments=["SplatRenderMode: mip"])
     assert "SplatRenderMode: mip" in read_ply(tmp_path / "a.ply").info.comments
+
+
+def test_a_comment_of_two_lines_is_refused(tmp_path: Path) -> None:
     with refuses(ValueError, "comments", "ASCII"):
         write_gaussians(tmp_path / "b.spz", corners(), comments=["two\nlines"])
 
@@ -221,8 +224,11 @@ def test_harmonics_are_dropped_on_demand(tmp_path: Path, tiny: Tiny) -> None:
     assert np.array_equal(read_ply(tmp_path / "a.ply").gaussians.shN, gaussians.shN[:, :3])
     write_ply(tmp_path / "b.ply", gaussians, sh_degree=0)
     assert read_ply(tmp_path / "b.ply").info.layout == "17-column export"
+
+
+def test_a_degree_above_that_of_the_gaussians_is_refused(tmp_path: Path, tiny: Tiny) -> None:
     with refuses(ValueError, "sh_degree", "0 to 3", 4):
-        write_ply(tmp_path / "c.ply", gaussians, sh_degree=4)
+        write_ply(tmp_path / "c.ply", with_harmonics(tiny.gaussians, 3), sh_degree=4)
 
 
 def test_extremes_are_stored_as_finite_numbers(tmp_path: Path, tiny: Tiny) -> None:
