@@ -21,21 +21,21 @@ from gsmerge.settings.compact import CompactOptions
 CALL = CompactCall(CompactOptions(), "auto", NO_HINTS)
 
 
-def jobs(*counts: int) -> list[Job]:
+def make_jobs(*counts: int) -> list[Job]:
     return [Job(f"{i}", (f"{i}.ply",), CALL, count) for i, count in enumerate(counts)]
 
 
-def machine(monkeypatch: pytest.MonkeyPatch, processors: int, memory: int | None) -> None:
+def set_machine(monkeypatch: pytest.MonkeyPatch, processors: int, memory: int | None) -> None:
     monkeypatch.setattr(run, "available_threads", lambda: processors)
     monkeypatch.setattr(run, "free_memory", lambda: memory)
 
 
 def test_processors_are_divided_among_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine(monkeypatch, 8, 10**12)
+    set_machine(monkeypatch, 8, 10**12)
 
     def spread(count: int, **message: Any) -> tuple[int, int]:
         settings = CompactOptions().with_settings({"threads": message.pop("threads", None)})
-        concurrency = choose_concurrency(jobs(*[1000] * count), BatchOptions(settings, **message))
+        concurrency = choose_concurrency(make_jobs(*[1000] * count), BatchOptions(settings, **message))
         return concurrency.jobs, concurrency.threads
 
     assert spread(100) == (8, 1)
@@ -50,17 +50,17 @@ def test_processors_are_divided_among_scenes(monkeypatch: pytest.MonkeyPatch) ->
     assert spread(100, engine="ray", jobs=5, threads=2) == (5, 2)
 
 
-def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_limits_the_number_of_concurrent_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     large, small = 10_000_000, 10_000
-    scenes, need = jobs(small, large, small, large, small), memory_bytes(large)
+    scenes, need = make_jobs(small, large, small, large, small), memory_bytes(large)
 
     def count(share: float | None, **message: Any) -> int:
-        machine(monkeypatch, 4, None if share is None else int(share * need / run.FREE_MEMORY_SHARE) + 1)
+        set_machine(monkeypatch, 4, None if share is None else int(share * need / run.FREE_MEMORY_SHARE) + 1)
         return choose_concurrency(scenes, BatchOptions(**message)).jobs
 
     assert [count(3), count(1), count(None)] == [4, 4, 4]  # those that are larger than most wait for each other
     assert count(1, jobs=3) == 3  # who asks for it gets it
-    scenes = jobs(small, large, large)
+    scenes = make_jobs(small, large, large)
     assert [count(4), count(2), count(1.9), count(0.5), count(None)] == [3, 2, 1, 1, 3]
     assert choose_concurrency(scenes, BatchOptions(jobs=2)).memory == math.inf
 
@@ -87,7 +87,7 @@ class Gauge(InlinePool):
 
 
 @pytest.mark.parametrize(("memory", "most"), [(math.inf, 15), (12, 12), (10, 9), (8, 9), (0, 9)])
-def test_calls_fit_into_the_memory_together_and_a_larger_one_runs_alone(memory: float, most: int) -> None:
+def test_concurrent_calls_fit_into_the_memory_unless_one_is_alone(memory: float, most: int) -> None:
     pool, sizes = Gauge(memory), [2, 3, 9, 2, 4, 1]
     ended = dict(pool.run(int, (Call(key, (), size) for key, size in enumerate(sizes))))
     assert ended == dict(enumerate(sizes))
@@ -95,8 +95,8 @@ def test_calls_fit_into_the_memory_together_and_a_larger_one_runs_alone(memory: 
     assert pool.most == most
 
 
-def test_scenes_that_others_wait_for_come_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    machine(monkeypatch, 4, 4 * memory_bytes(10))
+def test_a_scene_that_must_run_alone_comes_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    set_machine(monkeypatch, 4, 4 * memory_bytes(10))
     monkeypatch.setattr(run, "ProcessPool", InlinePool)
-    done = run.run_batch(jobs(10, 10**7, 10, 10), tmp_path, BatchOptions())
+    done = run.run_batch(make_jobs(10, 10**7, 10, 10), tmp_path, BatchOptions())
     assert [line["scene"] for line in done] == ["0", "2", "3", "1"]

@@ -1,4 +1,4 @@
-"""Settings of a batch, and its jobs: each scene once, and no two written to one file."""
+"""Each scene of a batch is one job, and no two jobs write to one file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("inside")
         ({"address": "auto"}, ("address", "ray", "local")),
     ],
 )  # fmt: skip
-def test_settings_out_of_range_are_refused(wrong: dict[str, Any], named: tuple[object, ...]) -> None:
+def test_batch_settings_out_of_range_are_refused(wrong: dict[str, Any], named: tuple[object, ...]) -> None:
     with refuses(ValueError, *named):
         BatchOptions(**wrong)
 
@@ -37,28 +37,30 @@ def test_settings_out_of_range_are_refused(wrong: dict[str, Any], named: tuple[o
     "template",
     ["{name}.ply", "{stem.real}.ply", "{0}.ply", "{}.ply", "{stem", "{stem}.txt", "/x/{stem}.ply", "../{stem}.ply"],
 )
-def test_templates_that_make_no_sense_are_refused(template: str) -> None:
+def test_impossible_output_templates_are_refused(template: str) -> None:
     with refuses(ValueError, "output"):
         BatchOptions(output=template)
 
 
-def outputs(*arguments: str, options: BatchOptions | None = None, results: Collection[str] = ()) -> dict[str, str]:
+def scenes_by_output(
+    *arguments: str, options: BatchOptions | None = None, results: Collection[str] = ()
+) -> dict[str, str]:
     jobs = find_jobs(arguments, OUT, options or BatchOptions(), results)
     return {job.output: Path(job.scene).as_posix() for job in jobs}
 
 
-def clashes(*arguments: str, options: BatchOptions | None = None) -> dict[str, bool]:
+def clashes_by_scene(*arguments: str, options: BatchOptions | None = None) -> dict[str, bool]:
     return {Path(job.scene).as_posix(): bool(job.clash) for job in find_jobs(arguments, OUT, options or BatchOptions())}
 
 
 def test_results_of_former_runs_are_no_scenes() -> None:
     touch("a.ply", "b.ply")
-    assert outputs("*.ply", results={os.path.realpath("b.ply")}) == {"a.ply": "a.ply"}
+    assert scenes_by_output("*.ply", results={os.path.realpath("b.ply")}) == {"a.ply": "a.ply"}
 
 
-def test_each_scene_comes_once() -> None:
+def test_a_scene_given_several_times_is_one_job() -> None:
     touch("s/a/scene.ply", "s/b.ply")
-    assert outputs("s", "s/a/scene.ply", "s/*", "s/b.ply") == {"b.ply": "s/b.ply", "a.ply": "s/a"}
+    assert scenes_by_output("s", "s/a/scene.ply", "s/*", "s/b.ply") == {"b.ply": "s/b.ply", "a.ply": "s/a"}
 
 
 @pytest.mark.parametrize("given", [["all/b", "all/a"], ["all/link.ply", "all/a"], ["all/*/*.ply"], ["linked/all"]])
@@ -67,39 +69,39 @@ def test_a_scene_is_named_by_the_path_with_the_fewest_links(given: list[str]) ->
     for path, target in (("all/a", "room"), ("all/b", "room"), ("all/link.ply", "room/scene.ply"), ("linked", ".")):
         Path(path).symlink_to(target)
     expected = {"all/*/*.ply": "all/room/scene.ply", "linked/all": "linked/all/room"}.get(given[0], given[0])
-    assert list(outputs(*given, options=BatchOptions(output="{parent}/{stem}.ply")).values()) == [expected]
-    assert [*outputs("all/b", "all/link.ply", "linked/all", "all/room").values()] == ["all/room"]
+    assert list(scenes_by_output(*given, options=BatchOptions(output="{parent}/{stem}.ply")).values()) == [expected]
+    assert [*scenes_by_output("all/b", "all/link.ply", "linked/all", "all/room").values()] == ["all/room"]
 
 
-def test_two_scenes_are_not_written_to_one_file() -> None:
+def test_scenes_with_one_output_file_clash() -> None:
     touch("s/a/scene.ply", "t/a/scene.ply")
     touch("t/b/scene.ply")
-    assert clashes("t", "s") == {"t/a": True, "t/b": False, "s/a": True}
+    assert clashes_by_scene("t", "s") == {"t/a": True, "t/b": False, "s/a": True}
     assert names(find_jobs(["s", "t"], OUT, BatchOptions())[0].clash, "out/a.ply", "s/a and t/a", "--name")
-    apart = outputs("s", "t/a", options=BatchOptions(output="{parent}/{stem}.ply"))
+    apart = scenes_by_output("s", "t/a", options=BatchOptions(output="{parent}/{stem}.ply"))
     assert apart == {"s/a.ply": "s/a", "t/a.ply": "t/a"}
 
 
-def test_levels_need_files_of_their_own_too() -> None:
+def test_files_of_levels_clash_with_other_results() -> None:
     touch("a.ply", "a.level1.ply")
     levels = BatchOptions(CompactOptions().with_settings({"levels": 2}))
-    assert len(outputs("*.ply")) == 2
-    assert clashes("*.ply", options=levels) == {"a.ply": True, "a.level1.ply": True}
+    assert len(scenes_by_output("*.ply")) == 2
+    assert clashes_by_scene("*.ply", options=levels) == {"a.ply": True, "a.level1.ply": True}
 
 
-def test_a_result_does_not_replace_a_scene() -> None:
+def test_an_output_in_the_place_of_a_scene_is_a_clash() -> None:
     touch("out/a.ply", "b/c.ply")
-    assert clashes("out/a.ply", "b") == {"out/a.ply": True, "b/c.ply": False}
+    assert clashes_by_scene("out/a.ply", "b") == {"out/a.ply": True, "b/c.ply": False}
     assert names(find_jobs(["out/a.ply"], OUT, BatchOptions())[0].clash, "out/a.ply", "--output")
 
 
-def test_counts_come_from_the_header() -> None:
+def test_counts_of_jobs_come_from_the_header_of_the_scene() -> None:
     touch("a.ply")
     Path("b.ply").write_text("no header")
     assert [job.num_gaussians for job in find_jobs(["a.ply", "b.ply"], OUT, BatchOptions())] == [7, 0]
 
 
-def test_names_are_filled_in(tmp_path: Path) -> None:
+def test_placeholders_of_the_output_name_are_filled_in(tmp_path: Path) -> None:
     options = BatchOptions(CompactOptions().with_settings({"k": 2}))
 
     def name(template: str, scene: str) -> str:
@@ -116,7 +118,7 @@ def test_names_are_filled_in(tmp_path: Path) -> None:
         name("{stem:d}.ply", "a.ply")
 
 
-def test_cameras_and_photos_of_each_scene_are_filled_in() -> None:
+def test_placeholders_of_cameras_and_photos_are_filled_in() -> None:
     touch("s/a/scene.ply", "s/b.ply", "photos/0.png")
     options = BatchOptions(cameras="{parent}/{stem}.json", images="photos", masks="{parent}/masks", protect="none")
     jobs = find_jobs(["s"], OUT, options)

@@ -19,13 +19,13 @@ SHA = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # of a
 FILES = [{"path": "a.ply", "sha256": SHA, "bytes": 3}]
 
 
-def done(output: str, key: str = "k") -> dict[str, Any]:
+def done_record(output: str, key: str = "k") -> dict[str, Any]:
     files = [{"path": output, "sha256": SHA, "bytes": 3}]
     return record(DONE, f"in/{output}", output, key=key, files=files, report={"worse": None}, unmet="too few")
 
 
-def test_results_are_known_by_what_they_were_made_of_and_what_they_are(tmp_path: Path) -> None:
-    append_line(tmp_path / RECORDS, done("a.ply"))
+def test_a_done_result_holds_for_its_key_while_its_file_is_unchanged(tmp_path: Path) -> None:
+    append_line(tmp_path / RECORDS, done_record("a.ply"))
     index = RecordIndex(tmp_path).read_on()
     known = index.results["a.ply"]
     assert known == DoneResult("k", FILES, "in/a.ply", unmet="too few")
@@ -38,11 +38,11 @@ def test_results_are_known_by_what_they_were_made_of_and_what_they_are(tmp_path:
     assert list(index.paths()) == [os.path.realpath(tmp_path / "a.ply")]
 
 
-def test_an_index_reads_on_and_past_what_is_damaged(tmp_path: Path) -> None:
+def test_the_index_of_records_reads_new_lines_past_damaged_ones(tmp_path: Path) -> None:
     path = tmp_path / RECORDS
     index = RecordIndex(tmp_path)
     index.read_on()
-    append_line(path, done("a.ply"))
+    append_line(path, done_record("a.ply"))
     append_line(path, record(FAILED, "in/b.ply", "b.ply", error="no"))
     index.read_on()
     assert list(index.results) == ["a.ply"]
@@ -50,8 +50,8 @@ def test_an_index_reads_on_and_past_what_is_damaged(tmp_path: Path) -> None:
         file.write(b"\x00\x00\n" + b'{"status":"done","output":"c.p')
     index.read_on()
     assert index.end == path.stat().st_size - 30
-    append_line(path, done("c.ply"))
-    append_line(path, done("a.ply", key="newer"))
+    append_line(path, done_record("c.ply"))
+    append_line(path, done_record("a.ply", key="newer"))
     append_line(path, {"status": "done", "output": "d.ply", "files": "none"})
     append_line(path, record(FAILED, "in/c.ply", "c.ply"))
     index.read_on()
@@ -66,8 +66,8 @@ WRONG: dict[str, Any] = {
 
 
 def foreign_lines() -> list[bytes]:
-    """Lines that are no records: every entry of one with every odd value, and without it."""
-    whole = done("a.ply")
+    """Return lines that are no records: every entry of one with every odd value, and without it."""
+    whole = done_record("a.ply")
     lines = [b"[" * 100_000, b'{"a":' * 100_000, b"9" * 10_000, b"[]", b"{}", b'{"status":"done"}']
     for key in ("status", "scene", "output", "files", "key", "report", "unmet"):
         lines += [json.dumps({**whole, key: value}).encode() for value in WRONG.values()]
@@ -79,10 +79,10 @@ def foreign_lines() -> list[bytes]:
     return lines
 
 
-def test_whatever_a_line_holds_the_records_can_be_read(tmp_path: Path) -> None:
+def test_a_record_after_any_foreign_line_is_read(tmp_path: Path) -> None:
     path, lines = tmp_path / RECORDS, foreign_lines()
     for line in lines:
-        path.write_bytes(line + b"\n" + json.dumps(done("b.ply")).encode() + b"\n")
+        path.write_bytes(line + b"\n" + json.dumps(done_record("b.ply")).encode() + b"\n")
         index = RecordIndex(tmp_path).read_on()
         assert "b.ply" in index.results, line[:200]
         assert os.path.realpath(tmp_path / "b.ply") in list(index.paths())
@@ -95,10 +95,13 @@ def test_a_pipe_in_place_of_a_result_is_not_waited_for(tmp_path: Path) -> None:
     assert not DoneResult("k", FILES, "in/a.ply").holds(tmp_path, "k")
 
 
-def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+def test_an_output_folder_below_a_file_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with refuses(SceneError, "out", *NO_FOLDER, "--output"):
         prepare_folder(tmp_path / "file" / "out")
+
+
+def test_an_output_folder_is_made_with_its_records(tmp_path: Path) -> None:
     prepare_folder(tmp_path / "new" / "out")
     assert (tmp_path / "new" / "out" / RECORDS).exists()
 

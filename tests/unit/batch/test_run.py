@@ -1,9 +1,10 @@
-"""One scene at a time: what is done, skipped, refused, locked, and what a kill at any moment leaves."""
+"""A scene of a batch is made, skipped or refused, and a kill at any moment leaves nothing half done."""
 
 from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from batches import QUICK, InlinePool, one_job, records, results, statuses
@@ -30,7 +32,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import atomic
 
 
-def test_a_lock_is_of_one_process_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_lock_of_a_result_is_held_once_and_leaves_no_file(tmp_path: Path) -> None:
     with lock_result(tmp_path, "a.ply", wait=False) as begun:
         assert begun is not None
         assert not begun.exists()
@@ -41,7 +43,7 @@ def test_a_lock_is_of_one_process_and_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_that_cannot_be_removed_is_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_file_that_cannot_be_removed_is_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on Windows, which removes no open file: the release does it there."""
 
     def refuse(path: Path, *_: Any, **__: Any) -> None:
@@ -69,14 +71,14 @@ while turns < 50:
 
 
 @pytest.mark.slow
-def test_processes_take_turns_though_each_removes_the_file(tmp_path: Path) -> None:
+def test_processes_that_remove_the_lock_file_take_turns(tmp_path: Path) -> None:
     """Two processes that import the package: locks of one process say nothing about those of others."""
     processes = [subprocess.Popen([sys.executable, "-c", TAKE_TURNS, str(tmp_path)]) for _ in range(2)]
     assert [process.wait() for process in processes] == [0] * 2
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
+def test_a_lock_file_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(SceneError, match="exists"), lock_result(tmp_path / "file", "a.ply", wait=False):
         pass
@@ -90,7 +92,7 @@ def run(scene: Path, out: Path, options: Any = QUICK) -> dict[str, Any]:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """Two views of 24 x 16."""
+    """Write a scene of two views of 24 x 16."""
     return write_scene(tmp_path / "room", num_views=2, width=24, height=16)
 
 
@@ -101,13 +103,13 @@ def out(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What the scene comes to."""
+    """Return the files of a run that nothing disturbs."""
     out = tmp_path_factory.mktemp("undisturbed") / "out"
     run(write_scene(out.with_name("room"), num_views=2, width=24, height=16), out)
     return results(out)
 
 
-def test_what_is_done_is_skipped(scene: Path, out: Path) -> None:
+def test_a_finished_scene_is_skipped_by_the_next_run(scene: Path, out: Path) -> None:
     first = run(scene, out)
     assert (first["status"], first["error"]) == (DONE, None)
     assert first["report"]["options"]["effort"] == "draft"
@@ -119,7 +121,7 @@ def test_what_is_done_is_skipped(scene: Path, out: Path) -> None:
     assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
 
 
-def test_other_settings_are_refused_unless_they_may_overwrite(scene: Path, out: Path) -> None:
+def test_other_settings_are_refused_without_overwrite(scene: Path, out: Path) -> None:
     run(scene, out)
     seed = replace(QUICK, settings=QUICK.settings.with_settings({"seed": 1}))
     before = results(out)
@@ -133,7 +135,7 @@ def test_other_settings_are_refused_unless_they_may_overwrite(scene: Path, out: 
     )  # back to the first settings: the file is of the others
 
 
-def test_what_changed_is_made_again(scene: Path, out: Path) -> None:
+def test_a_result_is_made_again_where_its_file_or_a_photo_changed(scene: Path, out: Path) -> None:
     run(scene, out)
     (out / "room.ply").unlink()
     assert run(scene, out)["status"] == DONE
@@ -146,7 +148,7 @@ def test_what_changed_is_made_again(scene: Path, out: Path) -> None:
     assert list(results(out)) == ["room.ply"]
 
 
-def test_a_scene_that_moved_is_still_the_same_until_a_new_version(
+def test_a_moved_scene_is_skipped_until_the_version_changes(
     scene: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run(scene, out)
@@ -159,7 +161,7 @@ def test_a_scene_that_moved_is_still_the_same_until_a_new_version(
     assert run(moved, out)["status"] == DONE
 
 
-def test_a_checkpoint_counts_by_what_is_in_it(scene: Path, out: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_is_known_by_its_content(scene: Path, out: Path, tmp_path: Path) -> None:
     networks = written(tmp_path / "networks.safetensors", untrained())
     said = replace(QUICK, settings=QUICK.settings.with_settings({"checkpoint": str(networks)}))
     assert run(scene, out, said)["status"] == DONE
@@ -175,7 +177,7 @@ def test_a_checkpoint_counts_by_what_is_in_it(scene: Path, out: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("ending", [".sog", pytest.param(".spz", marks=pytest.mark.slow)])
-def test_results_in_other_formats(ending: str, scene: Path, out: Path) -> None:
+def test_results_in_other_formats_are_skipped_until_a_file_is_missing(ending: str, scene: Path, out: Path) -> None:
     said = replace(QUICK, settings=QUICK.settings.with_settings({"levels": 2}), output="{stem}" + ending)
     actual = run(scene, out, said)
     paths = [f"room{ending}", f"room.level1{ending}", "room.cameras.json"]
@@ -189,23 +191,19 @@ def test_results_in_other_formats(ending: str, scene: Path, out: Path) -> None:
     assert run(scene, out, said)["status"] == DONE
 
 
-def test_unexpected_errors_are_recorded(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: Any, **__: Any) -> None:
-        raise ZeroDivisionError("odd\nthing")
-
-    monkeypatch.setattr(calls, "compact_files", broken)
-    assert run(scene, out)["error"] == "ZeroDivisionError: odd thing"
-
-    def greedy(*_: Any, **__: Any) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(calls, "compact_files", greedy)
-    assert run(scene, out)["error"].startswith("out of memory")
-
-
-def test_a_failure_leaves_an_earlier_result_and_says_so(
-    scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("error", "recorded"),
+    [(ZeroDivisionError("odd\nthing"), "ZeroDivisionError: odd thing"), (MemoryError(), "out of memory.*")],
+    ids=["two lines", "no memory"],
+)
+def test_unexpected_errors_are_recorded_in_one_line(
+    error: Exception, recorded: str, scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(calls, "compact_files", Mock(side_effect=error))
+    assert re.fullmatch(recorded, run(scene, out)["error"])
+
+
+def test_a_failure_says_that_the_earlier_result_stays(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the run and in the plan, whatever the error; there is nothing to say before the first result."""
     ply = (scene / "scene.ply").read_bytes()
     (scene / "scene.ply").write_bytes(ply[:-9])
@@ -227,7 +225,7 @@ def test_a_failure_leaves_an_earlier_result_and_says_so(
     assert says(foreseen, "scene.ply", "Permission denied", "stays")
 
 
-def test_the_result_of_another_scene_is_kept(scene: Path, out: Path) -> None:
+def test_the_result_of_another_scene_is_not_overwritten(scene: Path, out: Path) -> None:
     """Also one whose name comes a night later, by itself or beside the first; each on its own."""
     other = Path(shutil.copytree(scene, scene.parent / "later" / "room"))
     (photo := next((other / "images").iterdir())).write_bytes(photo.read_bytes() + b"\0")
@@ -247,7 +245,7 @@ def test_the_result_of_another_scene_is_kept(scene: Path, out: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="folders cannot be locked there")
-def test_what_is_done_is_skipped_in_a_folder_that_cannot_be_written(
+def test_a_finished_scene_is_skipped_in_a_folder_that_cannot_be_written(
     scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run(scene, out)
@@ -258,7 +256,7 @@ def test_what_is_done_is_skipped_in_a_folder_that_cannot_be_written(
     assert run(scene, out)["status"] == SKIPPED
 
 
-def test_a_result_that_no_batch_wrote_is_not_replaced(scene: Path, out: Path) -> None:
+def test_a_file_that_no_batch_wrote_is_not_replaced(scene: Path, out: Path) -> None:
     out.mkdir()
     (out / "room.ply").write_bytes(b"mine")
     for _ in range(2):  # the first refusal is no claim
@@ -286,7 +284,7 @@ def test_cameras_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) ->
     assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
 
 
-def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None:
+def test_a_scene_that_another_run_works_on_is_left_to_that_run(scene: Path, out: Path) -> None:
     job, started = one_job(scene, out)
     with lock_result(out, "room.ply", wait=False) as begun:
         assert begun is not None
@@ -299,7 +297,7 @@ def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None
     assert not (out / "batch.jsonl").exists()
 
 
-def test_what_another_run_works_on_comes_last(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_that_another_run_works_on_comes_last(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
     @contextmanager
@@ -329,7 +327,7 @@ KILLS = {
 @pytest.mark.parametrize(
     "moment", [pytest.param(name, marks=[] if name == "before the record" else [pytest.mark.slow]) for name in KILLS]
 )
-def test_a_kill_at_any_moment_loses_nothing(
+def test_a_run_killed_at_any_moment_is_made_good_by_the_next(
     moment: str, scene: Path, out: Path, root: Path, undisturbed: dict[str, str]
 ) -> None:
     where, before = KILLS[moment]
@@ -363,7 +361,7 @@ run_job(*one_job(Path({str(scene)!r}), Path({str(out)!r})), wait=False)
     "name",
     ["gsmerge.batch.run.atomic_output", "gsmerge.batch.jobs.compact_files", "gsmerge.io.formats.write.write_gaussians"],
 )
-def test_a_full_disk_fails_the_scene_and_leaves_nothing(
+def test_a_full_disk_fails_the_scene_without_a_file_left(
     name: str, scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever is written first; an error of the system in the middle of writing names no file."""
@@ -380,7 +378,7 @@ def test_a_full_disk_fails_the_scene_and_leaves_nothing(
     assert run(scene, out)["status"] == DONE
 
 
-def test_where_nothing_can_be_recorded_nothing_is_forgotten(
+def test_a_result_that_could_not_be_recorded_is_made_again(
     scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, str]
 ) -> None:
     def refuse(path: Path, _: Any) -> None:
@@ -399,16 +397,10 @@ def test_where_nothing_can_be_recorded_nothing_is_forgotten(
 
 
 def left_by_a_dead_process() -> str:
-    """The name of a temporary file whose process has ended."""
+    """Return the name of a temporary file whose process has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return atomic.temporary_path(Path("room.ply")).name.replace(f"-{os.getpid()}-", f"-{process.pid}-")
-
-
-def status(call: Any) -> str:
-    actual = run_job(*call, wait=False)
-    assert actual is not None
-    return str(actual["status"])
 
 
 def leave_mark(out: Path) -> Path:
@@ -419,15 +411,15 @@ def leave_mark(out: Path) -> Path:
     return begun
 
 
-def kill(out: Path) -> Path:
+def leave_killed_run(out: Path) -> Path:
     """Leave all that such a process leaves; return the mark."""
     (out / left_by_a_dead_process()).touch()
     return leave_mark(out)
 
 
-def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path) -> None:
+def test_a_run_that_is_given_up_leaves_only_its_record(scene: Path, out: Path) -> None:
     job, started = one_job(scene, out)
-    kill(out)
+    leave_killed_run(out)
     (out / ".room-mine.ply").touch()
     actual = run_job(job, started, False, "killed")
     assert actual is not None
@@ -436,16 +428,16 @@ def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path
     assert list(results(out)) == [".room-mine.ply"]
 
 
-def test_who_is_stopped_leaves_nothing(scene: Path, out: Path) -> None:
+def test_a_stopped_run_leaves_no_file(scene: Path, out: Path) -> None:
     job, started = one_job(scene, out)
-    kill(out)
+    leave_killed_run(out)
     remove_unfinished(started, [job])
     assert list(out.iterdir()) == []
 
 
-def test_who_is_stopped_between_result_and_record_leaves_the_mark_that_says_whose_it_is(scene: Path, out: Path) -> None:
+def test_a_run_stopped_before_its_record_leaves_the_mark_of_its_result(scene: Path, out: Path) -> None:
     job, started = one_job(scene, out)
-    mark = kill(out)
+    mark = leave_killed_run(out)
     (out / "room.ply").write_bytes(b"ours")
     remove_unfinished(started, [job])
     assert sorted(out.iterdir()) == sorted([mark, out / "room.ply"])

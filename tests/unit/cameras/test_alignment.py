@@ -1,4 +1,4 @@
-"""Poses that are in another convention than their format has."""
+"""Poses in another convention than that of their format are recognised."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def rewrite_poses(folder: Path, tiny: Tiny, convention: tuple[str, str]) -> None
 
 
 def some_rows(tiny: Tiny) -> Tiny:
-    """Two thirds of the Gaussians in a random order, a prime number: no pixels."""
+    """Return two thirds of the Gaussians in a random order, a prime number: no pixels."""
     order = np.random.default_rng(0).permutation(len(tiny.gaussians))
     return replace(tiny, gaussians=tiny.gaussians[order[:2399]])
 
 
 @sweep("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
-def test_the_reading_that_fits_is_taken_and_said(tiny_folder: Path, tiny: Tiny, true: tuple[str, str]) -> None:
+def test_poses_get_the_reading_that_fits_with_a_note(tiny_folder: Path, tiny: Tiny, true: tuple[str, str]) -> None:
     rewrite_poses(tiny_folder, tiny, true)
     loaded = load_scene(tiny_folder, order="view-major")
     assert loaded.alignment.ok
@@ -48,7 +48,7 @@ def test_the_reading_that_fits_is_taken_and_said(tiny_folder: Path, tiny: Tiny, 
 
 
 @sweep("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
-def test_without_pixels_the_photos_tell(tmp_path: Path, true: tuple[str, str]) -> None:
+def test_photos_tell_the_reading_of_poses_without_pixels(tmp_path: Path, true: tuple[str, str]) -> None:
     folder = some_rows(SMOOTH).save(tmp_path / "scene")
     rewrite_poses(folder, SMOOTH, true)
     loaded = load_scene(folder)
@@ -57,13 +57,13 @@ def test_without_pixels_the_photos_tell(tmp_path: Path, true: tuple[str, str]) -
     assert noted(loaded.notes, *true)
 
 
-def test_the_usual_reading_is_not_doubted(tmp_path: Path) -> None:
+def test_poses_that_fit_as_usual_get_no_note(tmp_path: Path) -> None:
     loaded = load_scene(some_rows(SMOOTH).save(tmp_path))
     assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
     assert loaded.notes == ()
 
 
-def test_a_tie_is_said() -> None:
+def test_two_readings_that_fit_alike_are_noted_where_photos_fit_both() -> None:
     """Cameras in the middle of a ball of Gaussians: both axes see the same; where photos do, too, there is a doubt."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(4000, 3))
@@ -88,13 +88,13 @@ def test_a_tie_is_said() -> None:
         assert ("fit as well when read as" in (said or "")) is doubts
 
 
-def test_one_pose_without_turn_has_fewer_readings() -> None:
+def test_a_single_pose_without_rotation_has_one_other_reading() -> None:
     assert [p.description for p in other_conventions(np.eye(4)[None], W2C_OPENCV)] == [
         "world-to-camera matrices with OpenGL axes"
     ]
 
 
-def test_rows_without_finite_positions_are_not_looked_at(tmp_path: Path, tiny: Tiny) -> None:
+def test_rows_without_finite_positions_do_not_decide_the_reading(tmp_path: Path, tiny: Tiny) -> None:
     folder = tiny.save(tmp_path / "scene")
     rewrite_poses(folder, tiny, W2C_OPENCV)
     data = bytearray((folder / "scene.ply").read_bytes())
@@ -104,7 +104,7 @@ def test_rows_without_finite_positions_are_not_looked_at(tmp_path: Path, tiny: T
     assert load_scene(folder, order="view-major").scene.pixels.shown.sum() == 839
 
 
-def test_poses_that_fit_in_no_reading(tmp_path: Path) -> None:
+def test_poses_that_fit_in_no_reading_are_refused(tmp_path: Path) -> None:
     folder = some_rows(SMOOTH).save(tmp_path / "scene")
     away = SMOOTH.c2w.copy()
     away[:, :3, 3] += 50

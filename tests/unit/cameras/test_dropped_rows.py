@@ -1,4 +1,4 @@
-"""Files that lack pixels, with cameras and without."""
+"""The grid of files that lack pixels is found, with cameras or without."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from gsmerge.scene.read import load_scene
 
 @sweep("size", [(64, 48), (96, 72)])
 @sweep("dropped", ["far", 0.1, "faint", 0.2], often=2)
-def test_dropped_pixels(tmp_path: Path, dropped: float | str, size: tuple[int, int]) -> None:
+def test_pixels_of_a_file_with_dropped_rows_are_found(
+    tmp_path: Path, dropped: float | str, size: tuple[int, int]
+) -> None:
     """At random, or by a rule."""
     tiny = smooth_scene(*size)
     if dropped == "far":
@@ -32,7 +34,7 @@ def test_dropped_pixels(tmp_path: Path, dropped: float | str, size: tuple[int, i
     assert float(right.mean()) > 0.99
 
 
-def test_gaussians_anywhere_in_their_pixels() -> None:
+def test_a_grid_with_dropped_rows_is_found_wherever_gaussians_are_in_their_pixels() -> None:
     """Half a pixel to each side, with the jitter of the scene."""
     tiny, rng = smooth_scene(96, 72), np.random.default_rng(1)
     views = np.arange(len(tiny.gaussians)) // (96 * 72)

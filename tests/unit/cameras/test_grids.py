@@ -1,4 +1,4 @@
-"""Cameras, photos and Gaussian grid of different sizes."""
+"""Cameras, photos and grids of Gaussians may have different sizes."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def write_cameras(folder: Path, tiny: Tiny, K: np.ndarray, size: tuple[int, int]
     (folder / "transforms.json").write_text(json.dumps(data | {"w": size[0], "h": size[1]}))
 
 
-def original(tiny: Tiny, mapping: PhotoTransform, size: tuple[int, int]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Intrinsics and photos that the mapping makes the scene's of."""
+def before_mapping(tiny: Tiny, mapping: PhotoTransform, size: tuple[int, int]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return intrinsics and photos that the mapping makes the scene's of."""
     matrix = np.array([[mapping.scale_x, 0, -mapping.left], [0, mapping.scale_y, -mapping.top], [0, 0, 1]])
     photos = [
         cv2.warpAffine(image, np.linalg.inv(matrix)[:2], size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -45,19 +45,21 @@ def original(tiny: Tiny, mapping: PhotoTransform, size: tuple[int, int]) -> tupl
 
 @pytest.mark.slow
 @pytest.mark.parametrize("resize", [resize_to, resize_and_crop])
-def test_photos_larger_than_cameras_and_grid(resize: Callable[..., PhotoTransform], tmp_path: Path) -> None:
+def test_larger_photos_are_resized_or_cropped_to_the_grid(
+    resize: Callable[..., PhotoTransform], tmp_path: Path
+) -> None:
     """An npz at the grid's size, photos as they were taken: stretched or cropped, as their colours say."""
-    _, photos = original(SMOOTH, resize((110, 72), (48, 36)), (110, 72))
+    _, photos = before_mapping(SMOOTH, resize((110, 72), (48, 36)), (110, 72))
     SMOOTH.save(tmp_path, cameras=False, images=False)
     write_photos(tmp_path, SMOOTH, photos)
     write_npz(tmp_path / "results.npz", SMOOTH, image=None, depth=np.ones((3, 36, 48), np.float32))
     loaded = load_scene(tmp_path, images=tmp_path / "images", order="view-major")
-    assert np.abs(loaded.scene.images * 255 - SMOOTH.images).mean() < 8
+    assert np.abs(loaded.scene.images * 255 - SMOOTH.images).mean() < 8  # of 255: the photos were resized twice
     assert any(note.startswith("photos of 110 x ") for note in loaded.notes)
 
 
-def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
-    K, _ = original(SMOOTH, resize_and_crop((96, 54), (48, 36)), (96, 54))
+def test_cameras_of_uncropped_pictures_are_cropped_to_the_images(tmp_path: Path) -> None:
+    K, _ = before_mapping(SMOOTH, resize_and_crop((96, 54), (48, 36)), (96, 54))
     SMOOTH.save(tmp_path)
     write_cameras(tmp_path, SMOOTH, K, (96, 54))
     loaded = load_scene(tmp_path, order="view-major")
@@ -66,7 +68,7 @@ def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mapping", [resize_to((100, 60), (50, 24)), resize_and_crop((100, 60), (30, 30))])
-def test_mappings_move_a_point_and_its_photo_alike(mapping: PhotoTransform) -> None:
+def test_photo_transforms_move_a_camera_as_they_move_its_photo(mapping: PhotoTransform) -> None:
     photo = np.zeros((60, 100, 3), np.uint8)
     photo[24:36, 64:72] = 255
     (small,) = mapping.photos([photo])
@@ -78,7 +80,7 @@ def test_mappings_move_a_point_and_its_photo_alike(mapping: PhotoTransform) -> N
     assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)
 
 
-def test_sizes_that_are_twice_a_principal_point(tmp_path: Path, tiny: Tiny) -> None:
+def test_intrinsics_stay_where_the_size_is_twice_the_principal_point(tmp_path: Path, tiny: Tiny) -> None:
     """They may be a pixel off; intrinsics stay those of the photos."""
     folder = tiny.save(tmp_path / "scene")
     write_cameras(folder, tiny, tiny.K, (tiny.width + 1, tiny.height))
@@ -87,7 +89,7 @@ def test_sizes_that_are_twice_a_principal_point(tmp_path: Path, tiny: Tiny) -> N
     assert not noted(loaded.notes, "scaled")
 
 
-def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:
+def test_intrinsics_divided_by_the_size_are_scaled_back(tmp_path: Path, tiny: Tiny) -> None:
     small = np.diag([1 / tiny.width, 1 / tiny.height, 1]) @ tiny.K
     folder = tiny.save(tmp_path / "scene")
     for size in ((20, 14), (0, 0)):
@@ -102,13 +104,13 @@ def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:
 @pytest.mark.parametrize(
     ("K", "size"), [([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]], (8, 8)), ([[50.0, 0, 0.5], [0, 50, 0.5], [0, 0, 1]], (0, 0))]
 )
-def test_short_intrinsics_in_pixels_stay(K: list[list[float]], size: tuple[int, int]) -> None:
+def test_small_intrinsics_in_pixels_are_not_scaled(K: list[list[float]], size: tuple[int, int]) -> None:
     read = make_camera_file("x", "x", W2C_OPENCV, [StoredView("a", np.eye(4), np.array(K), size)])
     assert np.array_equal(read.Ks[0], np.array(K))
     assert (int(read.widths[0]), int(read.heights[0])) == size
 
 
-def test_previews_show_rows_in_any_order(tmp_path: Path) -> None:
+def test_rows_in_any_order_are_read_with_smaller_photos(tmp_path: Path) -> None:
     """Rows that are no pixels in their order need no photos of a grid's size."""
     order = np.random.default_rng(0).permutation(len(SMOOTH.gaussians))
     replace(SMOOTH, gaussians=SMOOTH.gaussians[order]).save(tmp_path, images=False)

@@ -31,31 +31,30 @@ def large() -> Tiny:
 
 
 def cameras_of(tiny: Tiny, viewmats: np.ndarray | None = None) -> Cameras:
-    w2c = tiny.w2c if viewmats is None else viewmats
-    return Cameras(w2c, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
+    return Cameras(tiny.w2c if viewmats is None else viewmats, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
 
 
-def off(tiny: Tiny, degrees: float, shift: float) -> np.ndarray:
-    """The tiny scene's viewmats, each turned and moved in its own frame."""
+def moved_viewmats(tiny: Tiny, degrees: float, shift: float) -> np.ndarray:
+    """Return the tiny scene's viewmats, each turned and moved in its own frame."""
     return np.asarray(motions.random_motions(3, degrees, shift) @ tiny.w2c)
 
 
-def test_a_known_motion_is_measured(large: Tiny) -> None:
-    wrong = cameras_of(large, off(large, 0.7, 0.02))
+def test_a_known_motion_of_cameras_is_measured(large: Tiny) -> None:
+    wrong = cameras_of(large, moved_viewmats(large, 0.7, 0.02))
     pairs = sample_pixels(large.gaussians, wrong, np.ones(len(large.gaussians), bool))
     moved = move_cameras(pairs, wrong, NAMES)
     assert 1.5 < moved.worst_px < max_correctable_px(200, 140)
     degrees, distances = pose_changes(large.w2c, moved.cameras.viewmats)
-    assert degrees.max() < 0.05
-    assert distances.max() < 0.004
+    assert degrees.max() < 0.05  # of the 0.7 that they were turned
+    assert distances.max() < 0.004  # of the 0.02 that they were moved
     assert [move["view"] for move in moved.moves] == list(NAMES)
     assert [move["degrees"] for move in moved.moves] == pytest.approx([0.7] * 3, abs=0.05)
     assert "degrees" in moved.note
 
 
-def test_cameras_that_fit_stay_bit_for_bit(large: Tiny) -> None:
+def test_cameras_that_fit_stay_bit_for_bit_beside_one_that_is_off(large: Tiny) -> None:
     viewmats = large.w2c
-    viewmats[1] = off(large, 0.7, 0.02)[1]
+    viewmats[1] = moved_viewmats(large, 0.7, 0.02)[1]
     pairs = sample_pixels(large.gaussians, cameras_of(large), np.ones(len(large.gaussians), bool))
     moved = move_cameras(pairs, cameras_of(large, viewmats), NAMES)
     np.testing.assert_array_equal(moved.cameras.viewmats[[0, 2]], viewmats[[0, 2]])
@@ -66,7 +65,9 @@ def test_cameras_that_fit_stay_bit_for_bit(large: Tiny) -> None:
     ("factor", "shift", "found"),
     [(1, 4, "-4.00 to cx"), (1, 8, "-8.00 to cx"), (1.05, 0, "fx by 0.9523"), (0.92, 0, "fx by 1.087")],
 )
-def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: float, found: str, large: Tiny) -> None:
+def test_wrong_intrinsics_are_refused_with_their_correction(
+    factor: float, shift: float, found: str, large: Tiny
+) -> None:
     pairs = sample_pixels(large.gaussians, cameras_of(large), np.ones(len(large.gaussians), bool))
     cameras = cameras_of(large)
     Ks = cameras.Ks * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
@@ -75,7 +76,7 @@ def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: flo
         move_cameras(pairs, replace(cameras, Ks=Ks), NAMES)
 
 
-def test_principal_points_in_the_middle_are_assumed(large: Tiny) -> None:
+def test_a_principal_point_assumed_in_the_middle_is_corrected(large: Tiny) -> None:
     """Formats such as INRIA's store none."""
     Ks = cameras_of(large).Ks
     Ks[:, :2, 2] = large.width / 2, large.height / 2
@@ -100,8 +101,8 @@ def test_a_file_with_other_intrinsics_is_refused_with_the_remedy(large: Tiny, tm
         load_scene(tmp_path, order="view-major", cameras=tmp_path / "transforms.json")
 
 
-def test_far_off_is_too_far(large: Tiny) -> None:
-    wrong = cameras_of(large, off(large, 8.0, 0.02))
+def test_cameras_that_are_far_off_are_not_moved(large: Tiny) -> None:
+    wrong = cameras_of(large, moved_viewmats(large, 8.0, 0.02))
     assert move_cameras(sample_pixels(large.gaussians, wrong, np.ones(84000, bool)), wrong, NAMES) is None
     assert max_correctable_px(480, 360) == 12
     assert max_correctable_px(20, 14) == 1.5  # in small pictures twelve pixels are much
@@ -115,9 +116,9 @@ def save_with(tiny: Tiny, folder: Path, viewmats: np.ndarray) -> Path:
 
 @pytest.mark.slow
 def test_a_file_whose_cameras_are_off_is_read_with_a_note(large: Tiny, tmp_path: Path) -> None:
-    load = load_scene(save_with(large, tmp_path / "scene", off(large, 0.7, 0.02)))
+    load = load_scene(save_with(large, tmp_path / "scene", moved_viewmats(large, 0.7, 0.02)))
     assert load.scene.has_own_pixels
-    assert pose_changes(large.w2c, load.scene.cameras.viewmats)[0].max() < 0.05
+    assert pose_changes(large.w2c, load.scene.cameras.viewmats)[0].max() < 0.05  # degrees
     assert sum(names(note, "cameras", "median") for note in load.notes) == 1
     assert len(load.moves) == 3
 

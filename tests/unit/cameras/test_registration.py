@@ -1,4 +1,4 @@
-"""Scenes of one place, each in a frame and a unit of its own, found in one another and joined."""
+"""Scenes of one place, each in its own frame and unit, are found in one another and joined."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PATHS = [Path(f"{name}.ply") for name in "abcdef"]
 
 @cache
 def made_scene(seed: int, views: int = VIEWS) -> Scene:
-    """A photographed room with the depth errors of a network."""
+    """Return a photographed room with the depth errors of a network."""
     ranges = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))
     options = GenerateOptions(views=views, width=WIDTH, height=HEIGHT, ranges=ranges)
     made = make_synthetic_scene(seed, 0, options)
@@ -49,7 +49,7 @@ def parts() -> list[Scene]:
     return split_views(made_scene(2), SCALES)
 
 
-def test_views_are_found_up_to_a_similarity(place: Scene, parts: list[Scene]) -> None:
+def test_registration_finds_the_views_up_to_a_similarity(place: Scene, parts: list[Scene]) -> None:
     """Within half a degree and one per cent of the truth, and the first file stays; three pairs take a second."""
     joined = join_scenes(parts[:3], PATHS[:3])
     assert joined.used == (0, 1, 2)
@@ -85,7 +85,7 @@ def test_a_view_of_another_place_is_left_out(parts: list[Scene]) -> None:
 
 
 @pytest.mark.slow
-def test_files_of_several_views(place: Scene) -> None:
+def test_files_of_several_views_are_joined(place: Scene) -> None:
     """Each with frame and unit of its own: two exports of one room."""
     turn, shift = rotation(0.5, -1.0, 2.2), np.array([4.0, -3, 2])
     other = move_scene(subset(place, [1, 3, 5]), Similarity(turn, 1.6, shift))
@@ -97,7 +97,7 @@ def test_files_of_several_views(place: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_without_photos_base_colours_are_compared(parts: list[Scene]) -> None:
+def test_files_without_photos_are_joined_by_their_base_colours(parts: list[Scene]) -> None:
     bare = [replace(part, images=None) for part in parts[:2]]
     assert join_scenes(bare, PATHS[:2]).used == (0, 1)
     joined = join_scenes([bare[0], parts[1]], PATHS[:2])
@@ -106,7 +106,7 @@ def test_without_photos_base_colours_are_compared(parts: list[Scene]) -> None:
 
 
 @pytest.mark.slow
-def test_the_last_bits_do_not_matter(parts: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keypoints_moved_by_a_rounding_error_move_no_place(parts: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
     """Places are rounded, and what moves keypoints by a rounding error moves no place."""
     places = register(parts[:2]).similarities
     assert places[1].scale == round(places[1].scale, DIGITS)
@@ -122,13 +122,13 @@ def test_the_last_bits_do_not_matter(parts: list[Scene], monkeypatch: pytest.Mon
         assert np.array_equal(getattr(other, name), getattr(places[1], name))
 
 
-def test_opencv_is_left_as_it_was(parts: list[Scene]) -> None:
+def test_finding_keypoints_leaves_the_settings_of_opencv(parts: list[Scene]) -> None:
     before = cv2.useOptimized()
     keypoints.find_keypoints(parts[0])
     assert cv2.useOptimized() == before
 
 
-def test_files_that_cannot_be_joined(parts: list[Scene]) -> None:
+def test_files_that_cannot_be_joined_are_refused(parts: list[Scene]) -> None:
     unaligned = replace(parts[1], pixels=None)
     with refuses(SceneError, "b.ply", "1 camera", "no pixels"):
         join_scenes([parts[0], unaligned], PATHS[:2])
@@ -146,7 +146,7 @@ def test_files_that_cannot_be_joined(parts: list[Scene]) -> None:
         join_scenes([parts[0], shiny], PATHS[:2])
 
 
-def test_similarities_of_exact_points() -> None:
+def test_similarities_of_exact_points_are_exact() -> None:
     rng = np.random.default_rng(0)
     p, turn, shift = rng.normal(size=(5, 4, 3)), rotation(0.4, -1.2, 2.0), np.array([3.0, -2, 1])
     rotations, scales, shifts = fit_similarities(p, 1.7 * p @ turn.T + shift, np.ones((5, 4)))

@@ -1,4 +1,4 @@
-"""Poses and a focal length from points and their pixels, against OpenCV's."""
+"""Poses and a focal length are found from points and their pixels, as OpenCV finds them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 TRUE = motion_matrices(np.array([[0.1, 0.2, -0.1, 0.1, 0, 6], [-0.2, 0.1, 0.4, 0.5, 0.3, 7], [0, 0, 0, 0, 0, 5.0]]))
 
 
-def shown(noise: float, seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Points of three views, and the pixels that show them."""
+def points_and_pixels(noise: float, seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return points of three views, and the pixels that show them."""
     rng = np.random.default_rng(seed)
     points = [rng.normal(size=(80, 3)) for _ in TRUE]
     pixels = []
@@ -37,15 +37,15 @@ def shown(noise: float, seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarra
                         (np.array([[330.0, 0, 150], [0, 280, 126], [0, 0, 1]]), ALL_INTRINSICS)],
 )  # fmt: skip
 def test_exact_pixels_give_poses_and_intrinsics(guess: np.ndarray, free: int):
-    points, pixels = shown(0.0)
+    points, pixels = points_and_pixels(0.0)
     starts = np.stack([start_pose(p, q, guess) for p, q in zip(points, pixels, strict=True)])
     near_K, poses = refine_poses(points, pixels, guess, starts, free=free)
     np.testing.assert_allclose(near_K, K, atol=1e-5)
     np.testing.assert_allclose(poses, TRUE, atol=1e-6)
 
 
-def test_a_plane_in_front_of_the_camera_leaves_the_focal_length_open():
-    points, pixels = shown(0.0)
+def test_focal_length_is_uncertain_before_a_plane_seen_head_on():
+    points, pixels = points_and_pixels(0.0)
     Ks = np.tile(K, (3, 1, 1))
     assert focal_uncertainty(points, pixels, Ks, TRUE) < 0.01
     wall = points[0] * [1, 1, 0]
@@ -56,8 +56,8 @@ def test_a_plane_in_front_of_the_camera_leaves_the_focal_length_open():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_poses_of_noisy_pixels_are_opencvs(seed):
-    points, pixels = shown(1.0, seed)
+def test_poses_from_noisy_pixels_are_those_of_opencv(seed):
+    points, pixels = points_and_pixels(1.0, seed)
     for p, q in zip(points, pixels, strict=True):
         start = start_pose(p, q, K)
         _, (pose,) = refine_poses([p], [q], K, start[None])
@@ -66,8 +66,8 @@ def test_poses_of_noisy_pixels_are_opencvs(seed):
         np.testing.assert_allclose(pose[:3, 3:], shift, atol=1e-4)
 
 
-def test_the_error_is_least():
-    points, pixels = shown(1.0)
+def test_refined_cameras_have_the_least_projection_error():
+    points, pixels = points_and_pixels(1.0)
     near_K, poses = refine_poses(points, pixels, K, TRUE, free=ONE_FOCAL)
 
     def error(K: np.ndarray, poses: np.ndarray) -> float:
@@ -83,15 +83,18 @@ def test_the_error_is_least():
         assert error(near_K * np.array([[1 + 1e-3 * sign] * 2 + [1]]), poses) > least
 
 
-def test_points_in_one_place_end():
+def test_refining_poses_ends_for_points_in_one_place():
     points, pixels = np.zeros((10, 3)), np.full((10, 2), 5.0)
     assert np.isfinite(refine_poses([points], [pixels], K, TRUE[:1])[1]).all()
+
+
+def test_refining_poses_without_points_is_an_error():
     with pytest.raises(np.linalg.LinAlgError):
-        refine_poses([points[:0]], [pixels[:0]], K, TRUE[:1])
+        refine_poses([np.zeros((0, 3))], [np.zeros((0, 2))], K, TRUE[:1])
 
 
-def test_a_start_behind_the_points_ends():
-    points, pixels = shown(1.0)
+def test_refining_poses_from_behind_the_points_ends_with_finite_ones():
+    points, pixels = points_and_pixels(1.0)
     behind = TRUE.copy()
     behind[:, 2, 3] = 0.5  # points lie in front of the camera, beside it and behind
     near_K, poses = refine_poses(points, pixels, K, behind, free=ONE_FOCAL)
@@ -101,8 +104,8 @@ def test_a_start_behind_the_points_ends():
 
 @pytest.mark.parametrize("flat", [False, True])
 @pytest.mark.parametrize("wrong", [0.0, 0.25])
-def test_some_camera_shows_the_points(flat: bool, wrong: float):
-    points, pixels = shown(0.3)
+def test_projective_error_is_small_where_a_camera_shows_the_points(flat: bool, wrong: float):
+    points, pixels = points_and_pixels(0.3)
     rng = np.random.default_rng(1)
     for one, where in zip(points, pixels, strict=True):
         if flat:
@@ -111,24 +114,27 @@ def test_some_camera_shows_the_points(flat: bool, wrong: float):
             where[:] = places[:, :2] / places[:, 2:]
         some = rng.random(len(one)) < wrong
         where[some] = rng.permutation(where[some])
-        assert projective_error(one, where) < 1
+        assert projective_error(one, where) < 1  # pixel, of which the noise is 0.3
         assert projective_error(1e4 * one + 50, where) < 1
 
 
-def test_no_camera_shows_points_in_other_pixels():
+def test_projective_error_is_large_for_shuffled_pixels():
     rng = np.random.default_rng(1)
-    points, pixels = shown(0.0)
+    points, pixels = points_and_pixels(0.0)
     assert min(projective_error(p, rng.permutation(q)) for p, q in zip(points, pixels, strict=True)) > 20
 
 
-def test_a_few_points_or_one_place_fit_any_camera():
+def test_projective_error_of_too_few_points_is_zero():
     rng = np.random.default_rng(1)
     assert projective_error(rng.normal(size=(10, 3)), rng.uniform(0, 100, (10, 2))) == 0
-    error = projective_error(np.ones((50, 3)), rng.uniform(0, 100, (50, 2)))
+
+
+def test_projective_error_of_points_in_one_place_is_not_small():
+    error = projective_error(np.ones((50, 3)), np.random.default_rng(1).uniform(0, 100, (50, 2)))
     assert not error < 10
 
 
-def test_a_step_beyond_all_numbers_is_not_taken():
-    points, pixels = shown(1.0)
+def test_refined_poses_stay_finite_where_a_step_would_overflow():
+    points, pixels = points_and_pixels(1.0)
     _, poses = refine_poses([p * [1, 1, 1e58] for p in points], pixels, K, TRUE)
     assert np.isfinite(poses).all()

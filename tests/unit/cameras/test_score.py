@@ -14,8 +14,7 @@ from gsmerge.types import Cameras, Gaussians
 
 
 def cameras_of(tiny: Tiny, viewmats: np.ndarray | None = None) -> Cameras:
-    w2c = tiny.w2c if viewmats is None else viewmats
-    return Cameras(w2c, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
+    return Cameras(tiny.w2c if viewmats is None else viewmats, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
 
 
 def valid_of(tiny: Tiny) -> np.ndarray:
@@ -26,7 +25,7 @@ def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -
     return check_pairs(sample_pixels(gaussians, cameras, valid), cameras)
 
 
-def test_a_scene_aligned_with_jitter(tiny: Tiny) -> None:
+def test_a_scene_with_the_usual_jitter_is_aligned(tiny: Tiny) -> None:
     actual = check_alignment(tiny.gaussians, cameras_of(tiny), valid_of(tiny))
     assert actual.ok
     assert len(actual.median_px) == 3
@@ -35,7 +34,7 @@ def test_a_scene_aligned_with_jitter(tiny: Tiny) -> None:
     assert actual.share_within_1px == 1
 
 
-def test_a_known_shift_is_measured(tiny: Tiny) -> None:
+def test_a_known_shift_of_one_view_is_measured(tiny: Tiny) -> None:
     moved = cameras_of(tiny)
     Ks = moved.Ks.copy()
     Ks[1, 0, 2] += 3
@@ -46,7 +45,7 @@ def test_a_known_shift_is_measured(tiny: Tiny) -> None:
     assert actual.share_within_1px == pytest.approx(2 / 3, abs=0.01)
 
 
-def test_rows_that_are_set_aside_do_not_count(tiny: Tiny) -> None:
+def test_rows_that_are_set_aside_do_not_count_in_the_alignment(tiny: Tiny) -> None:
     means, valid = tiny.gaussians.means.copy(), valid_of(tiny).reshape(-1)
     means[: len(means) // 2] += 100
     valid[: len(means) // 2] = False
@@ -55,7 +54,7 @@ def test_rows_that_are_set_aside_do_not_count(tiny: Tiny) -> None:
     assert np.isnan(actual.median_px[0])
 
 
-def test_a_scene_behind_its_cameras_is_refused(tiny: Tiny) -> None:
+def test_a_scene_behind_its_cameras_is_not_aligned(tiny: Tiny) -> None:
     behind = cameras_of(tiny, np.diag([-1.0, -1, -1, 1]) @ tiny.w2c)  # same pixels, but negative depth
     actual = check_alignment(tiny.gaussians, behind, valid_of(tiny))
     assert not actual.ok
@@ -63,7 +62,7 @@ def test_a_scene_behind_its_cameras_is_refused(tiny: Tiny) -> None:
     assert actual.median_px == (np.inf,) * 3
 
 
-def test_large_views_are_sampled_in_all_columns() -> None:
+def test_alignment_samples_all_columns_of_large_views() -> None:
     tiny = make_tiny(200, 250)
     actual = check_alignment(tiny.gaussians, cameras_of(tiny), valid_of(tiny))
     assert actual.ok
@@ -73,25 +72,25 @@ def test_large_views_are_sampled_in_all_columns() -> None:
     assert odd.share_within_1px == pytest.approx(0.5, abs=0.02)
 
 
-def test_tiny_views_are_not_aligned_by_being_tiny(tiny: Tiny) -> None:
+def test_shuffled_rows_of_tiny_views_are_not_aligned(tiny: Tiny) -> None:
     small = make_tiny(6, 5)
     assert check_alignment(small.gaussians, cameras_of(small), valid_of(small)).ok
     shuffled = small.gaussians[np.random.default_rng(0).permutation(len(small.gaussians))]
     assert not check_alignment(shuffled, cameras_of(small), valid_of(small)).ok
 
 
-def test_a_wrong_number_of_rows(tiny: Tiny) -> None:
+def test_a_wrong_number_of_rows_is_refused(tiny: Tiny) -> None:
     with refuses(ValueError, "", "3 x 14 x 20", 839):
         check_alignment(tiny.gaussians[:-1], cameras_of(tiny), valid_of(tiny))
 
 
-def test_conventions_are_inverse_to_each_other(tiny: Tiny) -> None:
+def test_viewmats_survive_a_conversion_to_every_convention(tiny: Tiny) -> None:
     for convention in CONVENTIONS:
         assert np.allclose(to_viewmats(from_viewmats(tiny.w2c, convention), convention), tiny.w2c)
     assert np.allclose(to_viewmats(tiny.c2w @ FLIP, ("camera-to-world", "OpenGL")), tiny.w2c)
 
 
-def test_other_orders_are_named(tiny: Tiny) -> None:
+def test_another_order_of_rows_is_named(tiny: Tiny) -> None:
     good, valid, n = cameras_of(tiny), valid_of(tiny), len(tiny.gaussians)
 
     def explain(rows: np.ndarray) -> str | None:
@@ -104,7 +103,7 @@ def test_other_orders_are_named(tiny: Tiny) -> None:
     assert explain(np.random.default_rng(0).permutation(n)) is None
 
 
-def test_the_share_in_front_is_named_if_it_explains_the_distance(tiny: Tiny) -> None:
+def test_the_message_has_the_share_in_front_where_it_explains_the_distance(tiny: Tiny) -> None:
     cameras = cameras_of(tiny)
     shifted = replace(cameras, Ks=cameras.Ks + np.array([[0, 0, 9.0], [0, 0, 0], [0, 0, 0]]))
     behind = cameras_of(tiny, np.diag([-1.0, -1, -1, 1]) @ tiny.w2c)

@@ -1,4 +1,4 @@
-"""Rows without pixels in the frame of the first camera, with the cameras of the data set."""
+"""Rows without pixels may be in another frame than the cameras, which are moved there."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ WIDTH, HEIGHT = 56, 40
 SMOOTH = smooth_scene(WIDTH, HEIGHT)
 
 
-def voxels() -> np.ndarray:
-    """Rows of merged Gaussians, a prime number, in an order of space."""
+def voxel_rows() -> np.ndarray:
+    """Return rows of merged Gaussians, a prime number, in an order of space."""
     return export_rows(replace(SMOOTH, gaussians=merge_voxels(SMOOTH, 0.07)), np.arange(4027))
 
 
@@ -44,8 +44,8 @@ def padded(rows: np.ndarray) -> np.ndarray:
     return full[grid.transpose(1, 2, 0).reshape(-1)]
 
 
-def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path) -> None:
-    rows = turned(padded(voxels()), SMOOTH.w2c[0, :3, :3])
+def test_cameras_are_rotated_into_the_first_for_padded_rows_of_volsplat(tmp_path: Path) -> None:
+    rows = turned(padded(voxel_rows()), SMOOTH.w2c[0, :3, :3])
     loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
     assert not loaded.scene.has_own_pixels
     assert "the cameras are rotated into the first camera, as the photos' colours show" in loaded.notes
@@ -56,9 +56,9 @@ def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path) -> None:
 
 
 @sweep("scale", [0.2, 1.0, 3.0])
-def test_voxels_in_the_first_camera_at_any_scale(tmp_path: Path, scale: float) -> None:
+def test_cameras_are_moved_into_the_first_for_voxels_at_any_scale(tmp_path: Path, scale: float) -> None:
     first = SMOOTH.w2c[0]
-    rows = turned(voxels(), first[:3, :3], scale=scale, shift=scale * first[:3, 3])
+    rows = turned(voxel_rows(), first[:3, :3], scale=scale, shift=scale * first[:3, 3])
     rows["opacity"] = 1 / (1 + elementary.exp(-rows["opacity"]))
     loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
     assert not loaded.scene.has_own_pixels
@@ -70,9 +70,9 @@ def test_voxels_in_the_first_camera_at_any_scale(tmp_path: Path, scale: float) -
 
 @sweep("scale", [0.01, 39.37, 100.0, 1000.0], often=2)
 @pytest.mark.parametrize("turn", [np.eye(3), np.diag([1.0, -1, -1])], ids=["as it is", "y up"])
-def test_the_units_of_another_program(tmp_path: Path, scale: float, turn: np.ndarray) -> None:
+def test_the_scale_of_voxels_in_another_unit_is_found(tmp_path: Path, scale: float, turn: np.ndarray) -> None:
     """Three frames are searched at a hundred scales each, which takes seconds."""
-    loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxels(), turn, scale=scale)))
+    loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxel_rows(), turn, scale=scale)))
     (note,) = [note for note in loaded.notes if "scale" in note]
     solved = float(note.partition("--hint scene_scale=")[2].partition(")")[0])
     assert solved == pytest.approx(scale, rel=0.02)
@@ -100,35 +100,35 @@ def shifted(scene: Smooth, offset: np.ndarray) -> Smooth:
 
 @pytest.mark.parametrize("name", OFFSET_FILES)
 @sweep("sign", [1, -1], often=1)
-def test_cameras_with_an_offset(tmp_path: Path, name: str, sign: int) -> None:
+def test_an_offset_of_cameras_is_found_from_a_file_or_photos(tmp_path: Path, name: str, sign: int) -> None:
     """Without a right file, a thousand places are tried, which takes seconds."""
     text = OFFSET_FILES[name]
     if text is not None:
         (tmp_path / name).write_text(text)
-    loaded = load_scene(save_export(tmp_path, shifted(SMOOTH, sign * OFFSET), voxels()))
+    loaded = load_scene(save_export(tmp_path, shifted(SMOOTH, sign * OFFSET), voxel_rows()))
     is_exact = name not in ("none", "wrong.txt")
     assert np.allclose(loaded.scene.cameras.centres, SMOOTH.c2w[:, :3, 3], atol=1e-4 if is_exact else 0.03)
     assert noted(loaded.notes, "cameras are moved by", name if is_exact else "photos")
     assert len(loaded.scene.photo_views) == 3
 
 
-def test_without_photos_no_shift_is_found(tmp_path: Path) -> None:
-    folder = save_export(tmp_path, shifted(SMOOTH, OFFSET), voxels())
+def test_an_offset_of_cameras_without_photos_is_a_doubt(tmp_path: Path) -> None:
+    folder = save_export(tmp_path, shifted(SMOOTH, OFFSET), voxel_rows())
     for photo in (folder / "images").rglob("*.png"):
         photo.unlink()
     assert names(str(load_scene(folder).doubts), "transforms.json", "0 %", "offset.txt")
 
 
-def test_voxels_turned_to_y_up(tmp_path: Path) -> None:
+def test_cameras_are_turned_for_voxels_with_y_up(tmp_path: Path) -> None:
     """As files are that were written in the axes of .spz, beside OpenCV cameras."""
     half = np.diag([1.0, -1, -1])
-    loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxels(), half)))
+    loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxel_rows(), half)))
     assert any("turned to y up" in note for note in loaded.notes)
     assert np.allclose(loaded.scene.cameras.viewmats[:, :3, :3], SMOOTH.w2c[:, :3, :3] @ half, atol=1e-6)
 
 
-def test_without_photos_no_other_frame_is_tried(tmp_path: Path) -> None:
-    rows = turned(voxels(), np.diag([-1.0, 1, -1]))
+def test_voxels_in_another_frame_without_photos_are_refused(tmp_path: Path) -> None:
+    rows = turned(voxel_rows(), np.diag([-1.0, 1, -1]))
     folder = save_export(tmp_path, SMOOTH, rows)
     for photo in (folder / "images").rglob("*.png"):
         photo.unlink()
@@ -136,10 +136,12 @@ def test_without_photos_no_other_frame_is_tried(tmp_path: Path) -> None:
         load_scene(folder, cameras=folder)
 
 
-def test_no_other_frame_stands_against_the_foremost_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_is_refused_where_photos_contradict_the_foremost_colours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whatever chooses a frame: where the photos are far from what they should show, it is refused."""
     wrong = Similarity(np.eye(3), 1.0, np.array([0.9, 0.4, 0.0]), "somewhere else")
-    rows = voxels()
+    rows = voxel_rows()
     rows["x"] += np.random.default_rng(0).uniform(-0.05, 0.05, len(rows))  # a pixel to each side
     folder = save_export(tmp_path, SMOOTH, rows)
     monkeypatch.setattr(unaligned, "_choose_frame", lambda inputs, usual: wrong)
@@ -147,7 +149,7 @@ def test_no_other_frame_stands_against_the_foremost_colours(tmp_path: Path, monk
         load_scene(folder, cameras=folder)
 
 
-def test_hidden_gaussians_say_nothing_about_the_foremost() -> None:
+def test_hidden_gaussians_do_not_count_in_the_foremost_colours() -> None:
     cameras = Cameras(np.eye(4)[None], np.array([[[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]]), 100, 100)
     rng = np.random.default_rng(0)
     photo = rng.random((1, 10, 10, 3)).repeat(10, 1).repeat(10, 2).astype(np.float32)
@@ -163,13 +165,13 @@ def test_hidden_gaussians_say_nothing_about_the_foremost() -> None:
         unaligned.check_cameras(gaussians, np.ones(8000, bool), cameras, photo, foremost=foremost).color_ratio
         for foremost in (False, True)
     )
-    assert every > 0.4
+    assert every > 0.4  # half of the Gaussians are hidden, and of random colours
     assert foremost < 0.1
 
 
-def test_photos_that_the_model_saw(tmp_path: Path) -> None:
+def test_resized_photos_of_the_model_are_taken_where_they_fit(tmp_path: Path) -> None:
     """As WorldMirror leaves a portrait: whole photos squeezed to the shape of what was cut out of them."""
-    folder = save_export(tmp_path, SMOOTH, voxels())
+    folder = save_export(tmp_path, SMOOTH, voxel_rows())
     squeezed = [cv2.resize(np.pad(i, ((16, 16), (0, 0), (0, 0)), "reflect"), (WIDTH, HEIGHT)) for i in SMOOTH.images]
     write_images(folder / "images", replace(SMOOTH, images=np.stack(squeezed)))
     write_images(folder / "images_resized", SMOOTH)
@@ -179,7 +181,7 @@ def test_photos_that_the_model_saw(tmp_path: Path) -> None:
 
 
 def test_rows_that_are_all_padding_are_refused(tmp_path: Path) -> None:
-    rows = np.repeat(voxels()[:1], 100)
+    rows = np.repeat(voxel_rows()[:1], 100)
     for name in "xyz":
         rows[name] = 0
     folder = save_export(tmp_path, SMOOTH, rows)

@@ -1,4 +1,4 @@
-"""Rows that were centred, rescaled and turned upright by amounts that no file says, with pixels dropped or fused."""
+"""Rows that were centred, rescaled and turned upright by unknown amounts are matched with photos."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WIDTH, HEIGHT, VIEWS, TRIM = 96, 72, 3, 8
 
 
 def with_texture(tiny: Smooth) -> Smooth:
-    """The same surface in colours by which each stretch of pixels is known."""
+    """Return the same surface in colours by which each stretch of pixels is known."""
     noise = np.random.default_rng(1).integers(0, 256, tiny.images.shape).astype(np.float32)
     images = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in noise])
     images = (128 + 2 * (images - 128)).clip(0, 255).astype(np.uint8)
@@ -36,7 +36,7 @@ def textured() -> Smooth:
 
 
 def far_cut(tiny: Smooth, share: float = 0.9) -> np.ndarray:
-    """Indices in the order row, column, view, without borders and the farthest."""
+    """Return indices in the order row, column, view, without borders and the farthest."""
     index = np.arange(tiny.depths.size).reshape(tiny.depths.shape)
     limit = np.quantile(tiny.depths, share)
     kept = np.zeros(index.shape, bool)
@@ -46,7 +46,7 @@ def far_cut(tiny: Smooth, share: float = 0.9) -> np.ndarray:
 
 
 def upright(tiny: Smooth, rows: np.ndarray, first: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
-    """Rows as pixelSplat's exporter leaves them; also its scale, and the centres of the cameras there."""
+    """Return rows as pixelSplat's exporter leaves them, its scale, and the centres of the cameras there."""
     means = np.stack([rows[name] for name in "xyz"], 1).astype(np.float64)
     middle = np.median(means, 0)
     scale = 1 / np.quantile(np.abs(means - middle), 0.95, axis=0).max()
@@ -63,7 +63,9 @@ def check_centres(loaded: Loaded, centres: np.ndarray, scale: float) -> None:
 
 @pytest.mark.slow
 @sweep("first", [0, 2])
-def test_far_pixels_dropped_before_the_world_was_turned(tmp_path: Path, textured: Smooth, first: int) -> None:
+def test_cameras_are_turned_upright_with_rows_whose_far_pixels_were_dropped(
+    tmp_path: Path, textured: Smooth, first: int
+) -> None:
     kept = far_cut(textured)
     rows, scale, centres = upright(textured, export_rows(textured, kept), first)
     loaded = load_scene(save_export(tmp_path, textured, rows))
@@ -72,7 +74,7 @@ def test_far_pixels_dropped_before_the_world_was_turned(tmp_path: Path, textured
 
 @pytest.mark.slow
 @sweep("photos", ["none", "of another scene"])
-def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured: Smooth, photos: str) -> None:
+def test_upright_rows_without_matching_photos_are_refused(tmp_path: Path, textured: Smooth, photos: str) -> None:
     rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)))
     strange = np.random.default_rng(5).integers(0, 256, textured.images.shape, np.uint8)
     folder = save_export(tmp_path, replace(textured, images=strange), rows)
@@ -83,7 +85,7 @@ def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured
         load_scene(folder, cameras=folder)
 
 
-def test_too_few_rows_for_a_stretch(tmp_path: Path, textured: Smooth) -> None:
+def test_upright_rows_too_few_to_be_matched_are_refused(tmp_path: Path, textured: Smooth) -> None:
     rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)[:100]))
     with refuses(SceneError, "scene.ply"):
         load_scene(save_export(tmp_path, textured, rows), cameras=tmp_path)

@@ -1,4 +1,4 @@
-"""What a terminal shows while a command runs."""
+"""Commands show their progress as bars, as lines or as events."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Terminal(io.StringIO):
         return True
 
     def lines(self) -> list[str]:
-        """What was ever printed, in lines, without colours and movements of the cursor."""
+        """Return what was ever printed, in lines, without colours and movements of the cursor."""
         return [line.strip() for line in re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.getvalue()))]
 
 
@@ -33,7 +33,9 @@ def terminal_of_100_columns(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("columns", "bar"), [("80", 16), ("40", 8)])
-def test_the_bar_of_a_run_fills_and_names_the_stage(monkeypatch: pytest.MonkeyPatch, columns: str, bar: int) -> None:
+def test_the_bar_of_a_run_fills_beside_the_name_of_the_stage(
+    monkeypatch: pytest.MonkeyPatch, columns: str, bar: int
+) -> None:
     """By the shares of expected parts, or else by the steps that are counted."""
     monkeypatch.setenv("COLUMNS", columns)
     with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
@@ -49,7 +51,7 @@ def test_the_bar_of_a_run_fills_and_names_the_stage(monkeypatch: pytest.MonkeyPa
     assert any("done" in line and "━" * bar in line for line in lines)
 
 
-def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_run_is_one_line_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     with total_progress(4, quiet=False) as progress:
         progress(RunEnd("room", "failed", 1, "no photos", 1, 0.25))
         progress(RunEnd("garden", "done", 2, "", 1, 0.5))
@@ -60,7 +62,7 @@ def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str
     assert capsys.readouterr().err.splitlines() == lines
 
 
-def test_runs_as_events_have_their_names_whole(capsys: pytest.CaptureFixture[str]) -> None:
+def test_events_of_runs_have_the_whole_name_of_the_scene(capsys: pytest.CaptureFixture[str]) -> None:
     """Also after others have failed, and with a space in them."""
     with json_progress(), total_progress(2, quiet=True) as progress:
         progress(RunEnd("my room", "failed", 1, "no photos", 1, 0.25))
@@ -75,7 +77,7 @@ def test_runs_as_events_have_their_names_whole(capsys: pytest.CaptureFixture[str
     assert events[1]["seconds_left"] == 0
 
 
-def test_a_doubtful_run_is_marked(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_doubtful_run_is_marked_in_lines_and_events(capsys: pytest.CaptureFixture[str]) -> None:
     """Lines of JSON have all notes, and a warning even if the command is quiet."""
     worse = "the result shows its own photos worse than the input does: 20.00 dB, 30.00 dB before"
     run = "room", "done", 1, "", 0, 1.0, ["no masks", Doubt(worse)]
@@ -100,14 +102,14 @@ def test_brackets_in_names_are_no_markup_in_bars() -> None:
     assert terminal.getvalue().count("[/b]") > 1
 
 
-def test_bars_of_stages_escape_what_terminals_obey() -> None:
+def test_bars_of_stages_escape_control_characters() -> None:
     with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
         progress("inspect: a\x1b]0;title\x07.ply", 1, 2)
     assert "\x1b]" not in terminal.getvalue()
     assert r"a\x1b]0;title\x07.ply" in terminal.getvalue()
 
 
-def test_warnings_of_numbers_are_one_note(capsys: pytest.CaptureFixture[str]) -> None:
+def test_numeric_warnings_are_printed_as_one_note(capsys: pytest.CaptureFixture[str]) -> None:
     with plain_warnings():
         warnings.simplefilter("always")
         for text in ("Mean of empty slice", "invalid value encountered in divide"):

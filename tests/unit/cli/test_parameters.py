@@ -1,4 +1,4 @@
-"""Settings and hints by name, as ``--set`` and ``--hint`` read them."""
+"""Settings and hints are given by name with ``--set`` and ``--hint``."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ KNOWN = flat_settings(EvaluateOptions) | flat_settings(CompactOptions)
         ("lpips=alex", {"lpips": ["alex"]}),
     ],
 )
-def test_values_are_json_or_text(pair: str, expected: dict[str, Any]) -> None:
+def test_values_of_set_are_read_as_json_or_text(pair: str, expected: dict[str, Any]) -> None:
     assert parse_pairs("--set", [pair], KNOWN) == expected
 
 
@@ -52,12 +52,12 @@ def test_values_are_json_or_text(pair: str, expected: dict[str, Any]) -> None:
         (["match=all"], "--set match", ["overlap", "'all'"]), (["k=" + "[" * 100_000], "--set k", ["[["]),
     ],
 )  # fmt: skip
-def test_what_cannot_be_meant(pairs: list[str], place: str, found: list[str]) -> None:
+def test_impossible_pairs_of_set_are_refused(pairs: list[str], place: str, found: list[str]) -> None:
     with refuses(UsageError, place, *found):
         parse_pairs("--set", pairs, KNOWN)
 
 
-def test_options_and_set_are_one() -> None:
+def test_settings_come_from_options_and_set_together() -> None:
     args = Args(k=2, effort="fast", set=["overlap=0.5"])
     settings = args.settings()
     assert (settings.decode.k, settings.effort, settings.match.overlap) == (2, "fast", 0.5)
@@ -74,7 +74,7 @@ def test_words_of_options_become_values() -> None:
     assert values == {"budget": "300", "k": 2, "seed": 3, "effort": "fast", "cameras": "none", "images": Path("a/b")}
 
 
-def test_several_kinds_of_settings() -> None:
+def test_set_fills_several_kinds_of_settings() -> None:
     assert Args(set=["k=2", "max_views=3"]).values(CompactOptions, ExtendOptions) == {"k": 2, "max_views": 3}
     made, online = Args(set=["recipe=paper", "max_views=3"]).make(CompactOptions, ExtendOptions)
     assert (made.segment.segmentation, online.max_views) == ("bass-st", 3)
@@ -89,7 +89,7 @@ def test_the_seed_may_come_from_the_environment(monkeypatch: pytest.MonkeyPatch)
         Args().settings()
 
 
-def test_unknown_names_have_near_ones() -> None:
+def test_an_unknown_setting_is_refused_with_a_near_name() -> None:
     with refuses(UsageError, "--set superpixel", "superpixels"):
         parse_pairs("--set", ["superpixel=3"], KNOWN)
     with refuses(UsageError, "--set foo", "unknown; --set help"):

@@ -42,7 +42,7 @@ def make_document(files: tuple[Path, Path], **changes: Any) -> dict[str, Any]:
     )
 
 
-def test_document_is_strict_json(files: tuple[Path, Path]) -> None:
+def test_the_report_document_is_strict_json(files: tuple[Path, Path]) -> None:
     document = json.loads(to_json(make_document(files)))
     assert document["choices"]["agreement"]["share"] is None  # infinity is no JSON
     assert document["ratio"] == 0.025
@@ -51,7 +51,7 @@ def test_document_is_strict_json(files: tuple[Path, Path]) -> None:
     assert document["seed"] == 5
 
 
-def test_what_the_input_covers_stands_beside_all_pixels(files: tuple[Path, Path]) -> None:
+def test_scores_of_covered_pixels_stand_beside_those_of_all_pixels(files: tuple[Path, Path]) -> None:
     document = make_document(files, covered=Covered(0.79, 26.1, 25.9))
     assert document["psnr_covered"] == {"share": 0.79, "before": 26.1, "after": 25.9}
     for text in ["\n".join(report.result_table(document))]:
@@ -61,7 +61,7 @@ def test_what_the_input_covers_stands_beside_all_pixels(files: tuple[Path, Path]
     assert make_document(files)["psnr_covered"] is None
 
 
-def test_new_views_come_first(files: tuple[Path, Path]) -> None:
+def test_new_views_come_before_own_photos_in_the_table(files: tuple[Path, Path]) -> None:
     document = make_document(files, new_views=NewViews(17.25, 21.5, 3.0, 5.5, 3))
     assert document["new_views"] == {"before": 17.25, "after": 21.5, "low": 3.0, "high": 5.5, "views": 3}
     table = [" ".join(row.split()) for row in report.result_table(document)]
@@ -71,7 +71,7 @@ def test_new_views_come_first(files: tuple[Path, Path]) -> None:
     assert table[place + 1].startswith("its own photos")
 
 
-def test_the_curve_marks_the_result(files: tuple[Path, Path]) -> None:
+def test_the_curve_marks_the_count_nearest_to_the_result(files: tuple[Path, Path]) -> None:
     points = [{"count": count, "psnr": 20.0, "ssim": 0.5} for count in (10, 30, 90)]
     heading, _, few, nearest, many = report.curve_lines(make_document(files, choices={"curve": points}))
     assert "patches of the photos that they left out" in heading

@@ -1,4 +1,4 @@
-"""What a run is said to take before it begins."""
+"""The time and the fit of a run are estimated before it begins."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def seconds(
     views: int = 12, *, steps: int = 240, count: int = 50_000, threads: int = 1, choice: CountChoice = ONCE,
     has_trial: bool = False, **changes: Any,
 ) -> float:  # fmt: skip
-    """Wall time of a run, with settings of ``compact``."""
+    """Return the wall time of a run, with settings of ``compact``."""
     options = CompactOptions().with_settings({"checkpoint": "none"} | changes)
     size = SceneSize(views * VIEW, views, 320, 480, True, rendered=False)
     costs = RunCosts(options.to_dict(), views * VIEW, VIEW, 0.5, steps, choice=choice, has_trial=has_trial)
@@ -31,7 +31,7 @@ def seconds(
     return costs.seconds(costs.all_parts(limits, count), views, threads)
 
 
-def test_more_work_takes_longer() -> None:
+def test_a_run_with_more_work_is_estimated_to_take_longer() -> None:
     usual = seconds()
     assert IMPORT_SECONDS < seconds(steps=0) < seconds(steps=0, method="greedy")
     assert seconds(steps=0, method="random") < usual < seconds(recipe="paper", checkpoint="paper")
@@ -44,7 +44,7 @@ def test_more_work_takes_longer() -> None:
     assert seconds(2) > seconds(2, threads=2) == seconds(2, threads=16)
 
 
-def test_a_file_alone_is_fitted_except_by_a_draft() -> None:
+def test_a_file_without_cameras_is_fitted_except_in_a_draft() -> None:
     draft, asked, best = (
         estimate(ALONE, CompactOptions().with_settings({"budget": "10%", "effort": effort}))
         for effort in ("draft", "default", "best")

@@ -1,4 +1,4 @@
-"""Harmonics of degree 4, which splat-transform and gsply refuse in a ``.ply``: results have three, and notes say so."""
+"""Results of degree 4, which splat-transform and gsply refuse in a ``.ply``, get degree 3 and a note."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("name", "degree"), [("x.ply", 3), ("x.spz", 3), ("x.glb", 3)])
-def test_results_have_harmonics_of_three_degrees(folder: Path, name: str, degree: int) -> None:
+def test_results_of_degree_4_have_harmonics_of_degree_3(folder: Path, name: str, degree: int) -> None:
     document = compact_files(find_scene_files(folder), PLAIN, Outputs(folder / name))
     assert read_gaussians(folder / name).info.sh_degree == degree
     assert noted(document["notes"], "above degree 3")
     assert document["input"]["sh_degree"] == 4
 
 
-def test_a_result_s_size_is_that_of_three_degrees(folder: Path) -> None:
+def test_a_budget_of_bytes_counts_harmonics_of_degree_3(folder: Path) -> None:
     settings = PLAIN.with_settings({"budget": "30kB", "fill": True})
     document = compact_files(find_scene_files(folder), settings, Outputs(folder / "x.ply"))
     size = (folder / "x.ply").stat().st_size
@@ -47,7 +47,7 @@ def test_a_result_s_size_is_that_of_three_degrees(folder: Path) -> None:
     assert size <= 30_000 < size + 62 * 4
 
 
-def test_files_with_them_are_named(folder: Path, tiny: Tiny) -> None:
+def test_files_of_degree_4_are_noted(folder: Path, tiny: Tiny) -> None:
     assert noted(check_content(folder / "scene.ply").notes, "degree 4", "splat-transform 3.7")
     assert noted(gsmerge.inspect(folder)["notes"], "degree 4", "gsply")
     write_ply(folder / "three.ply", gsmerge.read_ply(folder / "scene.ply").gaussians, sh_degree=3)

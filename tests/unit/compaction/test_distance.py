@@ -1,4 +1,4 @@
-"""No result that is clearly worse than its input: how that is told, and in which ways a run goes on."""
+"""A result that is far from its input is recognised, and the run goes on in another way."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def prepared() -> Prepared:
     return prepare(make_room())
 
 
-def tiny(gaussians: Gaussians) -> Gaussians:
-    """Points in place of surfaces: nearly nothing is drawn."""
+def nearly_nothing(gaussians: Gaussians) -> Gaussians:
+    """Return points in place of surfaces: nearly nothing is drawn."""
     return replace(gaussians[::40], opacities=gaussians.opacities[::40] * np.float32(0.1))
 
 
 def slow_psnr(a: np.ndarray, b: np.ndarray, covered: np.ndarray) -> float:
-    """PSNR over the covered pixels of all pictures, blurred by OpenCV."""
+    """Return the PSNR over the covered pixels of all pictures, blurred by OpenCV."""
     blurred = [
         np.stack([cv2.GaussianBlur(p.clip(0, 1), (0, 0), DISTANCE_BLUR) for p in pictures]) for pictures in (a, b)
     ]
@@ -51,7 +51,7 @@ def slow_psnr(a: np.ndarray, b: np.ndarray, covered: np.ndarray) -> float:
 
 def test_distances_are_those_of_a_slow_reference(prepared: Prepared) -> None:
     scene = prepared.scene
-    result = tiny(scene.gaussians)
+    result = nearly_nothing(scene.gaussians)
     cameras = resize_cameras(
         scene.cameras, DISTANCE_PIXELS, round(DISTANCE_PIXELS * scene.cameras.height / scene.cameras.width)
     )
@@ -65,7 +65,7 @@ def test_distances_are_those_of_a_slow_reference(prepared: Prepared) -> None:
     assert [float(value) for value in re.findall(r"([\d.]+) dB", text)] == pytest.approx([distance, error], abs=0.3)
 
 
-def test_the_input_and_usual_results_are_not_far(room: Scene, prepared: Prepared) -> None:
+def test_neither_the_input_nor_a_usual_result_is_far(room: Scene, prepared: Prepared) -> None:
     assert describe_far(prepared.scene.gaussians, prepared) is None
     for settings in ({}, {"fit": "none"}, {"superpixels": "1%"}):
         assert not compact(room, effort="draft", **settings).report.is_far
@@ -76,7 +76,9 @@ def test_the_input_and_usual_results_are_not_far(room: Scene, prepared: Prepared
     [(20, 20 - TWICE_DB - 0.1, True), (20, 20 - TWICE_DB + 0.1, False), (60, WRONG_DB + 0.1, False), (None, 3, False),
      (20, None, False), (float("nan"), 3, False)],
 )  # fmt: skip
-def test_far_is_twice_the_error_and_wrong(before: float | None, after: float | None, expected: bool) -> None:
+def test_a_result_is_far_at_twice_the_error_where_that_is_clearly_wrong(
+    before: float | None, after: float | None, expected: bool
+) -> None:
     assert is_far(before, after) == expected
 
 
@@ -87,12 +89,12 @@ def spoil_fits(monkeypatch: pytest.MonkeyPatch, *, merges: bool) -> None:
     def spoilt(start: Any, scene: Any, options: Any, seed: int, **rest: Any) -> Any:
         fitted = fit_scene(start, scene, options, seed, **rest)
         is_kept = options.fit == "none" and not merges
-        return fitted if is_kept else replace(fitted, gaussians=tiny(fitted.gaussians))
+        return fitted if is_kept else replace(fitted, gaussians=nearly_nothing(fitted.gaussians))
 
     monkeypatch.setattr(pipeline, "fit_scene", spoilt)
 
 
-def test_a_run_goes_on_without_a_fit_that_spoils_it(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_is_made_again_without_the_fit_that_spoiled_it(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     spoil_fits(monkeypatch, merges=False)
     report = compact(room, effort="draft").report
     assert not report.is_far
@@ -102,7 +104,7 @@ def test_a_run_goes_on_without_a_fit_that_spoils_it(room: Scene, monkeypatch: py
     assert "without a fit" in again[0]
 
 
-def test_nothing_is_made_where_no_way_helps(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_is_refused_where_every_way_ends_far_from_the_input(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     spoil_fits(monkeypatch, merges=True)
     with refuses(TargetError, "expected a result as good as its input, found none", "--budget"):
         compact(room, effort="draft")

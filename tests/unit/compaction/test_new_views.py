@@ -1,4 +1,4 @@
-"""What a new viewpoint gains, as a report expects it."""
+"""A report says what gain to expect at a new viewpoint."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def pictured(scene: Scene) -> PicturedScene:
     return PicturedScene.with_pictures(scene, scene.images, scene.masks)
 
 
-def test_gains_are_those_of_the_trial_up_to_what_own_photos_gain_on_confirmed_depth() -> None:
+def test_the_expected_gain_lies_between_the_trial_and_own_photos_on_confirmed_depth() -> None:
     gain = OWN * 0.9 * 20 + (1 - OWN) * 6
     scores = (round(psnr, 2) for psnr in (18 + gain, 6 - SPREAD, 18 + SPREAD))  # between the trial and own photos
     assert TRIAL.predict(20, 40, 0.9) == NewViews(18, *scores, views=3)
@@ -39,19 +39,19 @@ def test_gains_are_those_of_the_trial_up_to_what_own_photos_gain_on_confirmed_de
     assert TRIAL.predict(20, 30, 0).gain == 0
 
 
-def test_the_input_shows_new_views_as_much_worse_than_own_photos_as_in_small() -> None:
+def test_new_views_of_the_input_score_below_own_photos_by_what_the_trial_found() -> None:
     assert TRIAL.predict(17, 40, 1).before == 15
     assert TRIAL.predict(23, 40, 1).before == 21
 
 
-def test_losses_are_expected_where_the_trial_or_own_photos_lose() -> None:
+def test_no_gain_is_expected_where_the_trial_or_own_photos_lose() -> None:
     worse = Trial(20, 18, 16.5, 2)
     assert worse.predict(20, 20, 1).gain == pytest.approx((1 - OWN) * -1.5)
     assert worse.predict(20, 19, 0.5).high == SPREAD
     assert TRIAL.predict(20, 19, 1).gain == 0  # own photos lose: no gain is expected
 
 
-def test_four_views_say_what_new_ones_gain(room: Scene) -> None:
+def test_a_report_of_four_views_expects_a_gain_of_new_views(room: Scene) -> None:
     report = compact(scenes.take_views(room, range(LEAST_VIEWS)), **QUICK).report
     assert report.new_views is not None
     assert 1 <= report.new_views.views <= LEAST_VIEWS
@@ -62,29 +62,29 @@ def test_four_views_say_what_new_ones_gain(room: Scene) -> None:
 
 
 @pytest.mark.parametrize("settings", [{"effort": "draft"}, {"new_views": False}])
-def test_drafts_and_who_asks_for_none_get_none(settings: dict[str, object], room: Scene) -> None:
+def test_new_views_are_not_tried_in_a_draft_or_when_switched_off(settings: dict[str, object], room: Scene) -> None:
     report = compact(room, **QUICK, **settings).report
     assert report.new_views is None
     assert "new views" not in report.seconds
 
 
-def test_a_draft_tells_who_asks(room: Scene) -> None:
+def test_new_views_are_tried_in_a_draft_on_request(room: Scene) -> None:
     assert compact(room, **QUICK, effort="draft", new_views=True).report.new_views is not None
 
 
-def test_too_few_photos_say_nothing(room: Scene) -> None:
+def test_new_views_are_not_tried_with_too_few_photos(room: Scene) -> None:
     assert compact(scenes.take_views(room, range(LEAST_VIEWS - 1)), **QUICK).report.new_views is None
     assert compact(replace(room, images=None), **QUICK).report.new_views is None
 
 
-def test_threads_change_nothing(room: Scene) -> None:
+def test_the_number_of_threads_does_not_change_the_trial(room: Scene) -> None:
     one, two = (compact(room, **QUICK, threads=threads) for threads in (1, 2))
     assert one.report.new_views is not None
     assert one.report.new_views == two.report.new_views
     assert scenes.identical(one.gaussians, two.gaussians)
 
 
-def test_a_trial_leaves_the_result_as_it_is(room: Scene) -> None:
+def test_a_trial_of_new_views_does_not_change_the_result(room: Scene) -> None:
     tried, without = (compact(room, **QUICK, new_views=wanted).gaussians for wanted in (True, False))
     assert scenes.identical(tried, without)
 
@@ -98,7 +98,7 @@ def test_views_left_out_together_are_no_neighbours(count: int) -> None:
     assert all(np.diff(views).min(initial=99) > 4 for views in rounds)
 
 
-def test_left_out_views_leave_neither_photos_nor_rows(room: Scene) -> None:
+def test_the_rest_has_neither_photos_nor_rows_of_left_out_views(room: Scene) -> None:
     prepared = prepare(room, PrepareOptions(poses="fixed"))
     left_out = leave_out(prepared.scene, [1, 3], prepared)
     assert left_out is not None
@@ -111,7 +111,7 @@ def test_left_out_views_leave_neither_photos_nor_rows(room: Scene) -> None:
     assert mean_seen(scores, left_out.shares) == pytest.approx(np.average(scores, weights=left_out.shares))
 
 
-def test_what_only_left_out_views_show_does_not_count() -> None:
+def test_pixels_that_only_left_out_views_show_do_not_count() -> None:
     """Rows without pixels do not say which view saw them: the others know nothing of a wall behind them."""
     scene = scenes.make_scene(scenes.wall(), scenes.arc(4))
     turn = np.diag([-1.0, 1, -1, 1])
@@ -132,7 +132,7 @@ def test_what_only_left_out_views_show_does_not_count() -> None:
     assert mark_seen(rest, turned).mean() == 0
 
 
-def test_small_scenes_keep_places_and_what_they_show(room: Scene) -> None:
+def test_a_shrunk_scene_keeps_the_positions_of_its_gaussians(room: Scene) -> None:
     scene = pictured(room)
     small = shrink_scene(scene, 4)
     assert (small.cameras.width, small.cameras.height) == (12, 9)
@@ -144,7 +144,7 @@ def test_small_scenes_keep_places_and_what_they_show(room: Scene) -> None:
 
 
 @pytest.mark.parametrize("scores", [(17.25, 21.5, 3.0, 5.5), (-1.5, 0.0, 0.2, 2.75), (30.12, 29.99, -1.4, 1.1)])
-def test_files_say_what_to_expect(scores: tuple[float, ...]) -> None:
+def test_expected_scores_are_read_back_from_a_comment(scores: tuple[float, ...]) -> None:
     comment = new_views_comment(ExpectedScores(*scores))
     assert read_expected_scores(["a comment", 3, comment]) == ExpectedScores(*scores)
     assert comment not in copied_comments([comment])  # a result of a result gets its own
@@ -160,7 +160,7 @@ def test_files_say_what_to_expect(scores: tuple[float, ...]) -> None:
         "gsmerge new views: 1e9.00 to 20.00 dB, gain 1.75 to 4.25 dB",
     ],
 )
-def test_other_comments_say_nothing(comment: object) -> None:
+def test_comments_of_another_form_have_no_expected_scores(comment: object) -> None:
     assert read_expected_scores([comment]) is None
     assert read_expected_scores([]) is None
 
@@ -173,5 +173,5 @@ def test_other_comments_say_nothing(comment: object) -> None:
         ((-3.0, -0.5), "0.5 to 3.0 dB farther"),
     ],
 )
-def test_gains_in_words(bounds: tuple[float, float], words: str) -> None:
+def test_a_range_of_gains_is_described_in_words(bounds: tuple[float, float], words: str) -> None:
     assert describe_gain(*bounds) == words

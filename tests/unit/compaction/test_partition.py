@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from gsmerge.compaction.partition import (
     SHARED,
+    Block,
     Covisibility,
     count_factors,
     measure_covisibility,
@@ -22,8 +23,8 @@ from gsmerge.plan import usual_blocks
 from gsmerge.types import Cameras, Scene
 
 
-def walk(num_views: int, reach: int = 3) -> np.ndarray:
-    """Weights of views in a row that share less the farther apart they are."""
+def walk_weights(num_views: int, reach: int = 3) -> np.ndarray:
+    """Return weights of views in a row that share less the farther apart they are."""
     distance = np.abs(np.arange(num_views)[:, None] - np.arange(num_views))
     weights = np.maximum(0.0, 1 - distance / (reach + 1))
     np.fill_diagonal(weights, 0)
@@ -46,9 +47,9 @@ def test_every_view_is_in_one_block(num_views: int, count: int, seed: int) -> No
 
 
 @pytest.mark.parametrize("order", ["walk", "shuffled"])
-def test_a_walk_is_cut_into_stretches(order: str) -> None:
+def test_views_of_a_walk_are_cut_into_stretches(order: str) -> None:
     places = np.arange(60) if order == "walk" else np.random.default_rng(0).permutation(60)
-    blocks = partition_views(walk(60)[places][:, places], 3)
+    blocks = partition_views(walk_weights(60)[places][:, places], 3)
     for block in blocks:
         stretch = np.sort(places[list(block.own)])
         assert np.array_equal(stretch, np.arange(stretch[0], stretch[0] + len(stretch)))
@@ -84,7 +85,7 @@ def test_many_gaussians_or_views_ask_for_blocks(num_gaussians: int, num_views: i
 
 @pytest.fixture(scope="module")
 def two_sides() -> Scene:
-    """Three views of a wall from near, and three of the same wall from twice as far."""
+    """Make three views of a wall from near, and three of the same wall from twice as far."""
     near, far = scenes.arc(3, 48, 36, span=0.3), scenes.arc(3, 48, 36, span=0.3)
     viewmats = far.viewmats.copy()
     viewmats[:, 2, 3] += 2.0
@@ -92,7 +93,7 @@ def two_sides() -> Scene:
     return scenes.make_scene(scenes.wall(), cameras)
 
 
-def test_what_views_see_of_each_other(two_sides: Scene) -> None:
+def test_covisibility_is_the_share_that_one_view_sees_of_another(two_sides: Scene) -> None:
     covisibility = measure_covisibility(two_sides)
     shares = covisibility.shares
     assert np.allclose(np.diag(shares), 1)
@@ -131,7 +132,7 @@ def test_points_belong_to_the_nearest_view_that_sees_them(two_sides: Scene) -> N
     assert len(owning_views(np.empty((0, 3)), covisibility, views)) == 0
 
 
-def test_owners_see_a_point_or_have_it_in_their_picture_or_are_nearest() -> None:
+def test_owners_are_chosen_by_sight_then_by_picture_then_by_distance() -> None:
     rng = np.random.default_rng(0)
     turned = np.linalg.qr(rng.normal(size=(30, 3, 3)))[0]
     turned *= np.linalg.det(turned)[:, None, None]
@@ -159,6 +160,4 @@ def test_blocks_that_see_the_same_need_more_gaussians(two_sides: Scene) -> None:
 
 
 def partition_of(*owns: list[int]) -> list:
-    from gsmerge.compaction.partition import Block
-
     return [Block(tuple(own), ()) for own in owns]

@@ -1,4 +1,4 @@
-"""How many Gaussians: limits, the scene's curve, and the search for a quality."""
+"""The number of Gaussians follows from limits, the scene's curve and the search for a quality."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def log2(number: float) -> float:
     return float(elementary.log(number) / elementary.log(2))
 
 
-def points(*values: tuple[int, float, float]) -> list[CurvePoint]:
+def curve_points(*values: tuple[int, float, float]) -> list[CurvePoint]:
     return [CurvePoint(*value) for value in values]
 
 
@@ -41,7 +41,7 @@ def make_plan(
     *,
     keeps_fidelity: bool = False,
 ) -> Plan:
-    """What a search reads of a plan."""
+    """Make what a search reads of a plan."""
     limits = SimpleNamespace(
         min_count=least, max_count=most, default=most if default is None else default, num_input=most
     )
@@ -60,7 +60,7 @@ def make_plan(
         ({"budget": "quest3"}, None, DEVICES["quest3"]),
     ],
 )
-def test_limits(settings: dict[str, object], exact: int | None, most: int) -> None:
+def test_counts_are_limited_by_the_budget(settings: dict[str, object], exact: int | None, most: int) -> None:
     options = BudgetOptions(**settings)
     assert exact_count(options, 50_000_000, 0) == exact
     assert max_allowed(options, 50_000_000, 0) == most
@@ -69,7 +69,7 @@ def test_limits(settings: dict[str, object], exact: int | None, most: int) -> No
 @pytest.mark.parametrize(
     ("budget", "taken"), [("2%", 20_000), ("40%", 70_000), ("20KB", 286), ("50MB", 70_000), ("quest3", 70_000)]
 )
-def test_no_more_than_new_views_gain_from(budget: str, taken: int) -> None:
+def test_counts_are_limited_to_what_new_views_gain_from(budget: str, taken: int) -> None:
     options = BudgetOptions(budget=budget, most=70_000)
     assert exact_count(options, 1_000_000, 0) == taken
     assert max_allowed(options, 1_000_000, 0) == taken
@@ -78,7 +78,7 @@ def test_no_more_than_new_views_gain_from(budget: str, taken: int) -> None:
     assert not replace(options, budget=90_000).is_limit
 
 
-def test_a_small_scene_is_its_own_limit() -> None:
+def test_counts_are_limited_to_those_of_a_small_scene() -> None:
     assert max_allowed(BudgetOptions(budget="mobile"), 777, 0) == 777
     assert exact_count(BudgetOptions(budget=9999), 777, 0) == 777
 
@@ -90,12 +90,12 @@ def test_a_small_scene_is_its_own_limit() -> None:
         ("levels", 0), ("levels", 9),
     ],
 )  # fmt: skip
-def test_refused(name: str, value: object) -> None:
+def test_budgets_out_of_range_are_refused(name: str, value: object) -> None:
     with refuses(ValueError, name, value if name == "levels" else f"'{value}'"):
         BudgetOptions(**{name: value})
 
 
-def test_qualities() -> None:
+def test_qualities_are_read_as_a_target_or_a_loss() -> None:
     psnr, loss, best = (BudgetOptions(quality=text) for text in ("30dB", "-0.2 db", "-0dB"))
     assert (psnr.target_psnr, psnr.max_drop) == (30.0, None)
     assert (loss.target_psnr, loss.max_drop) == (None, 0.2)
@@ -103,25 +103,25 @@ def test_qualities() -> None:
 
 
 @pytest.mark.parametrize("share", [0.044, 0.02, 1, 1e-6, 0.087, 1 / 3])
-def test_shares_are_exact(share: float) -> None:
+def test_a_share_is_read_back_exactly_from_its_text(share: float) -> None:
     assert parse_share(share_text(share)) == share
 
 
-def test_rungs_rise_within_their_limits() -> None:
+def test_counts_of_the_curve_rise_within_the_limits() -> None:
     assert curve_counts(None, 1000, 10, 5000)[0] == [125, 250, 500, 1000]
     assert curve_counts(0.2, 1000, 10, 5000)[0] == [62, 125, 250, 500, 1000, 2000]
     assert curve_counts(None, 1000, 300, 900)[0] == [300, 500, 900]
     assert curve_counts(None, 1000, 100, 100)[0] == [100]
 
 
-def test_levels_end_where_a_view_would_have_none() -> None:
+def test_counts_of_levels_end_where_a_view_would_have_none() -> None:
     assert level_counts(6400, 4, 12) == [1600, 400, 100]
     assert level_counts(6400, 4, 200) == [1600, 400]
     assert level_counts(6400, 1, 12) == []
 
 
 def test_count_within_is_read_off_the_curve() -> None:
-    curve = points((100, 20.0, 0), (200, 22.0, 0), (400, 23.0, 0), (800, 22.5, 0))
+    curve = curve_points((100, 20.0, 0), (200, 22.0, 0), (400, 23.0, 0), (800, 22.5, 0))
     assert count_within(curve, 0.0) == 400
     assert count_within(curve, 0.5) == math.ceil(200 * 2**0.5)
     assert count_within(curve, 1.0) == 200
@@ -130,48 +130,48 @@ def test_count_within_is_read_off_the_curve() -> None:
 
 
 def test_count_within_falls_as_more_may_be_lost() -> None:
-    curve = points((100, 20.0, 0), (200, 24.0, 0), (400, 23.5, 0), (800, 26.0, 0), (1600, 26.1, 0))
+    curve = curve_points((100, 20.0, 0), (200, 24.0, 0), (400, 23.5, 0), (800, 26.0, 0), (1600, 26.1, 0))
     counts = [count_within(curve, drop / 10) for drop in range(80)]
     assert counts == sorted(counts, reverse=True)
 
 
-def test_knee_of_a_curve_that_stops_rising() -> None:
-    flat_after_400 = points((100, 20, 0.5), (200, 22, 0.6), (400, 23, 0.7), (800, 23, 0.7), (1600, 23, 0.7))
+def test_knee_is_where_the_curve_stops_rising() -> None:
+    flat_after_400 = curve_points((100, 20, 0.5), (200, 22, 0.6), (400, 23, 0.7), (800, 23, 0.7), (1600, 23, 0.7))
     assert 283 <= curve_knee(flat_after_400) <= 566  # between the middles of the steep and of the flat part
-    assert curve_knee(points((100, 20, 0.5), (200, 22, 0.6), (400, 24, 0.7))) == 400
-    assert curve_knee(points((100, 24, 0.7), (200, 22, 0.6), (400, 20, 0.5))) == 100
-    assert curve_knee(points((100, 24, 0.7))) == 100
+    assert curve_knee(curve_points((100, 20, 0.5), (200, 22, 0.6), (400, 24, 0.7))) == 400
+    assert curve_knee(curve_points((100, 24, 0.7), (200, 22, 0.6), (400, 20, 0.5))) == 100
+    assert curve_knee(curve_points((100, 24, 0.7))) == 100
 
 
 def test_knee_weighs_structure_against_psnr() -> None:
     """A blurred scene can have the better PSNR; it is not the knee while structure still grows."""
     psnr_falls = [(100, 22.0), (200, 21.9), (400, 21.8), (800, 21.7)]
-    without = points(*((count, psnr, 0.7) for count, psnr in psnr_falls))
-    grows = points(*((count, psnr, 0.60 + 0.04 * i) for i, (count, psnr) in enumerate(psnr_falls)))
+    without = curve_points(*((count, psnr, 0.7) for count, psnr in psnr_falls))
+    grows = curve_points(*((count, psnr, 0.60 + 0.04 * i) for i, (count, psnr) in enumerate(psnr_falls)))
     assert curve_knee(without) == 100
     assert curve_knee(grows) == 800
 
 
 def rises(count: int) -> float:
-    """2 dB per doubling."""
+    """Return a PSNR that rises by 2 dB per doubling."""
     return 20 + 2 * log2(count / 1000)
 
 
 def search(curve: Callable[[int], float], target: float, start: int, least: int, most: int) -> CountSearch:
     """Run a search on a curve that is known, instead of building scenes."""
     counts = CountSearch(make_plan(target_psnr=target, least=least, most=most), start)
-    counts.run(lambda count: built(count, curve(count)))
+    counts.run(lambda count: fake_result(count, curve(count)))
     return counts
 
 
-def built(count: int | None, psnr: float) -> Any:
+def fake_result(count: int | None, psnr: float) -> Any:
     record = SimpleNamespace(seconds={})
     return SimpleNamespace(count=count, psnr=psnr, deciding_psnr=psnr, gaussians=range(count or 0), record=record)
 
 
 @pytest.mark.parametrize("start", [10, 300, 1000, 4000, 90_000])
 @pytest.mark.parametrize("target", [17.0, 20.0, 23.3, 27.0])
-def test_search_finds_the_fewest(start: int, target: float) -> None:
+def test_search_finds_the_fewest_gaussians_that_meet_the_target(start: int, target: float) -> None:
     actual = search(rises, target, start, 10, 100_000)
     fewest = 1000 * 2 ** ((target - 20) / 2)
     best = actual.best
@@ -181,12 +181,12 @@ def test_search_finds_the_fewest(start: int, target: float) -> None:
     assert len(actual.psnrs) <= MAX_BUILDS
 
 
-def test_search_near_the_answer_ends_close_to_it() -> None:
+def test_search_that_starts_near_the_answer_ends_close_to_the_answer() -> None:
     count = search(rises, 24.0, 3000, 10, 100_000).best.count
     assert 4000 <= count <= 4000 * 1.3
 
 
-def test_search_says_when_it_is_out_of_reach() -> None:
+def test_search_says_that_the_target_is_out_of_reach() -> None:
     actual = search(rises, 40.0, 1000, 10, 5000)
     reached = f"the input views reach {rises(5000):.2f} dB with 5,000 Gaussians"
     assert actual.facts(actual.best).unmet == f"quality: 40 dB was asked for; {reached}, the best that was tried"
@@ -212,32 +212,34 @@ def test_search_begins_within_its_limits(default: int, first: int) -> None:
     assert search_count(prepared, plan, cast("Build", None)).first == first
 
 
-def keep(curve: Callable[[int], float], default: int, most: int, *, rendered: bool = True) -> CountSearch:
+def search_as_good_as_input(
+    curve: Callable[[int], float], default: int, most: int, *, rendered: bool = True
+) -> CountSearch:
     """Run the search that keeps the input by default: 32.5 dB of its renders, or of photos."""
     plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_fidelity=True)
     counts = CountSearch(plan, default, rendered)
-    counts.run(lambda count: built(count, curve(count)))
+    counts.run(lambda count: fake_result(count, curve(count)))
     return counts
 
 
 def test_the_usual_count_is_kept_where_it_is_good_enough() -> None:
-    actual = keep(lambda _: 40.0, 1000, 20_000)
+    actual = search_as_good_as_input(lambda _: 40.0, 1000, 20_000)
     assert list(actual.psnrs) == [1000]  # not fewer, and no further run
     assert actual.notes == []
 
 
 @pytest.mark.parametrize("slope", [2.0, 3.0, 5.0])
 @pytest.mark.parametrize("needed", [1.1, 2.0, 7.0])
-def test_more_are_taken_until_the_input_is_kept(slope: float, needed: float) -> None:
-    actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 20_000)
+def test_the_count_rises_until_renders_of_the_input_are_kept(slope: float, needed: float) -> None:
+    actual = search_as_good_as_input(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 20_000)
     assert actual.best.psnr >= 32.5
     assert actual.best.count <= 1.4 * 1000 * needed
     assert len(actual.psnrs) <= 5
     assert noted(actual.notes, f"{actual.best.count:,} of 20,000")
 
 
-def test_what_is_compact_already_is_kept() -> None:
-    actual = keep(lambda count: 120.0 if count == 5000 else 25.0, 220, 5000)
+def test_all_gaussians_of_a_compact_scene_are_kept() -> None:
+    actual = search_as_good_as_input(lambda count: 120.0 if count == 5000 else 25.0, 220, 5000)
     assert actual.best.count == 5000
     assert noted(actual.notes, "compact already", "5,000 of 5,000")
     assert actual.facts(actual.best).unmet is None
@@ -245,9 +247,11 @@ def test_what_is_compact_already_is_kept() -> None:
 
 @pytest.mark.parametrize("slope", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("needed", [1.1, 3.0, 12.0])
-def test_more_are_taken_until_photos_are_shown_as_well(slope: float, needed: float) -> None:
+def test_the_count_rises_until_photos_are_shown_as_by_the_input(slope: float, needed: float) -> None:
     """Beyond the four times the usual count that a quality may take."""
-    actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 40_000, rendered=False)
+    actual = search_as_good_as_input(
+        lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 40_000, rendered=False
+    )
     assert actual.is_met
     assert actual.best.count <= 1000 * needed * 2 ** (FIDELITY_LOSS / slope) * SAME_COUNT_RATIO
     assert len(actual.psnrs) <= 5
@@ -255,24 +259,24 @@ def test_more_are_taken_until_photos_are_shown_as_well(slope: float, needed: flo
 
 
 @pytest.mark.parametrize("curve", [lambda _: 12.0, lambda count: 13 - log2(count / 1000)])
-def test_photos_that_no_count_shows_end_the_search(curve: Callable[[int], float]) -> None:
+def test_search_ends_early_where_no_count_shows_the_photos(curve: Callable[[int], float]) -> None:
     """As of another scene. The best is kept, even if it is the usual count."""
-    actual = keep(curve, 1000, 20_000, rendered=False)
+    actual = search_as_good_as_input(curve, 1000, 20_000, rendered=False)
     assert len(actual.psnrs) <= MAX_BUILDS
     assert (actual.best.count, actual.is_met, actual.facts(actual.best).unmet) == (1000, False, None)
     assert actual.notes == []
 
 
-def test_a_count_that_is_too_few_is_not_called_enough() -> None:
-    actual = keep(lambda count: 20 + log2(count / 1000), 1000, 3000, rendered=False)
+def test_the_note_says_that_the_largest_count_is_too_few() -> None:
+    actual = search_as_good_as_input(lambda count: 20 + log2(count / 1000), 1000, 3000, rendered=False)
     assert actual.best.count == 3000
     assert noted(actual.notes, "each of the 2 counts", "over 0.3 dB worse")
 
 
 @pytest.mark.parametrize("first", [300, None])
-def test_one_count_is_built_once_where_no_quality_is_asked_for(first: int | None) -> None:
+def test_one_count_is_built_where_no_quality_is_asked_for(first: int | None) -> None:
     counts = CountSearch(make_plan(), first)
-    counts.run(lambda count: built(count, 20.0))
+    counts.run(lambda count: fake_result(count, 20.0))
     assert [candidate.count for candidate in counts.candidates] == [first]
 
 
@@ -280,12 +284,12 @@ def judge_left_out(curve: Callable[[int], float], target: float, most: int | Non
     """Run a search that photos judge which the builds leave out."""
     photos = cast("LeftOut", SimpleNamespace(photos=range(2)))
     counts = CountSearch(make_plan(target_psnr=target, least=10, most=100_000), 1000, left_out=photos, most=most)
-    counts.run(lambda count: built(count, curve(count)))
+    counts.run(lambda count: fake_result(count, curve(count)))
     return counts
 
 
 @pytest.mark.parametrize("target", [18.0, 20.0, 21.0, 22.4])
-def test_photos_left_out_are_met_by_few_builds(target: float) -> None:
+def test_few_builds_meet_a_target_on_photos_left_out(target: float) -> None:
     """What is written is built of all views, with a count between those tried."""
     actual = judge_left_out(lambda count: 20 + log2(count / 1000), target)
     assert actual.is_met
@@ -294,7 +298,7 @@ def test_photos_left_out_are_met_by_few_builds(target: float) -> None:
     assert actual.count >= 0.9 * 1000 * 2 ** (target - 20)
 
 
-def test_photos_left_out_take_no_more_than_they_gain_from() -> None:
+def test_search_on_photos_left_out_stops_at_the_count_they_gain_from() -> None:
     actual = judge_left_out(lambda count: 20 + log2(count / 1000), 30.0, most=1600)
     assert max(actual.psnrs) == actual.count == 1600
     facts, reached = actual.facts(actual.best), "photos left out reach 20.68 dB with 1,600 Gaussians"

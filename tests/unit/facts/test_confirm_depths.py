@@ -1,4 +1,4 @@
-"""How far the views of a scene confirm each other's depth."""
+"""The views of a scene confirm or contradict each other's depth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def wall() -> Scene:
 
 
 def turned_away(scene: Scene, view: int) -> Scene:
-    """One view with all that it sees turned half around the vertical axis through its eye."""
+    """Turn one view with all that it sees half around the vertical axis through its eye."""
     eye, half = scene.cameras.centres[view], np.diag([-1.0, 1.0, -1.0])
     viewmats = scene.cameras.viewmats.copy()
     viewmats[view, :3, :3] = viewmats[view, :3, :3] @ half
@@ -87,7 +87,7 @@ def test_a_wall_that_all_views_see_is_confirmed(wall: Scene) -> None:
     assert agreement.share == MOST_PER_PIXEL
 
 
-def test_what_stands_nearer_is_contradicted(wall: Scene) -> None:
+def test_gaussians_in_front_of_what_other_views_see_are_contradicted(wall: Scene) -> None:
     """A half of one view, then of two: an eighth and a quarter of all pixels."""
     one, two = (confirm_depths(with_nearer_half(wall, views)) for views in ([1], [0, 2]))
     assert one.contradicted == pytest.approx(1 / 8, abs=0.05)
@@ -95,21 +95,21 @@ def test_what_stands_nearer_is_contradicted(wall: Scene) -> None:
     assert two.confirmed < one.confirmed < confirm_depths(wall).confirmed
 
 
-def test_views_that_look_elsewhere_are_alone(wall: Scene) -> None:
+def test_pixels_of_a_view_that_looks_elsewhere_are_alone(wall: Scene) -> None:
     agreement = confirm_depths(turned_away(wall, 2))
     assert agreement.alone == pytest.approx(1 / VIEWS + confirm_depths(wall).alone, abs=0.05)
     assert agreement.confirmed > 0.7
 
 
 @pytest.mark.parametrize("spoilt", [[], [1], [0, 2]])
-def test_shares_are_those_of_a_plain_loop(spoilt: list[int], wall: Scene) -> None:
+def test_shares_of_agreement_are_those_of_a_plain_loop(spoilt: list[int], wall: Scene) -> None:
     """But for the pixels that are drawn."""
     scene = with_nearer_half(wall, spoilt)
     actual, expected = confirm_depths(scene).to_dict(), confirm_slowly(scene).to_dict()
     assert actual == pytest.approx(expected, abs=0.03)
 
 
-def test_pixels_without_a_gaussian_do_not_count(wall: Scene) -> None:
+def test_pixels_without_a_gaussian_do_not_count_in_the_agreement(wall: Scene) -> None:
     valid = wall.pixels.shown.copy()
     valid[:, :, WIDTH // 2 :] = False
     half = scenes.shown_in(with_nearer_half(wall, [0, 1, 2, 3]), valid)
@@ -117,14 +117,14 @@ def test_pixels_without_a_gaussian_do_not_count(wall: Scene) -> None:
     assert confirm_depths(scenes.shown_in(wall, np.zeros_like(wall.pixels.shown))) is None
 
 
-def test_scenes_in_which_nothing_can_be_compared_have_none(wall: Scene) -> None:
+def test_scenes_in_which_nothing_can_be_compared_have_no_agreement(wall: Scene) -> None:
     assert confirm_depths(scenes.take_views(wall, [0])) is None
     assert confirm_depths(unaligned_scenes.without_order(wall)) is None
     none = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
     assert confirm_depths(Scene(wall.gaussians[:0], none, None, None, ())) is None
 
 
-def test_the_worst_part_is_named(wall: Scene) -> None:
+def test_the_part_of_the_views_that_is_contradicted_most_is_named(wall: Scene) -> None:
     """The right half of two views; of a view that is alone all is, which no part says."""
     agreement = confirm_depths(with_nearer_half(wall, [0, 2]))
     assert (agreement.contradicted_part, agreement.alone_part) == (f"right third of 2 of {VIEWS} views", "")
@@ -135,14 +135,14 @@ def test_the_worst_part_is_named(wall: Scene) -> None:
     assert "the depth is wrong (right third of 2 of 4 views)" in wrong
 
 
-def test_what_a_scene_bears_falls_with_the_share() -> None:
+def test_the_share_of_gaussians_falls_with_the_confirmed_share() -> None:
     shares = [Agreement(confirmed, 0, 0).share for confirmed in (1, 0.75, 0.7, 0.65, 0.6, 0.1)]
     assert shares == sorted(shares, reverse=True)
     assert shares[0] == shares[1] == MOST_PER_PIXEL
     assert shares[1] > shares[2] > shares[3] > shares[4] == shares[5] == FEWEST
 
 
-def test_a_poor_scene_says_why() -> None:
+def test_advice_on_a_poor_scene_says_why_it_is_poor() -> None:
     assert Agreement(0.5, 0.5, 0.0).advice is None
     lonely, wrong = Agreement(0.24, 0.14, 0.34).advice, Agreement(0.34, 0.41, 0.07).advice
     assert lonely is not None
@@ -151,7 +151,7 @@ def test_a_poor_scene_says_why() -> None:
     assert all(word in wrong for word in ("34 %", "depth is wrong"))
 
 
-def test_photos_from_one_point_are_said_to_be_pieces_of_a_panorama(wall: Scene) -> None:
+def test_advice_on_photos_from_one_point_names_a_panorama(wall: Scene) -> None:
     """Whatever their depths say of one another."""
     cameras = wall.cameras
     centre = cameras.centres[0]
@@ -167,7 +167,7 @@ def test_photos_from_one_point_are_said_to_be_pieces_of_a_panorama(wall: Scene) 
     assert not whole.from_one_point
 
 
-def test_what_lies_beyond_a_crop_contradicts_nothing(wall: Scene) -> None:
+def test_pixels_beyond_a_crop_contradict_nothing(wall: Scene) -> None:
     """Pixels without a Gaussian say nothing, and few pixels too little."""
     whole, pixels = confirm_depths(wall), wall.get_pixels()
     assert whole is not None

@@ -1,4 +1,4 @@
-"""How many Gaussians a budget, a file size and a device mean."""
+"""A budget, a file size or a device means a number of Gaussians."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from gsmerge.settings.budget import parse_budget, parse_bytes
         ("4e4", 40_000),
     ],
 )
-def test_budget(text: str | int, count: int) -> None:
+def test_budgets_are_read_as_counts_of_gaussians(text: str | int, count: int) -> None:
     assert parse_budget(text, 1_000_000) == count
 
 
@@ -45,7 +45,7 @@ def test_budget(text: str | int, count: int) -> None:
     ],
     ids=["none", "nothing", "above everything"],
 )
-def test_budgets_that_are_refused(texts: list[str], expected: str) -> None:
+def test_impossible_budgets_are_refused(texts: list[str], expected: str) -> None:
     for text in texts:
         with refuses(ValueError, "budget", expected, f"'{text}'"):
             parse_budget(text, 1000)
@@ -55,19 +55,19 @@ def test_budgets_that_are_refused(texts: list[str], expected: str) -> None:
     ("text", "size"),
     [("5MB", 5_000_000), ("5 mb", 5_000_000), ("1.5KiB", 1536), ("77", 77), (77, 77), ("2GB", 2 * 10**9)],
 )
-def test_bytes(text: str | int, size: int) -> None:
+def test_sizes_are_read_as_bytes(text: str | int, size: int) -> None:
     assert parse_bytes(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "MB", "5 XB", "-5MB", "5MBB", "1e6"])
-def test_bytes_that_are_none(text: str) -> None:
+def test_impossible_sizes_are_refused(text: str) -> None:
     with refuses(ValueError, "budget", '"5MB"', f"'{text}'"):
         parse_bytes(text)
 
 
 @pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize("count", [1, 9, 10, 144])
-def test_file_bytes_are_those_of_the_file(count: int, tmp_path: Path, degree: int) -> None:
+def test_file_bytes_are_the_size_of_the_written_file(count: int, tmp_path: Path, degree: int) -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 16, 9), degree=degree)
     write_ply(tmp_path / f"{count}.ply", scene.gaussians[:count])
     assert (tmp_path / f"{count}.ply").stat().st_size == file_bytes(count, degree)
@@ -83,7 +83,7 @@ def test_count_for_bytes_is_the_most_that_fits(degree: int) -> None:
             assert file_bytes(count, degree) <= size < file_bytes(count + 1, degree)
 
 
-def test_count_for_bytes_out_of_range() -> None:
+def test_sizes_and_degrees_out_of_range_have_no_count() -> None:
     with refuses(ValueError, "budget", 502 + COMMENT_BYTES, 100):
         count_for_bytes(100, 0)
     with refuses(ValueError, "sh_degree", "0 to 4", 5):

@@ -1,4 +1,4 @@
-"""Pictures of the input where no view looks: what is added, to which scenes, and what it is worth."""
+"""Pictures of the input are drawn where no view looks."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def room() -> Scene:
 
 
 def seen_from(room: Scene, views: Sequence[int]) -> Scene:
-    """All Gaussians of the room in no order, with the cameras and photos of some views."""
+    """Return all Gaussians of the room in no order, with the cameras and photos of some views."""
     whole = unaligned_scenes.without_order(room)
     names = tuple(room.names[view] for view in views)
     return replace(whole, cameras=room.cameras[views], images=room.images[views], names=names)
 
 
 def pictured(scene: Scene) -> PicturedScene:
-    """The canonical scene with its pixels and pictures."""
+    """Return the canonical scene with its pixels and pictures."""
     return PicturedScene.with_pictures(with_pixels(canonicalise(scene)[0]), scene.images, None)
 
 
@@ -54,12 +54,14 @@ def make_part() -> PicturedScene:
 
 @pytest.fixture(scope="module")
 def drawings() -> tuple[PicturedScene, PicturedScene]:
-    """That part of the room, and the same with drawings from outside."""
+    """Return that part of the room, and the same with drawings from outside."""
     part = make_part()
     return part, draw_outside(part)
 
 
-def test_drawings_count_where_they_show_mainly_what_no_view_sees(drawings: tuple[PicturedScene, PicturedScene]) -> None:
+def test_drawings_from_outside_count_where_they_show_what_no_view_sees(
+    drawings: tuple[PicturedScene, PicturedScene],
+) -> None:
     part, drawn = drawings
     placed = drawn.cameras[range(len(part), len(drawn))]
     np.testing.assert_array_equal(drawn.images[len(part) :], render(part.gaussians, placed).images.clip(0, 1))
@@ -73,7 +75,7 @@ def test_drawings_count_where_they_show_mainly_what_no_view_sees(drawings: tuple
     assert drawn.pixels.homes[unseen].max() >= len(part) * part.pixels_per_view  # and so they are members
 
 
-def test_own_views_stay_as_they_are(drawings: tuple[PicturedScene, PicturedScene]) -> None:
+def test_drawings_from_outside_do_not_change_own_views(drawings: tuple[PicturedScene, PicturedScene]) -> None:
     part, drawn = drawings
     assert len({*drawn.names}) == len(drawn) > len(part)
     assert drawn.gaussians is part.gaussians
@@ -87,8 +89,8 @@ def test_own_views_stay_as_they_are(drawings: tuple[PicturedScene, PicturedScene
 
 
 def test_larger_photos_get_larger_drawings(drawings: tuple[PicturedScene, PicturedScene]) -> None:
-    part, drawn = drawings
     """Those of the views are read as before, by their own numbers."""
+    part, drawn = drawings
     photos = drawn.large_photos
     assert [photos.read(number)[0, 0, 0] for number in photos.ids[: len(part)]] == [7, 4]
     np.testing.assert_allclose(photos.Ks, drawn.cameras.Ks * DOUBLE)
@@ -98,7 +100,7 @@ def test_larger_photos_get_larger_drawings(drawings: tuple[PicturedScene, Pictur
 
 
 @pytest.mark.parametrize("far", [0, VIEWS * 32 * 24], ids=["views see all", "views see nothing"])
-def test_other_scenes_stay_as_they_are(room: Scene, far: int) -> None:
+def test_nothing_is_drawn_where_views_see_all_or_nothing(room: Scene, far: int) -> None:
     scene = pictured(seen_from(room, range(VIEWS)))
     if far:
         scene = with_pixels(replace(scene, gaussians=unaligned_scenes.far_behind(scene.gaussians, far), pixels=None))
@@ -117,7 +119,7 @@ CALLS: dict[str, Callable[[Scene], object]] = {
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_parts_of_a_scene_draw_nothing(
+def test_nothing_is_drawn_for_parts_of_a_scene(
     room: Scene, monkeypatch: pytest.MonkeyPatch, call: Callable[[Scene], object]
 ) -> None:
     """Other views may see what theirs do not."""
@@ -125,7 +127,7 @@ def test_parts_of_a_scene_draw_nothing(
     call(room)
 
 
-def test_what_no_view_sees_stays_in_a_result(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gaussians_that_no_view_sees_stay_in_a_result(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     part, away = seen_from(room, [0, 1]), seen_from(room, [2])
 
     def compact_part() -> CompactResult:
@@ -136,5 +138,5 @@ def test_what_no_view_sees_stays_in_a_result(room: Scene, monkeypatch: pytest.Mo
     assert noted(result.report.notes, "no view sees 5 % of the Gaussians", "from 1 places")
     monkeypatch.setattr("gsmerge.facts.prepare.draw_outside", lambda scene: scene)
     scores = [scenes.psnr_of(gaussians, away) for gaussians in (result.gaussians, compact_part().gaussians)]
-    assert scores[0] > scores[1] + 4
-    assert scores[0] > scenes.psnr_of(part.gaussians, away) - 3
+    assert scores[0] > scores[1] + 4  # dB: without drawings a part is missing
+    assert scores[0] > scenes.psnr_of(part.gaussians, away) - 3  # dB: a result of 300 Gaussians is coarser

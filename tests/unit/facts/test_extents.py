@@ -1,4 +1,4 @@
-"""Large parts of photos in which a scene shows nothing: they stay empty, unless photos are asked for."""
+"""Large parts of photos in which a scene shows nothing stay empty, unless photos are asked for."""
 
 from __future__ import annotations
 
@@ -24,19 +24,14 @@ def room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
 
 
-def keep(scene: Scene, valid: np.ndarray) -> Scene:
-    """The scene without the rows of some pixels."""
-    return scenes.shown_in(scene, valid)
-
-
 def without_top(scene: Scene) -> Scene:
     valid = scene.pixels.shown.copy()
     valid[:, :THIRD] = False
-    return keep(scene, valid)
+    return scenes.shown_in(scene, valid)
 
 
 def ball_alone(scene: Scene) -> Scene:
-    """The Gaussians of the ball without pixels, beside photos of the whole room."""
+    """Return the Gaussians of the ball without pixels, beside photos of the whole room."""
     near = np.linalg.norm(scene.gaussians.means - np.array([0.2, 0.1, 2.6]), axis=1) < 0.55
     return replace(scene, gaussians=scene.gaussians[np.flatnonzero(near)], pixels=None)
 
@@ -45,7 +40,7 @@ def alphas(gaussians: Gaussians, scene: Scene) -> np.ndarray:
     return np.asarray(render(gaussians, scene.cameras).alphas[..., 0])
 
 
-def compared(scene: Scene, **settings: Any) -> tuple[np.ndarray, np.ndarray, list[str]]:
+def compare_extents(scene: Scene, **settings: Any) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return what the input and its result cover, and the notes that name the setting."""
     result = compact(scene, **FIT, **settings)
     notes = [note for note in result.report.notes if "--set extent=photos" in note]
@@ -53,7 +48,7 @@ def compared(scene: Scene, **settings: Any) -> tuple[np.ndarray, np.ndarray, lis
 
 
 def test_a_part_without_rows_stays_empty(room: Scene) -> None:
-    before, after, notes = compared(without_top(room))
+    before, after, notes = compare_extents(without_top(room))
     top = np.s_[:, : THIRD - 2 * RIM_PIXELS]
     assert after[top].mean() <= before[top].mean() + 0.02
     assert after[:, THIRD + RIM_PIXELS :].mean() > 0.9
@@ -65,12 +60,12 @@ def test_thin_rows_are_not_taken_for_empty_parts(room: Scene) -> None:
     """Rows of which a ray meets a sixth show the whole room; without those of the top they show all but the top."""
     for scene, count in ((room, 0), (without_top(room), 1)):
         faint = replace(scene.gaussians, opacities=0.02 * scene.gaussians.opacities)
-        _, _, notes = compared(replace(scene, gaussians=faint, pixels=None))
+        _, _, notes = compare_extents(replace(scene, gaussians=faint, pixels=None))
         assert len(notes) == count
 
 
-def test_photos_fill_it_where_it_is_asked_for(room: Scene) -> None:
-    _, after, notes = compared(without_top(room), extent="photos")
+def test_photos_fill_an_empty_part_where_that_is_asked_for(room: Scene) -> None:
+    _, after, notes = compare_extents(without_top(room), extent="photos")
     assert after[:, :THIRD].mean() > 0.9
     assert notes == []
 
@@ -79,15 +74,15 @@ def test_borders_and_small_holes_are_filled(room: Scene) -> None:
     valid = np.zeros_like(room.pixels.shown)
     valid[:, 3:-3, 3:-3] = True
     valid[:, 30:35, 40:45] = False
-    _, after, notes = compared(keep(room, valid))
+    _, after, notes = compare_extents(scenes.shown_in(room, valid))
     assert after.mean() > 0.95
     assert after[:, 30:35, 40:45].mean() > 0.9
     assert notes == []
 
 
-def test_an_object_alone_stays_alone(room: Scene) -> None:
+def test_an_object_stays_alone_beside_photos_of_its_room(room: Scene) -> None:
     scene = ball_alone(room)
-    before, after, _ = compared(scene)
+    before, after, _ = compare_extents(scene)
     around = np.ones((2 * AROUND + 1,) * 2, np.uint8)
     beside = np.stack([cv2.dilate((alpha > 0.02).astype(np.uint8), around) for alpha in before]) == 0
     assert beside.mean() > 0.3
@@ -95,7 +90,7 @@ def test_an_object_alone_stays_alone(room: Scene) -> None:
     assert after[before > 0.95].mean() > 0.8
 
 
-def test_empty_parts_do_not_count(room: Scene) -> None:
+def test_empty_parts_are_left_out_of_the_masks(room: Scene) -> None:
     scene = prepare(without_top(room)).scene
     assert scene.empty is not None
     assert scene.masks is not None
@@ -106,7 +101,7 @@ def test_empty_parts_do_not_count(room: Scene) -> None:
     assert prepare(room).scene.empty is None
 
 
-def test_large_parts_hold_a_large_square() -> None:
+def test_large_parts_are_those_that_hold_a_large_square() -> None:
     side = round(LARGE_SIDE * WIDTH)
     for width, large in ((side // 2, False), (side + 2, True)):
         empty = np.zeros((HEIGHT, WIDTH), bool)

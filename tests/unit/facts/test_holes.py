@@ -1,4 +1,4 @@
-"""Gaussians for pixels that the views show and no Gaussian covers."""
+"""Pixels that the views show and no Gaussian covers are filled with Gaussians."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ WIDTH, HEIGHT, NEAR, FAR, FLOOR = 96, 64, 3.0, 6.0, 24
 K = np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]])
 
 
-def scene_of(*, moved: float = 0.5, floor: int = FLOOR) -> PicturedScene:
-    """Three views of a far wall above a near one, each ``moved`` to the right; the far wall and borders are missing."""
+def make_walls(*, moved: float = 0.5, floor: int = FLOOR) -> PicturedScene:
+    """Make three views, each ``moved`` to the right, of a far wall above a near one; the near one alone has rows."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     depth = np.where(y < floor, FAR, NEAR)
     viewmats = np.tile(np.eye(4), (3, 1, 1))
@@ -56,36 +56,36 @@ def scene_of(*, moved: float = 0.5, floor: int = FLOOR) -> PicturedScene:
 
 
 def without_pixels(scene: PicturedScene) -> PicturedScene:
-    """The same rows, those that are there, in no order."""
+    """Return the same rows, those that are there, in no order."""
     rows = np.random.default_rng(0).permutation(len(scene.gaussians))
     return with_pixels(replace(scene, gaussians=scene.gaussians[rows], pixels=None))
 
 
 def new_in(filled: PicturedScene, scene: PicturedScene) -> np.ndarray:
-    """Mask ``[v,h,w]`` of the pixels that showed nothing before."""
+    """Return the mask ``[v,h,w]`` of the pixels that showed nothing before."""
     return filled.pixels.shown & ~scene.pixels.shown
 
 
 def filled_everywhere(scene: PicturedScene) -> PicturedScene:
-    """The scene filled where its pictures show something: everywhere."""
+    """Fill the scene where its pictures show something: everywhere."""
     return fill_holes(scene, np.ones(scene.images.shape[:3], bool), everywhere=True)
 
 
 def depths_of(scene: PicturedScene) -> np.ndarray:
-    """Depth of each pixel's Gaussian ``[v,h,w]``."""
+    """Return the depth of each pixel's Gaussian ``[v,h,w]``."""
     means = scene.gaussians.means[scene.pixels.fronts]
     return np.stack([camera_depths(*pair) for pair in zip(means, scene.cameras.viewmats[:, None, None], strict=True)])
 
 
-def test_far_pixels_lie_where_the_photos_agree() -> None:
-    filled = filled_everywhere(scene_of())
+def test_filled_far_pixels_lie_where_the_photos_agree() -> None:
+    filled = filled_everywhere(make_walls())
     far = (slice(None), slice(6, FLOOR - 6), slice(10, -10))
     assert filled.pixels.shown[far].all()
     assert (np.abs(np.log(depths_of(filled)[far] / FAR)) < 0.1).mean() > 0.9
 
 
-def test_rows_stay_and_what_fills_is_known() -> None:
-    scene = scene_of()
+def test_filling_keeps_rows_before_those_marked_as_filled() -> None:
+    scene = make_walls()
     filled, count = filled_everywhere(scene), len(scene.gaussians)
     assert all(np.array_equal(values[:count], getattr(scene.gaussians, name))
                for name, values in vars(filled.gaussians).items())  # fmt: skip
@@ -95,16 +95,16 @@ def test_rows_stay_and_what_fills_is_known() -> None:
     assert np.array_equal(filled.pixels.fronts[~new], scene.pixels.fronts[~new])
 
 
-def test_without_parallax_far_pixels_are_beside_the_others() -> None:
-    filled = filled_everywhere(scene_of(moved=0.0))
-    new = new_in(filled, scene_of())
+def test_filled_pixels_without_parallax_have_the_depth_beside_them() -> None:
+    filled = filled_everywhere(make_walls(moved=0.0))
+    new = new_in(filled, make_walls())
     assert new[:, :FLOOR].any()
     assert np.allclose(depths_of(filled)[new], NEAR, rtol=1e-3)
 
 
-def test_holes_between_rows_have_the_depth_beside_them() -> None:
+def test_filled_holes_between_rows_have_the_depth_beside_them() -> None:
     """Squares missing from the near wall: the photos do not speak for another depth."""
-    scene = scene_of()
+    scene = make_walls()
     kept = scene.pixels.shown.copy()
     kept[:, 40:48, 12:-12] = False
     filled = filled_everywhere(scenes.shown_in(scene, kept))
@@ -115,8 +115,8 @@ def test_holes_between_rows_have_the_depth_beside_them() -> None:
     assert (np.abs(np.log(depths_of(filled)[inner] / NEAR)) < 0.02).mean() > 0.95
 
 
-def test_rows_without_pixels_are_followed_by_new_ones() -> None:
-    scene = without_pixels(scene_of())
+def test_filled_rows_follow_the_rows_of_a_scene_without_pixels() -> None:
+    scene = without_pixels(make_walls())
     with record_run() as record:
         filled = filled_everywhere(scene)
     count = len(scene.gaussians)
@@ -128,13 +128,13 @@ def test_rows_without_pixels_are_followed_by_new_ones() -> None:
     assert noted(record.notes, f"{len(filled.gaussians) - count:,} pixels that no Gaussian covers enough get")
 
 
-def test_a_part_of_what_the_photos_show_stays_one() -> None:
-    scene = without_pixels(scene_of(floor=40))
+def test_a_part_of_what_photos_show_is_not_filled() -> None:
+    scene = without_pixels(make_walls(floor=40))
     assert filled_everywhere(scene) is scene
 
 
 def test_only_pixels_that_are_shown_are_filled() -> None:
-    scene = scene_of()
+    scene = make_walls()
     shown = np.zeros_like(scene.pixels.shown)
     shown[1, 4:12] = True
     new = new_in(fill_holes(scene, shown, everywhere=True), scene)
@@ -142,8 +142,8 @@ def test_only_pixels_that_are_shown_are_filled() -> None:
     assert not (new & ~shown).any()
 
 
-def test_nothing_is_added_where_everything_is_covered() -> None:
-    scene = scene_of()
+def test_nothing_is_filled_where_everything_is_covered() -> None:
+    scene = make_walls()
     full = replace(filled_everywhere(scene), filled=None)
     assert filled_everywhere(full) is full
     unordered = without_pixels(full)
@@ -151,7 +151,7 @@ def test_nothing_is_added_where_everything_is_covered() -> None:
 
 
 def test_views_that_show_no_gaussian_stay_empty() -> None:
-    scene = scene_of()
+    scene = make_walls()
     viewmats = scene.cameras.viewmats.copy()
     viewmats[2, :3, :3] = np.diag([-1, 1, -1])  # looks away
     turned = replace(scene, cameras=replace(scene.cameras, viewmats=viewmats))
@@ -159,7 +159,7 @@ def test_views_that_show_no_gaussian_stay_empty() -> None:
 
 
 @pytest.mark.parametrize("photos", [True, False])
-def test_dropped_pixels_are_filled_with_cameras(tmp_path: Path, photos: bool) -> None:
+def test_dropped_pixels_are_filled_where_cameras_are_known(tmp_path: Path, photos: bool) -> None:
     """Rows of Depth Anything 3 with cameras in the place of its depth maps, with photos or their own colours."""
     tiny = smooth_scene(96, 72)
     folder = save_export(tmp_path, tiny, export_rows(tiny, da3_rows(tiny)))
@@ -175,7 +175,7 @@ def test_dropped_pixels_are_filled_with_cameras(tmp_path: Path, photos: bool) ->
 
 
 def test_views_whose_photos_do_not_show_the_scene_stay_empty() -> None:
-    scene = scene_of()
+    scene = make_walls()
     images = scene.images.copy()
     images[1] = np.random.default_rng(0).random(images[1].shape)
     prepared = prepare(replace(scene, images=images))
@@ -183,8 +183,8 @@ def test_views_whose_photos_do_not_show_the_scene_stay_empty() -> None:
     assert new_in(prepared.scene, scene).any((1, 2)).tolist() == [True, False, True]
 
 
-def test_shares_of_a_budget_are_of_the_file() -> None:
+def test_shares_of_a_budget_do_not_count_filled_gaussians() -> None:
     """Not of the file and the Gaussians that were added."""
-    scene = without_pixels(scene_of())
+    scene = without_pixels(make_walls())
     count = len(scene.gaussians)
     assert len(compact(scene, budget="10%", fill=True, effort="draft").gaussians) == round(0.1 * count)

@@ -1,4 +1,4 @@
-"""Scenes that have another look than their photos: which of the two a result has."""
+"""A result has the look of its Gaussians, unless that of the photos is asked for."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def false_colors(colors: Colors) -> Colors:
 
 
 def styled(colors: Colors) -> Colors:
-    """Green inks on pale paper."""
+    """Draw in green inks on pale paper."""
     light = grey(colors)[..., 0]
     return np.stack([1 - 0.9 * light, 0.9 - 0.4 * light**2, 0.3 + 0.6 * np.abs(2 * light - 1)], -1).clip(0, 1)
 
@@ -42,19 +42,19 @@ def room() -> Scene:
 
 
 def with_look(scene: Scene, look: Callable[[Colors], Colors]) -> Scene:
-    """Other colours of the Gaussians beside the same photos."""
+    """Return the scene with other colours of its Gaussians beside the same photos."""
     colors = look(sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1).astype(np.float64))
     return replace(scene, gaussians=replace(scene.gaussians, sh0=rgb_to_sh0(colors.astype(np.float32))[:, None]))
 
 
 def distances(result: CompactResult, scene: Scene) -> tuple[float, float]:
-    """Mean difference of colours from the scene's own Gaussians and from its photos."""
+    """Return the mean difference of colours from the scene's own Gaussians and from its photos."""
     shown, own = (render(each, scene.cameras).images for each in (result.gaussians, scene.gaussians))
     return float(np.abs(shown - own).mean()), float(np.abs(shown - scene.images).mean())
 
 
 @pytest.mark.parametrize(("rows", "is_noted"), [(1, True), (0, False)])
-def test_less_than_a_percent_that_differs_is_not_noted(rows: int, is_noted: bool, room: Scene) -> None:
+def test_photos_that_differ_are_noted_from_a_percent_of_their_pixels(rows: int, is_noted: bool, room: Scene) -> None:
     hidden = np.zeros(room.images.shape[:3], bool)
     hidden[0, :rows] = hidden[0, -1, :9] = True
     with record_run() as record:
@@ -67,33 +67,33 @@ def test_less_than_a_percent_that_differs_is_not_noted(rows: int, is_noted: bool
     [grey, false_colors, styled, lambda colors: colors[..., ::-1]],
     ids=["grey", "false colours", "styled", "BGR"],
 )
-def test_a_scene_keeps_its_look(look: Callable[[Colors], Colors], room: Scene) -> None:
+def test_a_scene_keeps_its_look_beside_other_photos(look: Callable[[Colors], Colors], room: Scene) -> None:
     scene = with_look(room, look)
     result = compact(scene, **FIT)
     assert result.report.psnr_reference == ROW_COLORS
     assert len([note for note in result.report.notes if "--set look=photos" in note]) == 1
     own, photos = distances(result, scene)
-    assert own < 0.6 * photos
+    assert own < 0.6 * photos  # clearly nearer to its own look
 
 
 @pytest.mark.parametrize("look", [grey, false_colors, styled])
-def test_photos_are_followed_where_it_is_asked_for(look: Callable[[Colors], Colors], room: Scene) -> None:
+def test_the_look_of_photos_is_taken_where_that_is_asked_for(look: Callable[[Colors], Colors], room: Scene) -> None:
     scene = with_look(room, look)
     result = compact(scene, **FIT, look="photos")
     assert result.report.psnr_reference == PHOTOS
     assert not noted(result.report.notes, "look")
     own, photos = distances(result, scene)
-    assert photos < 0.6 * own
+    assert photos < 0.6 * own  # clearly nearer to the look of the photos
 
 
-def test_photos_of_another_scene_are_no_look(room: Scene) -> None:
+def test_photos_of_another_scene_are_noted_as_no_look(room: Scene) -> None:
     other = scenes.make_scene(scenes.wall(9), scenes.arc(4, 96, 72)).images
     notes = compact(replace(room, images=other), **FIT).report.notes
     assert noted(notes, "4 of 4", "do not show what the Gaussians show")
     assert not [note for note in notes if "look=photos" in note]
 
 
-def test_a_mild_grade_is_followed(room: Scene) -> None:
+def test_photos_of_a_mildly_different_grade_are_followed(room: Scene) -> None:
     result = compact(with_look(room, lambda colors: 0.95 * colors**0.93 + 0.01), **FIT)
     assert result.report.psnr_reference == PHOTOS
     assert not [note for note in result.report.notes if "look" in note]

@@ -45,14 +45,14 @@ def small() -> Scene:
 
 
 def worst_error(scene: Scene, truth: Scene) -> tuple[float, float]:
-    """Degrees and distances between relative poses."""
+    """Return the largest degrees and distances between relative poses."""
     relative = [one.cameras.viewmats @ np.linalg.inv(one.cameras.viewmats[2]) for one in (scene, truth)]
     degrees, distances = pose_changes(*relative)
     return float(degrees.max()), float(distances.max())
 
 
 def with_highlight(scene: Scene) -> Scene:
-    """The scene with harmonics of degree 3, brightest where a wall at right angles to z mirrors a lamp."""
+    """Return the scene with harmonics of degree 3, brightest where a wall at right angles to z mirrors a lamp."""
     g, eyes = scene.gaussians, scene.cameras.centres.repeat(scene.pixels_per_view, 0)
     lamp = np.array([0.0, -0.2, 2 * np.median(g.means[:, 2]) - np.median(eyes[:, 2])])  # in the mirror
     lobes, seen = (evaluate_harmonics(normalize(away), 15) for away in (lamp - g.means, g.means - eyes))
@@ -62,7 +62,7 @@ def with_highlight(scene: Scene) -> Scene:
     return replace(scene, gaussians=shiny, images=(scene.images + bright).clip(0, 1).astype(np.float32))
 
 
-def test_moved_gaussians_stay_at_their_pixels(scene: Scene) -> None:
+def test_gaussians_moved_with_their_view_stay_at_their_pixels(scene: Scene) -> None:
     moved = motions.disagreeing(scene)
     for view in VIEWS:
         rows = slice(view * scene.pixels_per_view, (view + 1) * scene.pixels_per_view)
@@ -75,12 +75,12 @@ def test_moved_gaussians_stay_at_their_pixels(scene: Scene) -> None:
         np.testing.assert_allclose(*axes, atol=1e-5)
 
 
-def test_views_that_agree_are_left_alone(scene: Scene) -> None:
+def test_views_that_agree_are_not_moved(scene: Scene) -> None:
     assert move_poses(scene, VIEWS) is None
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["harmonics", "none"])
-def test_highlights_are_no_wrong_poses(known: bool, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_highlights_are_not_taken_for_wrong_poses(known: bool, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """The wall mirrors a lamp, whose image moves with the camera; only detail tells if Gaussians have no harmonics."""
     glossy = with_highlight(scene)
     seen = glossy if known else replace(glossy, gaussians=replace(glossy.gaussians, shN=scene.gaussians.shN))
@@ -94,18 +94,18 @@ def test_wrong_poses_of_views_with_highlights_are_mended(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("views", [slice(None), slice(1, 2)], ids=["all", "one"])
-def test_views_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None:
+def test_views_with_wrong_poses_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None:
     wrong = motions.disagreeing(scene, views=views)
     before = worst_error(wrong, scene)
     found = move_poses(wrong, VIEWS)
     degrees, distance = worst_error(found, scene)
-    assert degrees < 0.25 * before[0]
+    assert degrees < 0.25 * before[0]  # most of the error is gone
     assert distance < 0.25 * before[1]
     common = motion_vectors(wrong.cameras.viewmats, found.cameras.viewmats)
     np.testing.assert_allclose(np.median(common, 0), 0, atol=2e-3)
 
 
-def test_views_that_are_left_out_stay(scene: Scene) -> None:
+def test_views_that_are_left_out_are_not_moved(scene: Scene) -> None:
     wrong = motions.disagreeing(scene)
     found = move_poses(wrong, range(4))
     last = slice(4 * scene.pixels_per_view, None)
@@ -115,7 +115,7 @@ def test_views_that_are_left_out_stay(scene: Scene) -> None:
     np.testing.assert_allclose(np.median(common[:4], 0), 0, atol=2e-3)
 
 
-def test_cameras_of_repeated_views_and_of_views_that_share_one(small: Scene) -> None:
+def test_repeated_views_share_the_camera_that_was_moved(small: Scene) -> None:
     viewmats = small.cameras.viewmats.copy()
     viewmats[1] = viewmats[0]  # of other Gaussians and another photo
     shared = scenes.take_views(replace(small, cameras=replace(small.cameras, viewmats=viewmats)), [0, 1, 0, 2])
@@ -139,7 +139,7 @@ def test_nothing_is_moved_without_photos(cameras: bool, small: Scene) -> None:
     np.testing.assert_array_equal(result.cameras.viewmats, places.viewmats)
 
 
-def test_all_levels_have_the_cameras_of_the_finest(small: Scene) -> None:
+def test_coarser_levels_have_the_cameras_of_the_finest(small: Scene) -> None:
     result = compact(small, poses="free", fit_steps=12, superpixels="2%", levels=2)
     assert np.abs(result.cameras.viewmats - small.cameras.viewmats).max() > 0
     np.testing.assert_array_equal(result.coarser[0].cameras.viewmats, result.cameras.viewmats)
@@ -156,23 +156,23 @@ def test_clean_up_keeps_the_poses_of_the_fit(small: Scene) -> None:
 
 
 @pytest.mark.parametrize("size", [(12, 8), (40, 1)])
-def test_nothing_can_be_told_of_tiny_photos(size: tuple[int, int]) -> None:
+def test_nothing_is_moved_by_tiny_photos(size: tuple[int, int]) -> None:
     tiny = scenes.make_scene(scenes.room(), scenes.arc(3, *size))
     assert move_poses(tiny, range(3), always=True) is None
 
 
-def test_one_view_agrees_with_itself(scene: Scene) -> None:
+def test_a_single_view_is_not_moved(scene: Scene) -> None:
     assert move_poses(scenes.take_views(scene, [0]), [0], always=True) is None
 
 
-def test_no_motion_in_common() -> None:
+def test_a_motion_that_all_views_have_in_common_is_taken_out() -> None:
     start = np.tile(np.eye(4), (3, 1, 1))
     together = start @ motion_matrices(np.tile([0.1, 0.2, -0.1, 1.0, 2.0, 3.0], (3, 1)))
     np.testing.assert_allclose(without_common(start, together, np.mean), start, atol=1e-12)
 
 
 @pytest.mark.slow
-def test_compacting_says_how_far_views_were_moved(scene: Scene) -> None:
+def test_compacting_notes_the_views_that_it_moved(scene: Scene) -> None:
     wrong, settings = motions.disagreeing(scene), {"effort": "draft", "superpixels": "2%", "match": "overlap"}
     fixed, auto = (compact(wrong, **settings, poses=poses) for poses in ("fixed", "auto"))
     assert "poses" not in fixed.report.choices
@@ -186,7 +186,7 @@ def test_compacting_says_how_far_views_were_moved(scene: Scene) -> None:
     assert after > before + 1  # over all views: a draft's report is of two
 
 
-def test_right_poses_are_the_same_run(scene: Scene) -> None:
+def test_a_run_with_right_poses_gives_the_result_of_fixed_poses(scene: Scene) -> None:
     settings = {"fit_steps": 12, "superpixels": "2%"}
     fixed, auto = (compact(scene, **settings, poses=poses) for poses in ("fixed", "auto"))
     np.testing.assert_array_equal(fixed.gaussians.means, auto.gaussians.means)

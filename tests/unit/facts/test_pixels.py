@@ -1,4 +1,4 @@
-"""Homes and fronts of Gaussians in any order, and of such that are wider apart than pixels; least sizes."""
+"""Gaussians in any order get homes and fronts in the views, and those that are hidden a least size."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def room() -> Scene:
 
 
 def depth_errors(scene: Scene, room: Scene) -> np.ndarray:
-    """Logarithms of the depths of fronts over those of the surfaces, of pixels with one."""
+    """Return logarithms of the depths of fronts over those of the surfaces, of pixels with one."""
     fronts = find_pixels(scene).fronts
     depths, true = (
         np.stack([camera_depths(some.gaussians.means[front], pose) for front, pose in zip(f, poses, strict=True)])
@@ -37,7 +37,7 @@ def depth_errors(scene: Scene, room: Scene) -> np.ndarray:
     return np.abs(elementary.log(depths / true))[fronts >= 0]
 
 
-def test_rows_in_any_order_are_in_front_where_their_surface_is(room: Scene) -> None:
+def test_fronts_of_rows_in_any_order_are_those_of_their_surface(room: Scene) -> None:
     scene = unaligned_scenes.shuffled(room)
     pixels = find_pixels(scene)
     assert not pixels.own
@@ -61,7 +61,7 @@ def test_cells_are_as_wide_as_gaussians_are_apart(every: int, level: int, room: 
     assert (depth_errors(scene, room) < 0.1).mean() > 0.9
 
 
-def test_gaps_wider_than_cells_stay_gaps(room: Scene) -> None:
+def test_gaps_wider_than_cells_have_no_fronts(room: Scene) -> None:
     kept = np.ones((3, HEIGHT, WIDTH), bool)
     kept[:, 20:40, 30:60] = False
     scene = unaligned_scenes.without_order(room, np.flatnonzero(kept)[np.flatnonzero(kept) < WIDTH * HEIGHT])
@@ -82,7 +82,7 @@ def test_pixels_do_not_depend_on_the_order_of_rows(room: Scene) -> None:
         np.testing.assert_array_equal(np.where(other.shown, order[other.fronts], -1), one.fronts)
 
 
-def test_nothing_is_in_front_of_views_that_look_away(room: Scene) -> None:
+def test_views_that_look_away_have_no_fronts(room: Scene) -> None:
     viewmats = room.cameras.viewmats.copy()
     viewmats[1] = np.diag([-1.0, 1, -1, 1]) @ viewmats[1]
     away = replace(room, cameras=replace(room.cameras, viewmats=viewmats), pixels=None)
@@ -97,7 +97,7 @@ def resized(gaussians: Gaussians, factor: float, every: int = 1) -> Gaussians:
 
 
 def least_scales(scene: Scene) -> np.ndarray:
-    """Scales of Gaussians that the low-pass of their pixel hides are the low-pass; of others, what they were."""
+    """Return scales: the low-pass where that of the pixel hides a Gaussian, or else what they were."""
     scales, homes = scene.gaussians.scales.copy(), scene.pixels.homes.tolist()
     for row, home in enumerate(homes):
         view = home // scene.pixels_per_view
@@ -127,7 +127,7 @@ def test_hidden_gaussians_get_the_size_of_the_low_pass(factor: float, every: int
         assert (raised.gaussians.scales > scene.gaussians.scales)[seen].any(1).mean() > 0.2
 
 
-def test_views_of_few_pixels_change_no_sound_scene(room: Scene) -> None:
+def test_sizes_of_a_sound_scene_are_not_raised_for_views_of_few_pixels(room: Scene) -> None:
     cameras = room.cameras
     Ks = cameras.Ks / np.array([[8], [8], [1]], cameras.Ks.dtype)
     small = replace(cameras, Ks=Ks, width=WIDTH // 8, height=HEIGHT // 8)
@@ -138,7 +138,7 @@ def test_views_of_few_pixels_change_no_sound_scene(room: Scene) -> None:
 
 @pytest.mark.parametrize("factor", [1 / 30, 1e-5])
 @pytest.mark.parametrize("kind", ["grid", "shuffled", "no cameras"])
-def test_tiny_gaussians_are_merged_as_they_look(kind: str, factor: float) -> None:
+def test_tiny_gaussians_are_merged_as_well_as_sound_ones(kind: str, factor: float) -> None:
     """The input is drawn well by the low-pass alone, and the result is about as good as that of sound Gaussians."""
     sound = scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36), noise=0.03)
     if kind != "grid":
@@ -155,4 +155,4 @@ def test_tiny_gaussians_are_merged_as_they_look(kind: str, factor: float) -> Non
     else:
         psnrs = [report.psnr_after for report in reports]
         assert psnrs[1] > reports[1].psnr_before
-    assert psnrs[1] > psnrs[0] - 1, psnrs
+    assert psnrs[1] > psnrs[0] - 1, psnrs  # dB

@@ -14,7 +14,7 @@ PLACE = np.array([3.0, -2.0, 5.0])
 
 
 def scene_around(share: float = 1.0, power: float = 1.0, count: int = 6000) -> Gaussians:
-    """Gaussians in directions from a place, down to a height that leaves a ``share`` of them; sky and near ground.
+    """Make Gaussians in directions from a place, down to a height that leaves a ``share`` of them; sky and near ground.
 
     Sizes grow with the distance to a ``power``.
     """
@@ -31,7 +31,7 @@ def scene_around(share: float = 1.0, power: float = 1.0, count: int = 6000) -> G
     return Gaussians(means, quats, scales, np.full(count, 0.9, np.float32), sh0, np.zeros((count, 0, 3), np.float32))
 
 
-def test_cameras_stand_near_the_place_and_look_to_all_sides() -> None:
+def test_cameras_look_to_all_sides_from_near_the_place_of_the_viewer() -> None:
     cameras = place_inside(scene_around())
     assert cameras is not None
     assert np.linalg.norm(cameras.centres - PLACE, axis=1).max() < 0.5  # what is nearest is 1.6 away
@@ -43,9 +43,8 @@ def test_cameras_stand_near_the_place_and_look_to_all_sides() -> None:
 @pytest.mark.parametrize(
     ("share", "power"), [(0.3, 1.0), (1.0, 0.0)], ids=["a part of the directions", "sizes of one object"]
 )
-def test_other_scenes_are_seen_from_elsewhere(share: float, power: float) -> None:
-    gaussians = scene_around(share, power)
-    assert place_inside(gaussians) is None
+def test_no_cameras_are_placed_inside_other_scenes(share: float, power: float) -> None:
+    assert place_inside(scene_around(share, power)) is None
 
 
 def test_outliers_do_not_move_the_place() -> None:
@@ -57,7 +56,7 @@ def test_outliers_do_not_move_the_place() -> None:
     assert np.linalg.norm(cameras.centres - PLACE, axis=1).max() < 0.6
 
 
-def test_the_note_says_so_once() -> None:
+def test_placing_cameras_inside_is_noted_once() -> None:
     with record_run() as record:
         assert len(add_views(make_scene(scene_around(), NO_CAMERAS))) == 24
     assert len(record.notes) == 1

@@ -38,7 +38,7 @@ def test_unit_is_a_power_of_two_near_the_median_depth(factor: float, scene: Scen
     assert 2**-0.51 < float(np.median(own)) / unit < 2**0.51
 
 
-def test_leave_undoes_enter(scene: Scene) -> None:
+def test_leaving_the_frame_undoes_entering_it(scene: Scene) -> None:
     far = moved(scene, 7.0, [4e5, 5e6, 100])
     canonical, frame = canonicalise(far)
     assert canonical.gaussians.means.dtype == np.float32
@@ -51,7 +51,7 @@ def test_leave_undoes_enter(scene: Scene) -> None:
         assert np.array_equal(getattr(back, name), getattr(far.gaussians, name))
 
 
-def test_projections_do_not_change(scene: Scene) -> None:
+def test_projections_do_not_change_in_the_canonical_frame(scene: Scene) -> None:
     far = moved(scene, 0.01, [4e5, 5e6, 100])
     canonical, frame = canonicalise(far)
     before, after = project(far.gaussians.means, far.cameras), project(canonical.gaussians.means, canonical.cameras)
@@ -68,7 +68,7 @@ def test_flyaways_and_invalid_rows_do_not_move_the_frame(scene: Scene) -> None:
     assert np.abs(frame.origin - scene_frame(scene).origin).max() < 0.3
 
 
-def test_one_valid_row(scene: Scene) -> None:
+def test_the_frame_of_one_valid_row_has_its_origin_there(scene: Scene) -> None:
     mask = np.zeros_like(scene.pixels.shown)
     mask.reshape(-1)[7] = True
     frame = scene_frame(scenes.shown_in(scene, mask))
@@ -76,7 +76,7 @@ def test_one_valid_row(scene: Scene) -> None:
     assert frame.unit > 0
 
 
-def test_few_valid_rows_of_many() -> None:
+def test_the_frame_of_a_large_scene_is_that_of_its_valid_rows() -> None:
     """Only some rows are looked at; they must be valid ones."""
     large = scenes.make_scene(scenes.wall(), scenes.arc(1, 512, 256))
     mask = np.zeros_like(large.pixels.shown)
@@ -85,7 +85,7 @@ def test_few_valid_rows_of_many() -> None:
     assert np.abs(frame.origin - scene_frame(large).origin).max() < 0.1
 
 
-def test_no_valid_row_is_refused(scene: Scene) -> None:
+def test_a_frame_without_a_valid_row_is_refused(scene: Scene) -> None:
     with refuses(ValueError, "", "Gaussians", 0):
         scene_frame(scenes.shown_in(scene, np.zeros_like(scene.pixels.shown)))
 
@@ -96,7 +96,7 @@ def test_gaussians_in_the_cameras_plane_have_a_unit() -> None:
     assert scene_frame(still).unit == 1.0
 
 
-def test_renders_stand_in_for_photos_where_no_pixels_are_known_alone(scene: Scene) -> None:
+def test_renders_stand_in_for_photos_only_where_no_pixels_are_known(scene: Scene) -> None:
     """A fit to renders of one Gaussian per pixel would keep its errors: its pixels' own colours are taken."""
     bare = replace(scene, images=None)
     aligned, unaligned = prepare(bare), prepare(replace(bare, pixels=None))

@@ -1,4 +1,4 @@
-"""A scene of which no view is known: the views that judge its results."""
+"""Placed views judge the results of a scene of which no view is known."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def prepared() -> Prepared:
     return prepare(make_bare())
 
 
-def test_views_show_the_input_and_some_are_held_out(prepared: Prepared) -> None:
+def test_views_placed_for_a_bare_scene_are_renders_of_it(prepared: Prepared) -> None:
     scene, reference = prepared.scene, prepared.reference
     assert reference.placed
     assert reference.score_views == tuple(range(len(scene) // HELD_OUT))
@@ -45,7 +45,7 @@ def test_views_show_the_input_and_some_are_held_out(prepared: Prepared) -> None:
     assert scene.images.std() > 0.05
 
 
-def test_no_fit_sees_the_views_that_judge_it(prepared: Prepared) -> None:
+def test_a_fit_does_not_depend_on_the_views_that_judge_it(prepared: Prepared) -> None:
     """Whatever these show, the fitted Gaussians are the same."""
     pictures = prepared.scene.images.copy()
     pictures[list(prepared.reference.score_views)] = 0.5
@@ -66,14 +66,14 @@ def fit_scene_alone(prepared: Prepared, options: FitOptions) -> Gaussians:
     return fitted.gaussians
 
 
-def test_views_together_show_most(prepared: Prepared) -> None:
+def test_placed_views_together_see_most_of_the_scene(prepared: Prepared) -> None:
     cameras = prepared.scene.cameras
     pixels, depths = project(prepared.scene.gaussians.means.astype(np.float64), cameras)
     seen = (depths > 0) & ((pixels > 0) & (pixels < (cameras.width, cameras.height))).all(-1)
     assert seen.any(0).mean() > 0.95
 
 
-def test_fog_and_holes_are_seen(bare: Scene) -> None:
+def test_placed_views_judge_fog_or_holes_as_worse(bare: Scene) -> None:
     """A result that lacks a part, or has a cloud beside the scene, is judged worse than one that has neither.
 
     Nothing is fitted, which takes seconds: the result would be the same, since the fit makes it no better.
@@ -102,14 +102,14 @@ def _with_fog(gaussians: Gaussians) -> Gaussians:
     return Gaussians.concat([gaussians, fog])
 
 
-def test_one_note(bare: Scene) -> None:
+def test_a_scene_without_cameras_gets_one_note(bare: Scene) -> None:
     with record_run() as record:
         prepare(bare)
     assert len(record.notes) == 1
     assert noted(record.notes, "no cameras", "--cameras", "--images")
 
 
-def test_networks_and_other_methods_ask_for_views(bare: Scene) -> None:
+def test_a_run_without_views_is_one_without_networks_or_other_methods(bare: Scene) -> None:
     options = CompactOptions()
     assert is_without_views(bare, options)
     assert not is_without_views(bare, options.with_settings({"checkpoint": "shipped"}))
@@ -119,7 +119,7 @@ def test_networks_and_other_methods_ask_for_views(bare: Scene) -> None:
     )
 
 
-def test_nothing_is_left_out(bare: Scene) -> None:
+def test_gaussians_far_behind_all_placed_views_take_part(bare: Scene) -> None:
     """Also what lies behind all views takes part."""
     far = unaligned_scenes.far_behind(bare.gaussians, 40)
     result = compact(replace(bare, gaussians=Gaussians.concat([bare.gaussians, far])), budget="20%")
@@ -127,7 +127,7 @@ def test_nothing_is_left_out(bare: Scene) -> None:
     assert (np.abs(result.gaussians.means - middle) < np.ptp(far.means, 0) + 1).all(1).any()
 
 
-def test_half_of_the_views_to_look_from_stand_around_the_scene() -> None:
+def test_half_of_the_viewpoints_stand_around_the_scene() -> None:
     """So that an object is seen whole: a ball, whose inside shows as much of it."""
     rng, count = np.random.default_rng(0), 3000
     means = rng.normal(size=(count, 3))

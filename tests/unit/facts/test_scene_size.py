@@ -1,4 +1,4 @@
-"""Scenes of which no score says anything: Gaussians as no capture has, and views of one flat colour."""
+"""Scenes unlike captures, and views of one flat colour, get no score."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def room() -> Scene:
 
 
 def sized(gaussians: Gaussians, share: float) -> Gaussians:
-    """All of one size: a share of the diagonal of the box that holds most of them."""
+    """Make all Gaussians of one size: a share of the diagonal of the box that holds most of them."""
     low, high = np.percentile(gaussians.means, (1, 99), axis=0)
     return replace(gaussians, scales=np.full_like(gaussians.scales, share * np.linalg.norm(high - low)))
 
 
 @pytest.mark.parametrize(("share", "words"), [(1e-8, None), (0.9 * LARGE_SCALE, None), (1.1 * LARGE_SCALE, "at least")])
-def test_sizes_have_a_bound(share: float, words: str | None, room: Scene) -> None:
+def test_sizes_beyond_a_bound_are_unlike_captures(share: float, words: str | None, room: Scene) -> None:
     odd = unlike_captures(sized(room.gaussians, share))
     assert (odd is None) == (words is None)
     assert words is None or (f"{words} {share:.2g} times as large as the scene" in odd and "nothing is scored" in odd)
@@ -37,21 +37,26 @@ def test_sizes_have_a_bound(share: float, words: str | None, room: Scene) -> Non
 @pytest.mark.parametrize(
     ("value", "is_odd"), [(0.9 * BRIGHT_COLOR, False), (1.1 * BRIGHT_COLOR, True), (-1.1 * BRIGHT_COLOR, True)]
 )
-def test_colours_have_a_bound(value: float, is_odd: bool, room: Scene) -> None:
+def test_colours_beyond_a_bound_are_unlike_captures(value: float, is_odd: bool, room: Scene) -> None:
     colors = value * (1 + 0.01 * np.random.default_rng(0).random(room.gaussians.sh0.shape, np.float32))
     odd = unlike_captures(replace(room.gaussians, sh0=colors))
     assert (odd is not None) == is_odd
     assert odd is None or "base colours have coefficients beyond 11" in odd
 
 
-def test_one_colour_and_faint_ones_are_odd(room: Scene) -> None:
-    flat = replace(room.gaussians, sh0=np.full_like(room.gaussians.sh0, 0.3))
-    faint = replace(room.gaussians, opacities=np.full_like(room.gaussians.opacities, 0.001))
-    assert noted([unlike_captures(flat) or ""], "one flat colour")
-    assert noted([unlike_captures(faint) or ""], "opacities")
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [("sh0", 0.3, "one flat colour"), ("opacities", 0.001, "opacities")],
+    ids=["flat", "faint"],
+)
+def test_gaussians_of_one_colour_or_all_faint_are_unlike_captures(
+    name: str, value: float, words: str, room: Scene
+) -> None:
+    odd = replace(room.gaussians, **{name: np.full_like(getattr(room.gaussians, name), value)})
+    assert noted([unlike_captures(odd) or ""], words)
 
 
-def test_some_odd_ones_and_few_are_none(room: Scene) -> None:
+def test_a_third_or_a_handful_of_odd_gaussians_is_like_captures(room: Scene) -> None:
     scales = room.gaussians.scales.copy()
     scales[::3] *= 1e6
     assert unlike_captures(replace(room.gaussians, scales=scales)) is None
@@ -61,7 +66,7 @@ def test_some_odd_ones_and_few_are_none(room: Scene) -> None:
     assert unlike_captures(large[:0]) is None
 
 
-def test_odd_gaussians_have_no_score(room: Scene) -> None:
+def test_scenes_unlike_captures_have_no_score(room: Scene) -> None:
     bright = replace(room.gaussians, sh0=np.full_like(room.gaussians.sh0, 40))
     for scene in (replace(room, gaussians=bright), replace(room, gaussians=sized(room.gaussians, 0.5))):
         report = compact(scene, **FIT).report

@@ -1,4 +1,4 @@
-"""In how many views a Gaussian takes part, against a count by alpha compositing pixel by pixel."""
+"""The number of views that show a Gaussian is that of compositing pixel by pixel."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def room() -> Gaussians:
     return made[:: max(1, len(made) // 150)]
 
 
-def test_a_view_counts_where_a_picture_shows_the_gaussian(room: Gaussians, cameras: Cameras) -> None:
+def test_a_view_counts_for_a_gaussian_where_its_picture_shows_it(room: Gaussians, cameras: Cameras) -> None:
     """A white Gaussian among black ones shows its own weights."""
     half = blank_photos(cameras, 2)
     views = [tile_view(make_splats(room), **half.camera(view)) for view in range(len(half))]
@@ -39,7 +39,7 @@ def test_a_view_counts_where_a_picture_shows_the_gaussian(room: Gaussians, camer
     np.testing.assert_array_equal(count_views(room, cameras), counts)
 
 
-def test_what_hides_behind_a_wall_or_a_camera_is_seen_by_none(room: Gaussians, cameras: Cameras) -> None:
+def test_gaussians_behind_all_cameras_count_no_views(room: Gaussians, cameras: Cameras) -> None:
     away = replace(room, means=room.means - 1000 * cameras.viewmats[:, 2, :3].mean(0).astype(np.float32))
     assert not count_views(away, cameras).any()
     assert len(count_views(room[:0], cameras)) == 0

@@ -1,4 +1,4 @@
-"""A small room whose photos show exactly the Gaussians that are known."""
+"""Fixtures of a small room whose photos show exactly the Gaussians that are known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The optimiser's state, and growing it."""
+"""The state of a fit is made of Gaussians, grown, and judged on held-out patches."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsmerge.raster.photos import Photos, scene_photos
 
 
 @cache
-def make(degree: int) -> tuple[Scene, Gaussians]:
+def make_scene_of_degree(degree: int) -> tuple[Scene, Gaussians]:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
     actual = scenes.plain(scene, superpixels="8%")
     return scene, replace(actual, means=actual.means.astype(np.float32))
@@ -29,21 +29,21 @@ def make(degree: int) -> tuple[Scene, Gaussians]:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return make(0)[0]
+    return make_scene_of_degree(0)[0]
 
 
 @pytest.fixture(scope="module")
 def gaussians() -> Gaussians:
-    return make(0)[1]
+    return make_scene_of_degree(0)[1]
 
 
 @pytest.fixture(scope="module")
 def photos() -> Photos:
-    return scene_photos(make(0)[0])
+    return scene_photos(make_scene_of_degree(0)[0])
 
 
-def used(gaussians: Gaussians) -> FitState:
-    """A state with some past."""
+def state_with_past(gaussians: Gaussians) -> FitState:
+    """Return a state with some past."""
     state = start_state(gaussians)
     rng = np.random.default_rng(0)
     state.m[:] = rng.normal(size=state.m.shape)
@@ -55,7 +55,7 @@ def used(gaussians: Gaussians) -> FitState:
     return state
 
 
-def covars_of(x: np.ndarray) -> np.ndarray:
+def covariances_of(x: np.ndarray) -> np.ndarray:
     made = x.astype(np.float64)
     return covariances(made[:, QUAT:LOGIT], elementary.exp(made[:, SIZE:QUAT]))
 
@@ -64,8 +64,8 @@ def covars_of(x: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_state_and_back(degree: int) -> None:
-    _, gaussians = make(degree)
+def test_gaussians_are_read_back_from_a_fit_state(degree: int) -> None:
+    _, gaussians = make_scene_of_degree(degree)
     state = start_state(gaussians)
     assert state.x.shape == (len(gaussians), COLUMNS)
     assert state.x.dtype == np.float32
@@ -81,7 +81,7 @@ def test_state_and_back(degree: int) -> None:
         assert getattr(actual, name).dtype == np.float32
 
 
-def test_ends_of_the_range_stay_finite(gaussians: Gaussians) -> None:
+def test_a_fit_state_of_extreme_opacities_and_scales_is_finite(gaussians: Gaussians) -> None:
     opacities, scales = np.array([0.0, 1.0, 1e-9, 0.5], np.float32), np.array([[0.0, 1e-30, 1e6]] * 4, np.float32)
     hard = replace(gaussians[:4], opacities=opacities, scales=scales)
     state = start_state(hard)
@@ -91,9 +91,9 @@ def test_ends_of_the_range_stay_finite(gaussians: Gaussians) -> None:
 
 def test_view_colors_bring_the_harmonics_up_to_date() -> None:
     """Below degree 1 the colours themselves; above, the harmonics with the present base colour."""
-    flat = start_state(make(0)[1])
+    flat = start_state(make_scene_of_degree(0)[1])
     assert flat.view_colors() is flat.colors
-    shiny = start_state(make(3)[1])
+    shiny = start_state(make_scene_of_degree(3)[1])
     shiny.colors[:] = 0.5
     assert shiny.view_colors() is None
     np.testing.assert_array_equal(shiny.splats.sh0, 0)
@@ -103,7 +103,7 @@ def test_view_colors_bring_the_harmonics_up_to_date() -> None:
 
 
 @pytest.mark.parametrize("more", [0, 1, 7, 40])
-def test_grown_count_is_exact(gaussians: Gaussians, photos: Photos, more: int) -> None:
+def test_growing_a_state_gives_exactly_the_count_asked_for(gaussians: Gaussians, photos: Photos, more: int) -> None:
     state = start_state(gaussians)
     grown, _ = grow(state, error_masses(state, photos), len(gaussians) + more)
     assert len(grown.x) == len(gaussians) + more
@@ -113,25 +113,25 @@ def test_grown_count_is_exact(gaussians: Gaussians, photos: Photos, more: int) -
         assert grown is state
 
 
-def test_never_more_than_doubled(gaussians: Gaussians, photos: Photos) -> None:
+def test_growing_a_state_doubles_it_at_most(gaussians: Gaussians, photos: Photos) -> None:
     state = start_state(gaussians)
     masses = error_masses(state, photos)
     assert len(grow(state, masses, 10 * len(gaussians))[0].x) == 2 * len(gaussians)
     assert len(grow(state, masses, 3)[0].x) == len(gaussians)
 
 
-def test_halves_have_their_parents_moments(gaussians: Gaussians, photos: Photos) -> None:
+def test_two_halves_have_the_moments_of_their_parent(gaussians: Gaussians, photos: Photos) -> None:
     """Mean and covariance of the pair are those of the parent: exactly, the axes across included."""
     state = start_state(gaussians)
     n = len(gaussians)
     grown, _ = grow(state, error_masses(state, photos), 2 * n)
     first, second = grown.x[:n], grown.x[n:]
     np.testing.assert_allclose((first[:, :3] + second[:, :3]) / 2, state.x[:, :3], atol=1e-6)
-    own = covars_of(first)
-    np.testing.assert_array_equal(covars_of(second), own)
+    own = covariances_of(first)
+    np.testing.assert_array_equal(covariances_of(second), own)
     apart = (second - first)[:, :3].astype(np.float64) / 2
     pair = own + apart[:, :, None] * apart[:, None]
-    expected = covars_of(state.x)
+    expected = covariances_of(state.x)
     assert (np.abs(pair - expected).max((1, 2)) <= 1e-4 * np.abs(expected).max((1, 2))).all()
     longest = state.x[:, SIZE:QUAT].max(1)
     np.testing.assert_allclose(np.linalg.norm(apart, axis=1), 0.7 * np.exp(longest), rtol=1e-4)
@@ -139,7 +139,7 @@ def test_halves_have_their_parents_moments(gaussians: Gaussians, photos: Photos)
     np.testing.assert_array_equal(first[:, QUAT:LOGIT], state.x[:, QUAT:LOGIT])
 
 
-def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: Scene, photos: Photos) -> None:
+def test_two_halves_cover_what_their_parent_covered(gaussians: Gaussians, scene: Scene, photos: Photos) -> None:
     """Each is clearer than the parent; both together cover a little more, so as to close gaps."""
     state = start_state(gaussians)
     n = len(gaussians)
@@ -149,9 +149,9 @@ def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: Scene, 
     assert before <= after <= before + 0.1
 
 
-def test_the_rest_stays_as_it_is(gaussians: Gaussians, photos: Photos) -> None:
+def test_rows_that_are_not_halved_stay_as_they_are(gaussians: Gaussians, photos: Photos) -> None:
     """In order, with its past and its start; halves have their parent's past and start where they are."""
-    state, n = used(gaussians), len(gaussians)
+    state, n = state_with_past(gaussians), len(gaussians)
     grown, _ = grow(state, error_masses(state, photos), n + 9)
     worst = np.sort(np.argsort(-error_masses(state, photos), kind="stable")[:9])
     rest = np.setdiff1d(np.arange(n), worst)
@@ -168,8 +168,8 @@ def test_the_rest_stays_as_it_is(gaussians: Gaussians, photos: Photos) -> None:
     np.testing.assert_allclose(grown.units[halves], np.exp(own), rtol=1e-5)
 
 
-def test_harmonics_are_inherited(photos: Photos) -> None:
-    _, gaussians = make(3)
+def test_halves_inherit_the_harmonics_of_their_parent(photos: Photos) -> None:
+    _, gaussians = make_scene_of_degree(3)
     state, n = start_state(gaussians), len(gaussians)
     grown, _ = grow(state, error_masses(state, photos), 2 * n)
     np.testing.assert_array_equal(grown.splats.shN[:n], state.splats.shN)
@@ -191,7 +191,7 @@ def test_growing_happens_where_the_error_is(scene: Scene, gaussians: Gaussians) 
         assert (pixels[:, :2] / pixels[:, 2:] < [20, 16]).all()
 
 
-def test_unseen_ones_have_no_error_and_are_the_last_to_be_halved(gaussians: Gaussians, photos: Photos) -> None:
+def test_unseen_gaussians_have_no_error_to_be_halved_for(gaussians: Gaussians, photos: Photos) -> None:
     behind = replace(gaussians[:5], means=gaussians.means[:5] - 100)
     state = start_state(Gaussians.concat([behind, gaussians]))
     assert (error_masses(state, photos)[:5] == 0).all()
@@ -203,7 +203,7 @@ def test_unseen_ones_have_no_error_and_are_the_last_to_be_halved(gaussians: Gaus
 
 
 @pytest.mark.parametrize("size", [(96, 64), (33, 17), (8, 6), (2, 2), (1, 5)])
-def test_every_view_holds_something_out(size: tuple[int, int]) -> None:
+def test_every_view_holds_out_some_pixels(size: tuple[int, int]) -> None:
     photos = scene_photos(scenes.make_scene(scenes.wall(), scenes.arc(3, *size)))
     for seed in range(5):
         weights = training_weights(photos, 0.05, seed)
@@ -213,7 +213,7 @@ def test_every_view_holds_something_out(size: tuple[int, int]) -> None:
             assert set(np.unique(weight).tolist()) == {0.0, 1.0}
 
 
-def test_share_of_the_patches() -> None:
+def test_held_out_patches_have_their_share_at_random() -> None:
     photos = scene_photos(scenes.make_scene(scenes.wall(), scenes.arc(4, 128, 128)))
     box_shares = [1 - np.mean(training_weights(photos, share, 0)) for share in (0.05, 0.25, 0.6)]
     assert box_shares == pytest.approx([0.06, 0.25, 0.6], abs=0.12)
@@ -254,9 +254,9 @@ def test_holdout_psnr_sets_exposure_aside(photos: Photos) -> None:
     factors /= elementary.exp(elementary.log(factors).mean())
     images = [0.5 * photo / factor for photo, factor in zip(photos.images, factors, strict=True)]
     halved = replace(photos, images=0.5 * photos.images)
-    assert holdout_psnr(images, halved, weights, 1.15) > 60
-    assert holdout_psnr(images, halved, weights, np.inf) < 40
-    assert holdout_psnr(images, photos, weights, 1.15) < 15
+    assert holdout_psnr(images, halved, weights, 1.15) > 60  # dB: equal but for rounding
+    assert holdout_psnr(images, halved, weights, np.inf) < 40  # dB: the exposures of 0.8 and 1.25 count
+    assert holdout_psnr(images, photos, weights, 1.15) < 15  # dB: all views are half as bright
 
 
 # what has faded
@@ -270,19 +270,22 @@ def test_growth_spends_the_count_on_what_can_be_seen(gaussians: Gaussians, photo
     assert len(grown.x) == len(gaussians) + 9
     assert not np.isin(grown.origins, np.arange(len(gaussians))[::7]).any()
     assert grown.splats.opacities.min() > FADED
-    rows = used(gaussians)[np.array([4, 2])]
+
+
+def test_chosen_rows_of_a_state_keep_their_past(gaussians: Gaussians) -> None:
+    rows = state_with_past(gaussians)[np.array([4, 2])]
     for name in ("x", "x0", "m", "v", "units", "box_shares", "min_sizes"):
-        np.testing.assert_array_equal(getattr(rows, name), getattr(used(gaussians), name)[[4, 2]])
+        np.testing.assert_array_equal(getattr(rows, name), getattr(state_with_past(gaussians), name)[[4, 2]])
     assert rows.origins.tolist() == [4, 2]
 
 
-def test_halves_of_what_has_not_faded_are_drawn(gaussians: Gaussians, photos: Photos) -> None:
+def test_halves_of_a_faint_gaussian_are_still_drawn(gaussians: Gaussians, photos: Photos) -> None:
     faint = start_state(replace(gaussians, opacities=np.full_like(gaussians.opacities, FADED * 1.0001)))
     grown, _ = grow(faint, error_masses(faint, photos), 2 * len(gaussians))
     assert len(grown.x) > len(gaussians)
     assert grown.splats.opacities.min() >= 1 / 255
 
 
-def test_a_faint_scene_does_not_fade_away(gaussians: Gaussians, photos: Photos) -> None:
+def test_a_faint_scene_keeps_its_count_when_it_grows(gaussians: Gaussians, photos: Photos) -> None:
     faint = start_state(replace(gaussians, opacities=np.full_like(gaussians.opacities, 0.0045)))
     assert len(grow_to(faint, photos, len(gaussians)).x) == len(gaussians)

@@ -1,4 +1,4 @@
-"""The full fit, on a tiny scene whose photos some known Gaussians made."""
+"""The full fit finds known Gaussians again from the photos that they made."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ LONG = FitOptions(fit_steps=160, holdout=0.2, fills=True)
 # what it reaches
 
 
-def test_perturbed_scene_comes_back(scene: Scene, truth: Gaussians, photos: Pair) -> None:
+def test_a_full_fit_restores_a_perturbed_scene(scene: Scene, truth: Gaussians, photos: Pair) -> None:
     gains = []
     for seed in range(3):
         start = scenes.spoil(truth, seed=seed)
         result, report = fit_full(start, scenes.run_for(photos, replace(LONG, dropout=0.0), len(start), seed=seed))
         assert (report.method, report.accepted, report.steps) == ("full", True, 160)
-        assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6
+        assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6  # dB: the error halves
         assert len(result) == len(start)
         gains.append(report.holdout_after - report.holdout_before)
-    assert np.mean(gains) > 5
+    assert np.mean(gains) > 5  # dB, on patches that the fit has not seen
     scenes.assert_invariants(result, scene)
 
 
-def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
+def test_a_full_fit_moves_gaussians_within_their_box(truth: Gaussians, photos: Pair) -> None:
     box = {"max_mean_shift": 0.5, "max_scale_change": 0.1, "max_opacity_change": 0.2, "min_scale": 0}
     box["max_ratio"] = np.inf
     start = scenes.spoil(truth)
@@ -57,7 +57,7 @@ def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
     assert float(np.abs(after - before).max()) <= 0.2001
 
 
-def test_no_stroke_is_left_of_what_photos_show(truth: Gaussians, photos: Pair) -> None:
+def test_a_full_fit_leaves_no_needle_that_photos_show(truth: Gaussians, photos: Pair) -> None:
     """Every twentieth Gaussian starts as a needle across the picture; without the limit most stay long."""
     rows = np.arange(0, len(truth), 20)
     scales = truth.scales.copy()
@@ -76,7 +76,7 @@ def test_no_stroke_is_left_of_what_photos_show(truth: Gaussians, photos: Pair) -
     assert left[0] == 0 < left[1]
 
 
-def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) -> None:
+def test_gaussians_that_one_photo_shows_have_a_smaller_box(truth: Gaussians, photos: Pair) -> None:
     state, least = start_state(truth), QUICK.tuning.single_view_share
 
     def shares_of(some: Pair) -> np.ndarray:
@@ -99,7 +99,7 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
     np.testing.assert_allclose(shares_of(with_views([0, 0])), np.where(shown > 0, 1, least), atol=1e-6)
 
 
-def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pair) -> None:
+def test_no_gaussian_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pair) -> None:
     """Of the photo that it is nearest to, whatever the box says."""
     start = scenes.spoil(truth)
     thin = replace(start, scales=start.scales * np.array([0.02, 1, 1], np.float32))
@@ -116,7 +116,7 @@ def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pai
     assert (needles.scales.min(1) < np.exp(min_sizes) / 3).mean() > 0.5
 
 
-def test_steps_draw_as_viewers_do(photos: Pair) -> None:
+def test_steps_draw_in_the_modes_of_viewers(photos: Pair) -> None:
     """With and without compensation, as when enlarged twice, and from afar; samples too, without compensation."""
     run = prepare_fit(FitJob(photos, LONG))
     modes = [run.draw_mode(step, 0.8) for step in range(1, 17)]
@@ -156,7 +156,9 @@ def test_the_first_steps_draw_each_pixel_in_turn(photos: Pair, views: int) -> No
 
 
 @pytest.mark.parametrize(("name", "field"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])
-def test_pulls_make_them_fade_and_shrink(truth: Gaussians, photos: Pair, name: str, field: str) -> None:
+def test_regularisation_makes_gaussians_smaller_or_fainter(
+    truth: Gaussians, photos: Pair, name: str, field: str
+) -> None:
     start = scenes.spoil(truth)
     free, pulled = (
         fit_full(start, scenes.run_for(photos, scenes.tuned(QUICK, **{name: prior_weight})))[0]
@@ -169,7 +171,7 @@ def test_pulls_make_them_fade_and_shrink(truth: Gaussians, photos: Pair, name: s
 
 
 @pytest.mark.parametrize(("every", "extra"), [(1, 0), (1, 70), (4, 85)])
-def test_count_asked_for_is_met(truth: Gaussians, photos: Pair, every: int, extra: int) -> None:
+def test_a_full_fit_grows_to_the_count_asked_for(truth: Gaussians, photos: Pair, every: int, extra: int) -> None:
     """More than double is grown in turns."""
     start = scenes.spoil(truth)[::every]
     assert every == 1 or extra > 1.5 * len(start)
@@ -178,7 +180,7 @@ def test_count_asked_for_is_met(truth: Gaussians, photos: Pair, every: int, extr
     assert len(result) == len(start) + extra
 
 
-def test_a_run_grows_to_a_multiple_of_what_is_left_at_most(truth: Gaussians, photos: Pair) -> None:
+def test_a_full_fit_grows_to_a_multiple_of_its_start_at_most(truth: Gaussians, photos: Pair) -> None:
     """Where many views show the same surfaces, few of the Gaussians at the start are visible."""
     start = scenes.spoil(truth)[::8]
     run = scenes.run_for(photos, replace(LONG, fills=False), count=8 * len(start), most_growth=3)
@@ -204,7 +206,7 @@ def test_dropout_needs_many_looks_at_each_view(photos: Pair, views: int, dropout
     assert prepare_fit(FitJob(many, FitOptions(fit_steps=600))).dropout == dropout
 
 
-def test_views_take_turns_and_dropout_follows_the_growth(
+def test_every_view_is_drawn_once_before_any_again(
     truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every view once before any again; the steps after the growth drop out of all Gaussians."""
@@ -220,7 +222,7 @@ def test_views_take_turns_and_dropout_follows_the_growth(
     assert all(sorted(views[i : i + 3]) == [0, 1, 2] for i in range(0, 318, 3))
 
 
-def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
+def test_short_fits_do_not_grow(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
     assert len(fit_full(start, scenes.run_for(photos, QUICK, count=2 * len(start)))[0]) == len(start)
     assert start_share(QUICK) == 1
@@ -231,7 +233,7 @@ def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
 # safety
 
 
-def test_held_out_patches_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
+def test_a_fit_does_not_learn_from_held_out_patches(truth: Gaussians, photos: Pair) -> None:
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
     options = scenes.tuned(replace(QUICK, half_res_share=1.0), ssim_lambda=0.0)
     start = scenes.spoil(truth)
@@ -245,7 +247,7 @@ def test_held_out_patches_teach_nothing_while_they_judge(truth: Gaussians, photo
 
 
 def run_steps(gaussians: Gaussians, photos: Pair, options: FitOptions) -> np.ndarray:
-    """The state after some steps, without a judge."""
+    """Return the state after some steps, without a judge."""
     run, state = scenes.run_for(photos, options), start_state(gaussians)
     schedule, optimiser = Schedule(run), make_optimiser(run)
     for step in range(options.fit_steps):
@@ -254,7 +256,7 @@ def run_steps(gaussians: Gaussians, photos: Pair, options: FitOptions) -> np.nda
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_unseen_ones_stay_as_they_are(degree: int) -> None:
+def test_unseen_gaussians_stay_as_they_are_in_a_full_fit(degree: int) -> None:
     """Outside all photos; also with colours that no photo has."""
     scene, truth = scenes.self_made(degree)
     behind = replace(truth[:4], means=truth.means[:4] - 100, sh0=np.full((4, 1, 3), 4.0, np.float32))
@@ -268,7 +270,7 @@ def test_unseen_ones_stay_as_they_are(degree: int) -> None:
 # rates, report, progress
 
 
-def test_rates_decay() -> None:
+def test_step_sizes_decay_to_their_end() -> None:
     rates = Tuning()
     start, half, end = (step_sizes(rates, p, 100) for p in (0.0, 0.5, 1.0))
     expected = (
@@ -284,7 +286,9 @@ def test_rates_decay() -> None:
     np.testing.assert_allclose(half**2, start * end, rtol=1e-6)
 
 
-def test_whole_photos_have_a_mean_of_their_own(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_shows_the_mean_error_of_whole_photos_alone(
+    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Before them a mean over fewer pixels may be another one."""
     monkeypatch.setattr(Optimiser, "step", lambda self, state, step: 0.01 if step.mode.stride > 1 else 0.1)
     calls: list[tuple[int, int, float, bool]] = []
@@ -293,12 +297,15 @@ def test_whole_photos_have_a_mean_of_their_own(truth: Gaussians, photos: Pair, m
     assert {call[3] for call in calls} == {0.5}
     assert {round(call[2]) for call in calls[:15]} == {20}
     assert {round(call[2]) for call in calls[15:]} == {10}
+
+
+def test_progress_counts_the_first_steps_as_quicker() -> None:
+    """So that the time left is about right."""
     said: list[tuple[str, int, int]] = []
     with record_run(lambda *stage: said.append(stage)):
         report_steps(10, 20, 20.0, 0.5)
         report_steps(15, 20, 10.0, 0.5)
         report_steps(20, 20, 10.0, 0.5)
-    # the first steps are quicker, so that the time left is about right
     assert said[0] == ("fit: photos 20.0 dB", round(20 * SAMPLE_COST / (1 + SAMPLE_COST)), 20)
     assert said[1][0] == "fit: photos 10.0 dB"
     assert said[0][1] < said[1][1] < 20
@@ -308,13 +315,15 @@ def test_whole_photos_have_a_mean_of_their_own(truth: Gaussians, photos: Pair, m
 # the same again
 
 
-def test_pieces_of_a_step_change_no_bit(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_size_of_pieces_of_a_step_changes_no_bit(
+    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one = fit_full(scenes.spoil(truth), scenes.run_for(photos, QUICK))
     monkeypatch.setattr(steps, "ADAM_ROWS", 17)
     assert scenes.identical(fit_full(scenes.spoil(truth), scenes.run_for(photos, QUICK))[0], one[0])
 
 
-def test_seed_repeats_and_matters(truth: Gaussians, photos: Pair) -> None:
+def test_a_full_fit_is_repeated_by_its_seed_alone(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
     one, two, other = (fit_full(start, scenes.run_for(photos, QUICK, seed=seed)) for seed in (5, 5, 6))
     assert scenes.identical(one[0], two[0])
@@ -323,7 +332,7 @@ def test_seed_repeats_and_matters(truth: Gaussians, photos: Pair) -> None:
 
 
 @pytest.mark.parametrize("size", [(8, 6), (5, 1), (1, 1)])
-def test_tiny_photos(size: tuple[int, int]) -> None:
+def test_a_full_fit_works_on_tiny_photos(size: tuple[int, int]) -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, *size))
     start = replace(scene.gaussians, means=scene.gaussians.means.astype(np.float32))
     result, report = fit_full(start, scenes.run_for(scenes.pair_of(scene), QUICK))
@@ -333,7 +342,7 @@ def test_tiny_photos(size: tuple[int, int]) -> None:
         assert np.isfinite(getattr(result, name)).all()
 
 
-def test_longer_runs_end_with_smaller_steps() -> None:
+def test_longer_fits_end_with_smaller_steps() -> None:
     rates = Tuning()
     usual, long = step_sizes(rates, 1.0, 300), step_sizes(rates, 1.0, 900)
     np.testing.assert_allclose(long, usual / 3, rtol=1e-6)
@@ -352,4 +361,4 @@ def test_rows_that_change_late_are_not_averaged_with_others(
         result, _ = fit_full(start, scenes.run_for(photos, replace(LONG, fit_steps=count), len(start)))
         assert len(result) == len(start)
         scores.append(scenes.psnr_of(result, scene))
-    assert scores[1] > scores[0] - 1
+    assert scores[1] > scores[0] - 1  # dB; averaged with others they would lose more

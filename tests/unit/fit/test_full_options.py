@@ -1,4 +1,4 @@
-"""Masks, dropout and moving cameras of the full fit."""
+"""The full fit follows masks, drops Gaussians out, and moves cameras."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gsmerge.settings.fit import GROW_STEPS, LONG_STEPS, USUAL_SHARE, Tuning
 
 
 @sweep("coarse", [0.5, 1.0])
-def test_steps_do_not_look_where_the_mask_is_not(coarse: float, scene: Scene, truth: Gaussians) -> None:
+def test_a_fit_ignores_what_masks_leave_out(coarse: float, scene: Scene, truth: Gaussians) -> None:
     """Rubbish on the left third of every photo; at both sizes, and at half size alone."""
     start = scenes.spoil(truth)
     options = FitOptions(fit_steps=40, holdout=0.2, half_res_share=coarse, dropout=0.0)
@@ -46,7 +46,7 @@ def test_steps_do_not_look_where_the_mask_is_not(coarse: float, scene: Scene, tr
     masked, report = fit_full(start, scenes.run_for(weighed, options))
     again, _ = fit_full(start, scenes.run_for(even, options))
     assert report.accepted
-    assert scenes.psnr_of(masked, scene) > scenes.psnr_of(whole, scene) + 2
+    assert scenes.psnr_of(masked, scene) > scenes.psnr_of(whole, scene) + 2  # dB: the rubbish is not learnt
     assert np.array_equal(again.means, whole.means)
 
 
@@ -54,7 +54,7 @@ QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
-def test_dropout_where_there_are_few_views(photos: tuple[Photos, Photos]) -> None:
+def test_dropout_is_used_where_there_are_few_views(photos: tuple[Photos, Photos]) -> None:
     many = Photos(*(np.concatenate([a, a]) for a in (photos[0].images, photos[0].viewmats, photos[0].Ks)), eps2d=0.3)
     pair = many, replace(photos[1], images=np.concatenate([photos[1].images] * 2))
     assert len(photos[0]) <= FEW_VIEWS < len(many)
@@ -82,7 +82,7 @@ def test_more_gaussians_have_fewer_steps_on_half_size_photos() -> None:
     assert replace(LONG, share=0.2, half_res_share=0.9).half_res_part == 0.9
 
 
-def test_dropout_leaves_out_its_share(truth: Gaussians, photos: tuple[Photos, Photos]) -> None:
+def test_dropout_leaves_its_share_of_gaussians_out_of_a_step(truth: Gaussians, photos: tuple[Photos, Photos]) -> None:
     """What is left out learns nothing from the step."""
     moved = []
     for share in (0.0, 0.5):
@@ -97,15 +97,15 @@ Pair = tuple[Photos, Photos]
 FREE = FitOptions(fit_steps=120, holdout=0.2, move_cameras=True, dropout=0.0)
 
 
-def spoil(photos: Pair, size: float = 0.01) -> Pair:
-    """Photos whose poses are off; the mean of the motions is none."""
+def spoil_poses(photos: Pair, size: float = 0.01) -> Pair:
+    """Return photos whose poses are off; the mean of the motions is none."""
     motions = np.random.default_rng(0).normal(size=(len(photos[0]), 6)) * size
     viewmats = photos[0].viewmats @ motion_matrices(motions - motions.mean(0))
     return replace(photos[0], viewmats=viewmats), replace(photos[1], viewmats=viewmats)
 
 
 def squared_error(truth: Gaussians, photos: Photos, view: int) -> tuple[float, np.ndarray]:
-    """Of a view, and its gradient by the viewmat."""
+    """Return the squared error of a view, and its gradient by the viewmat."""
     drawn = tile_view(start_state(truth).splats, **photos.camera(view))
     colors = view_colors(drawn)
     image, left = blend(drawn, colors, np.zeros(3, np.float32))
@@ -116,7 +116,7 @@ def squared_error(truth: Gaussians, photos: Photos, view: int) -> tuple[float, n
 
 @pytest.mark.parametrize("view", [0, 1])
 def test_steps_of_a_pose_lower_the_loss(view: int, truth: Gaussians, photos: Pair) -> None:
-    poses, (full, _) = start_poses(spoil(photos))
+    poses, (full, _) = start_poses(spoil_poses(photos))
     before = squared_error(truth, full, view)[0]
     rates = Tuning(poses_lr=0.1)
     for _ in range(10):
@@ -126,8 +126,8 @@ def test_steps_of_a_pose_lower_the_loss(view: int, truth: Gaussians, photos: Pai
     np.testing.assert_allclose(motion_vectors(poses.start, poses.viewmats), poses.x, atol=1e-9)
 
 
-def test_the_fit_finds_the_cameras(truth: Gaussians, photos: Pair) -> None:
-    wrong, start = spoil(photos), scenes.spoil(truth)
+def test_a_fit_that_moves_cameras_finds_their_poses(truth: Gaussians, photos: Pair) -> None:
+    wrong, start = spoil_poses(photos), scenes.spoil(truth)
     free, report = fit_full(start, scenes.run_for(wrong, FREE))
     fixed, other = fit_full(start, scenes.run_for(wrong, replace(FREE, move_cameras=False)))
     assert other.viewmats is None
@@ -136,6 +136,6 @@ def test_the_fit_finds_the_cameras(truth: Gaussians, photos: Pair) -> None:
     )]  # fmt: skip
     before, after = (float(np.median(np.linalg.norm(one - pixels[0], axis=-1))) for one in pixels[1:])
     assert after < 0.5 * before
-    assert report.holdout_after > other.holdout_after + 0.5
+    assert report.holdout_after > other.holdout_after + 0.5  # dB
     np.testing.assert_allclose(motion_vectors(wrong[0].viewmats, report.viewmats).mean(0), 0, atol=1e-9)
     assert len(free) == len(fixed)

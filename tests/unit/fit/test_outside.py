@@ -1,4 +1,4 @@
-"""Views from outside: what shows where the scene is empty, or hides what it shows, goes."""
+"""Views from outside keep a fit from filling what is empty and from hiding what is seen."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def look(reference: Gaussians, photos: Pair) -> Outside:
 
 
 def with_curtain(gaussians: Gaussians, opacity: float = 0.8) -> Gaussians:
-    """One Gaussian more, in the middle of the others, that covers every picture."""
+    """Add a Gaussian in the middle of the others, that covers every picture."""
     last = gaussians[-1:]
     wide = np.full_like(last.scales, 5 * np.ptp(gaussians.means, 0).max())
     curtain = replace(
@@ -59,7 +59,7 @@ def with_curtain(gaussians: Gaussians, opacity: float = 0.8) -> Gaussians:
     return Gaussians.concat([gaussians, curtain])
 
 
-def test_a_rim_beside_what_is_shown_does_not_count() -> None:
+def test_a_rim_beside_what_is_shown_does_not_count_as_empty() -> None:
     opacities = np.zeros((40, 100), np.float32)
     opacities[:, :10] = EMPTY_OPACITY + 0.01
     assert mark_empty(opacities)[20].tolist() == [column >= 10 + round(100 * RIM_SHARE) for column in range(100)]
@@ -67,7 +67,7 @@ def test_a_rim_beside_what_is_shown_does_not_count() -> None:
     assert not mark_empty(np.full((3, 4), 0.5, np.float32)).any()
 
 
-def test_views_stand_behind_and_around(outside: Outside, truth: Gaussians, photos: Pair) -> None:
+def test_outside_views_stand_behind_and_around_the_cameras(outside: Outside, truth: Gaussians, photos: Pair) -> None:
     """Each looks at the middle of what its photo sees, from no nearer than the photo's camera."""
     views = outside.views
     assert views.weights is not None
@@ -80,13 +80,13 @@ def test_views_stand_behind_and_around(outside: Outside, truth: Gaussians, photo
     assert np.degrees(np.arccos(np.clip(ahead @ photos[1].viewmats[:, 2, :3].T, -1, 1)).min(1)).max() > 15
 
 
-def test_a_scene_that_shows_nothing_has_none(truth: Gaussians, photos: Pair) -> None:
+def test_a_scene_that_shows_nothing_has_no_outside_views(truth: Gaussians, photos: Pair) -> None:
     faint = replace(truth[:5], opacities=np.full(5, 0.3, np.float32), scales=np.full((5, 3), 1e3, np.float32))
     assert place_outside_views(scenes.bare(faint), truth, photos[1], OPTIONS) is None
     assert place_outside_views(scenes.bare(truth[:0]), faint, photos[1], OPTIONS) is None
 
 
-def test_views_see_as_far_as_the_scene_shows_something(outside: Outside, truth: Gaussians) -> None:
+def test_outside_views_see_as_far_as_the_scene_shows_something(outside: Outside, truth: Gaussians) -> None:
     """Against depths drawn from the same cameras, and nothing where it is empty."""
     for view in range(0, len(outside.views), 9):
         limits = outside.limits[view]
@@ -98,7 +98,7 @@ def test_views_see_as_far_as_the_scene_shows_something(outside: Outside, truth: 
         assert depths.min() < np.median(limits[solid]) < depths.max()
 
 
-def test_points_before_a_limit_contradict(outside: Outside) -> None:
+def test_points_in_front_of_a_limit_contradict_outside_views(outside: Outside) -> None:
     """In front of a surface and in an empty pixel, but neither behind the surface nor beside the picture."""
     views = outside.views
     shown = np.argwhere(np.isfinite(outside.limits[0]) & (outside.limits[0] > outside.near[0] / 0.8))
@@ -114,7 +114,7 @@ def test_points_before_a_limit_contradict(outside: Outside) -> None:
 
 
 @pytest.mark.parametrize("empty", [True, False])
-def test_gradients_are_those_of_what_is_hidden(outside: Outside, truth: Gaussians, empty: bool) -> None:
+def test_veil_gradients_are_those_of_the_light_that_is_hidden(outside: Outside, truth: Gaussians, empty: bool) -> None:
     """Against a central difference in the curtain's opacity: its own where the scene is empty, before a wall as well.
 
     The wall stands at four times its depth.
@@ -138,7 +138,7 @@ def test_gradients_are_those_of_what_is_hidden(outside: Outside, truth: Gaussian
     assert not g.colors.any()
 
 
-def test_what_hides_little_and_what_stands_behind_is_left(outside: Outside, truth: Gaussians) -> None:
+def test_veils_that_hide_little_or_stand_behind_have_no_gradient(outside: Outside, truth: Gaussians) -> None:
     curtain = with_curtain(truth, 0.3)[len(truth) :]
     depth = float((outside.views.viewmats[0, 2] * np.append(curtain.means[0], 1)).sum())
     for limit, count in ((depth / (1 - VEILED_LOSS), 0), (0.5 * depth, 0), (8 * depth, 1)):
@@ -146,14 +146,14 @@ def test_what_hides_little_and_what_stands_behind_is_left(outside: Outside, trut
         assert len(veil_gradients(make_splats(curtain), looked, 0).ids) == count
 
 
-def test_fog_is_the_opacity_far_outside(outside: Outside, truth: Gaussians) -> None:
+def test_the_fog_score_is_the_opacity_where_outside_is_empty(outside: Outside, truth: Gaussians) -> None:
     assert score_fog(make_splats(truth), outside) == pytest.approx(0, abs=0.01)
     thick, thin = (score_fog(make_splats(with_curtain(truth, opacity)), outside) or 0 for opacity in (0.8, 0.2))
     assert 0.3 < 2 * thin < thick <= 0.81
     assert score_fog(make_splats(truth), replace(outside, limits=np.zeros_like(outside.limits))) is None
 
 
-def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pair, outside: Outside) -> None:
+def test_a_fit_keeps_empty_what_outside_views_have_empty(truth: Gaussians, photos: Pair, outside: Outside) -> None:
     """Photos that a curtain stands in ask for one; from outside nobody wants it."""
     wanted = with_curtain(truth, 0.3)
     shown = tuple(replace(some, images=np.stack(render_photos(wanted, some)).clip(0, 1)) for some in photos)
@@ -165,7 +165,7 @@ def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pa
     assert grown > 4 * kept
 
 
-def test_a_note_says_where_fog_is_left(truth: Gaussians, photos: Pair) -> None:
+def test_fog_left_by_a_fit_is_noted(truth: Gaussians, photos: Pair) -> None:
     _, report = fit_gaussians(scenes.spoil(truth), FitJob(photos, OPTIONS))
     for fog, count in ((HAZE, 0), (HAZE + 0.01, 1), (None, 0)):
         with record_run(None) as record:

@@ -1,4 +1,4 @@
-"""Cutting the Gaussians of a fit at the edges of its photos."""
+"""Gaussians of a fit are cut and split at the edges of its photos."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Pair = tuple[Photos, Photos]
 
 
 def with_wide(truth: Gaussians) -> Gaussians:
-    """The same, with every twentieth Gaussian eight times as large."""
+    """Return the same, with every twentieth Gaussian eight times as large."""
     wide = np.arange(0, len(truth), 20)
     scales = truth.scales.copy()
     scales[wide] *= 8
@@ -32,13 +32,13 @@ def with_wide(truth: Gaussians) -> Gaussians:
 
 
 def edges_of(photos: Photos, margin: float) -> Edges:
-    """Edges that are moved out by a margin in pixels."""
+    """Find edges that are moved out by a margin in pixels."""
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
     return find_edges(cameras, round(4 * len(photos) * photos.width * photos.height / margin**2))
 
 
 def lost_beyond(gaussians: Gaussians, edges: Edges) -> np.ndarray:
-    """Sum of the squared scales of each Gaussian across edges that a cut takes away."""
+    """Return the sum of the squared scales of each Gaussian across edges that a cut takes away."""
     means, is_cut, covars = gaussians.means.copy(), np.zeros(len(gaussians), np.uint8), np.zeros((len(gaussians), 3, 3))
     planes = edges.normals, edges.offsets
     cut_at_edges(gaussians.quats, gaussians.scales, *planes, 0, len(gaussians), means, covars, is_cut)
@@ -46,7 +46,7 @@ def lost_beyond(gaussians: Gaussians, edges: Edges) -> np.ndarray:
     return lost[is_cut > 0]
 
 
-def test_edges_bound_what_photos_show(photos: Pair) -> None:
+def test_edges_are_the_bounds_of_what_photos_show(photos: Pair) -> None:
     margin, half = 1.5, photos[1]
     edges = edges_of(half, margin)
     points = np.random.default_rng(1).normal(0, 3, (500, 3))
@@ -59,7 +59,7 @@ def test_edges_bound_what_photos_show(photos: Pair) -> None:
     assert 0.02 < shown.mean() < 0.9
 
 
-def test_what_crosses_the_edges_ends_there(truth: Gaussians, photos: Pair) -> None:
+def test_gaussians_that_cross_the_edges_are_cut_there(truth: Gaussians, photos: Pair) -> None:
     wide, edges = with_wide(truth), edges_of(photos[1], 4.0)
     state = start_state(wide)
     cut_state(state, edges)
@@ -73,7 +73,7 @@ def test_what_crosses_the_edges_ends_there(truth: Gaussians, photos: Pair) -> No
     np.testing.assert_array_equal(state.x[~moved], start_state(wide).x[~moved])
 
 
-def test_fixed_gaussians_and_least_sizes_stay(truth: Gaussians, photos: Pair) -> None:
+def test_cutting_keeps_fixed_gaussians_with_the_least_sizes_of_others(truth: Gaussians, photos: Pair) -> None:
     state = start_state(with_wide(truth))
     state.fixed[::2] = True
     state.fixed[20] = False  # a wide one
@@ -86,7 +86,7 @@ def test_fixed_gaussians_and_least_sizes_stay(truth: Gaussians, photos: Pair) ->
 
 
 def across_an_edge(opacity: float) -> tuple[FitState, Edges]:
-    """A disc of ten pixels (sigma) whose middle lies two pixels inside a photo of 48 pixels, and a small one inside."""
+    """Make a disc of ten pixels (sigma), its middle two pixels inside a photo of 48 pixels, and a small one inside."""
     cameras, x = scenes.arc(1), -22.0 * 3 / 48
     means = np.array([[x, 0, 3], [0, 0, 3]], np.float32)
     scales = np.array([[0.625, 0.625, 0.001], [0.02, 0.02, 0.02]], np.float32)
@@ -98,7 +98,7 @@ def across_an_edge(opacity: float) -> tuple[FitState, Edges]:
 
 
 def opacities_of(state: FitState) -> np.ndarray:
-    """Opacities ``[96]`` along the middle row of a picture that is twice as wide as the photo."""
+    """Return opacities ``[96]`` along the middle row of a picture that is twice as wide as the photo."""
     cameras = scenes.arc(1)
     wide = replace(cameras, Ks=cameras.Ks + np.array([[0, 0, 24], [0, 0, 0], [0, 0, 0]]), width=96)
     return np.asarray(render(gaussians_of(state.x, state.splats.shN), wide).alphas[0, 18, :, 0])
@@ -114,7 +114,7 @@ def test_a_large_gaussian_is_split_until_its_rim_is_narrow() -> None:
 
 
 @pytest.mark.parametrize("most", [2, 3, 6])
-def test_splits_keep_to_the_number(most: int) -> None:
+def test_splits_stay_within_the_most_gaussians(most: int) -> None:
     state, edges = across_an_edge(0.95)
     split = split_at_edges(state, edges, most)
     assert len(split.x) <= most
@@ -122,7 +122,7 @@ def test_splits_keep_to_the_number(most: int) -> None:
     np.testing.assert_array_equal(split.x[split.origins == 1], state.x[1:])
 
 
-def test_haze_before_the_scene_is_not_split() -> None:
+def test_a_faint_gaussian_across_an_edge_is_not_split() -> None:
     state, edges = across_an_edge(0.15)
     np.testing.assert_array_equal(split_at_edges(state, edges, 100).x, state.x)
 
@@ -142,7 +142,9 @@ def test_splits_that_show_the_photos_worse_are_not_taken(
     assert calls == [len(fitted)]
 
 
-def test_threads_write_the_same(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_threads_does_not_change_a_cut(
+    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("gsmerge.fit.edges.ROWS", 7)
 
     def cut(threads: int) -> FitState:
@@ -154,7 +156,7 @@ def test_threads_write_the_same(truth: Gaussians, photos: Pair, monkeypatch: pyt
     np.testing.assert_array_equal(cut(1).x, cut(3).x)
 
 
-def test_a_long_fit_reaches_beyond_its_photos_only_where_it_may(truth: Gaussians, photos: Pair) -> None:
+def test_a_long_fit_with_edges_reaches_less_beyond_its_photos(truth: Gaussians, photos: Pair) -> None:
     """Of one seed few Gaussians decide, so that four are taken, and lengths in place of their squares."""
     edges, reach = edges_of(photos[1], 2.0), np.zeros(2)
     for seed in range(4):

@@ -1,4 +1,4 @@
-"""The photos of a fit: at which size, read how often, and which of them a step looks at."""
+"""A fit chooses the size of its photos, reads them once, and looks at one size in each step."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
 def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> PicturedScene:
-    """The scene with enlarged photos of its own; ``read`` gets the number of every photo that is read."""
+    """Return the scene with enlarged photos of its own; ``read`` gets the number of every photo that is read."""
     width, height = (round(scale * side) for side in (scene.cameras.width, scene.cameras.height))
     images = [cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC) for image in scene.images]
     stored = [np.rint(255 * image.clip(0, 1)).astype(np.uint8) for image in images]
 
-    def one(photo: int) -> np.ndarray:
+    def read_stored(photo: int) -> np.ndarray:
         if read is not None:
             read.append(photo)
         return stored[photo]
 
     shape = np.array([[width / scene.cameras.width], [height / scene.cameras.height], [1.0]])
-    large = LargePhotos(scene.cameras.Ks * shape, width, height, tuple(range(len(scene))), one)
+    large = LargePhotos(scene.cameras.Ks * shape, width, height, tuple(range(len(scene))), read_stored)
     return PicturedScene.with_pictures(replace(scene, large_photos=large), scene.images, scene.masks)
 
 
@@ -52,7 +52,9 @@ def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Pic
         (4, False, {"photo_scale": 1.5}, 1.5), (1.2, True, {"photo_scale": 1.1}, 1.1),
     ],
 )  # fmt: skip
-def test_scale_is_chosen(scene: Scene, larger: float, auto: bool, settings: dict[str, Any], expected: float) -> None:
+def test_the_photo_scale_is_chosen_by_photos_and_settings(
+    scene: Scene, larger: float, auto: bool, settings: dict[str, Any], expected: float
+) -> None:
     actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=auto)
     assert actual == pytest.approx(expected, rel=0.02)
     assert problem is None
@@ -66,7 +68,7 @@ def test_scale_is_chosen(scene: Scene, larger: float, auto: bool, settings: dict
         (2, {"photo_scale": 2, "fit_steps": 12}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
     ],
 )
-def test_less_than_asked_for_is_said(
+def test_a_smaller_photo_scale_than_asked_for_has_a_reason(
     scene: Scene, larger: float, settings: dict[str, Any], expected: float, reason: str
 ) -> None:
     actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=True)
@@ -74,7 +76,7 @@ def test_less_than_asked_for_is_said(
     assert problem.startswith(reason)
 
 
-def test_photos_of_the_views_size_are_no_larger(scene: Scene) -> None:
+def test_photos_of_the_size_of_the_views_have_scale_1(scene: Scene) -> None:
     assert largest_scale(scene) == 1
     assert photo_scale(scene, FitOptions(), auto=True) == (1, None)
     assert photo_scale(scene, FitOptions(photo_scale=2), auto=True) == (
@@ -86,7 +88,7 @@ def test_photos_of_the_views_size_are_no_larger(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("value", [0.5, 0, -1, float("inf"), float("nan"), "2", "large"])
-def test_impossible_scales_are_refused(value: Any) -> None:
+def test_impossible_photo_scales_are_refused(value: Any) -> None:
     with refuses(ValueError, "photo_scale", 1, value):
         FitOptions(photo_scale=value)
 
@@ -94,7 +96,7 @@ def test_impossible_scales_are_refused(value: Any) -> None:
 # what is read
 
 
-def test_photos_are_read_once_at_their_scale(scene: Scene) -> None:
+def test_large_photos_are_read_once_at_the_chosen_scale(scene: Scene) -> None:
     read: list[int] = []
     large = with_large(scene, 4, read)
     photos = large_photos(large, 2)
@@ -108,7 +110,7 @@ def test_photos_are_read_once_at_their_scale(scene: Scene) -> None:
     np.testing.assert_allclose(photos.image(1), small / 255, atol=1e-6)
 
 
-def test_masks_weigh_larger_photos(scene: Scene) -> None:
+def test_masks_are_enlarged_to_weights_of_large_photos(scene: Scene) -> None:
     masks = np.ones(scene.pixels.shown.shape, bool)
     half = masks.shape[2] // 2
     masks[:, :, half:] = False
@@ -125,7 +127,7 @@ def test_a_point_has_the_same_place_in_every_size(scene: Scene) -> None:
     np.testing.assert_allclose(project(scene.gaussians.means[:50].astype(np.float64), large)[0], places * shape)
 
 
-def test_some_views_have_their_own_photos(scene: Scene) -> None:
+def test_a_subset_of_views_has_the_large_photos_of_these_views(scene: Scene) -> None:
     read: list[int] = []
     large_photos(subset(with_large(scene, 2, read), [2, 0]), 2)
     assert sorted(read) == [0, 2]
@@ -138,7 +140,7 @@ def test_some_views_have_their_own_photos(scene: Scene) -> None:
 # the steps
 
 
-def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
+def test_steps_look_at_half_size_then_full_size_then_larger_photos(scene: Scene) -> None:
     options = FitOptions(fit_steps=200, photo_scale=2)
     run = prepare_fit(FitJob(fit_photos(with_large(scene, 2), options), options))
     modes = [run.draw_mode(step + 1, step / 200) for step in range(200)]
@@ -151,7 +153,7 @@ def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
     assert [sizes[140:].count(size) for size in (0, 1)] == [52, 8]
 
 
-def test_the_users_share_of_half_size_steps_stays(scene: Scene) -> None:
+def test_a_share_of_half_size_steps_that_a_user_sets_stays(scene: Scene) -> None:
     options = FitOptions(half_res_share=0.8, photo_scale=2)
     assert prepare_fit(FitJob(fit_photos(with_large(scene, 2), options), options)).half_part == 0.8
 
@@ -161,7 +163,7 @@ def test_large_photos_count_in_every_pixel(scene: Scene) -> None:
     assert all((weight == 1).all() for weight in run.step_weights[2])
 
 
-def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> None:
+def test_a_fit_to_larger_photos_shows_them_better(truth: Gaussians, scene: Scene) -> None:
     """Over three seeds, since by one the gain is .2 to .9 dB."""
     large, start = with_large(scene, 2), scenes.spoil(truth)
     near = large_photos(large, 2)
@@ -179,7 +181,7 @@ def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> No
     assert sharp > usual + 0.3
 
 
-def test_a_run_says_at_what_scale_it_looked(scene: Scene) -> None:
+def test_a_run_notes_the_photo_scale(scene: Scene) -> None:
     report = compact(with_large(scene, 2), superpixels="10%", fit_steps=30).report
     assert report.choices["photo_scale"] == 2
     assert [note for note in report.notes if "--set photo_scale=1 " in note]
@@ -188,7 +190,7 @@ def test_a_run_says_at_what_scale_it_looked(scene: Scene) -> None:
     assert not [note for note in report.notes if "photo_scale" in note]
 
 
-def test_what_is_held_out_is_what_counts(scene: Scene) -> None:
+def test_held_out_patches_lie_where_photos_count(scene: Scene) -> None:
     """Of a small part, at least one patch of each view; none of what is to stay empty."""
     photos = scene_photos(scene)
     weights = np.full((len(photos), photos.height, photos.width), MASKED_WEIGHT, np.float32)

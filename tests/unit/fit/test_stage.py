@@ -1,4 +1,4 @@
-"""The stage: what stays, and which fit is taken."""
+"""The fit stage prunes, fits, and refuses a fit that shows the photos worse."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
 def visible(gaussians: Gaussians, photos: Photos) -> np.ndarray:
-    """Those with a weight of 1/255 in some photo, or outside all of them."""
+    """Mark Gaussians with a weight of 1/255 in some photo, or outside all of them."""
     peaks, inside = peak_weights(gaussians, photos)
     return ~inside | (peaks >= 1 / 255)
 
 
-def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
+def test_the_fit_stage_gives_the_result_of_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
     outside = place_outside_views(scenes.bare(truth), start, photos[1], QUICK)
     assert outside is not None
@@ -45,7 +45,7 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     assert scenes.identical(result, expected)
 
 
-def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
+def test_the_fit_stage_prunes_hidden_gaussians_first(truth: Gaussians, photos: Pair) -> None:
     opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
     alone, both = (fit_gaussians(g, FitJob(photos, QUICK))[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
@@ -71,12 +71,12 @@ def test_a_fit_is_taken_though_held_out_patches_get_worse(truth: Gaussians, phot
     assert report.accepted
 
 
-def test_nothing_to_fit(truth: Gaussians, photos: Pair) -> None:
+def test_fitting_no_gaussians_gives_none(truth: Gaussians, photos: Pair) -> None:
     result, _ = fit_gaussians(truth[:0], FitJob(photos, QUICK))
     assert len(result) == 0
 
 
-def test_a_survey_is_what_its_parts_are(truth: Gaussians, photos: Pair) -> None:
+def test_a_survey_of_photos_is_that_of_its_parts_one_by_one(truth: Gaussians, photos: Pair) -> None:
     run, pictures = scenes.run_for(photos, QUICK), list[np.ndarray]()
     survey = survey_photos(truth, run)
     half, state = photos[1], start_state(truth)
@@ -93,7 +93,7 @@ def test_a_survey_is_what_its_parts_are(truth: Gaussians, photos: Pair) -> None:
     np.testing.assert_array_equal(survey[rows].peaks, survey.peaks[rows])
 
 
-def test_shown(photos: Pair) -> None:
+def test_gaussians_in_sight_or_outside_all_photos_are_visible(photos: Pair) -> None:
     """In sight, hidden behind an opaque sheet, and outside all photos."""
     sheet = [[x, y, 2.0] for x in np.linspace(-2, 2, 41) for y in np.linspace(-2, 2, 41)]
     means = np.array([*sheet, [0.0, 0, 2.5], [0, 0, -5], [0, 0, 1.0]], np.float32)
@@ -106,7 +106,7 @@ def test_shown(photos: Pair) -> None:
     assert visible(made, photos[1])[-3:].tolist() == [False, True, True]
 
 
-def test_many_photos_are_surveyed_by_some_that_look_everywhere(truth: Gaussians) -> None:
+def test_some_of_many_photos_are_surveyed_if_they_look_everywhere(truth: Gaussians) -> None:
     def photos_of(shifts: np.ndarray) -> Photos:
         viewmats = np.tile(np.eye(4), (len(shifts), 1, 1))
         viewmats[:, 0, 3] = -shifts

@@ -1,4 +1,4 @@
-"""Steps of the full fit: the same bits as those of a slow twin, whatever the threads."""
+"""Steps of the full fit give the bits of a slow twin with any number of threads."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ CASES = {
 
 
 def take_steps(case: Case, take_step: TakeStep, threads: int = 2) -> tuple[FitState, list[float], Optimiser]:
-    """The state, the errors and the optimiser after the steps of a case."""
+    """Return the state, the errors and the optimiser after the steps of a case."""
     run, state = case.run(), case.state()
     optimiser, schedule = make_optimiser(run), Schedule(run)
     with use_threads(threads):
@@ -78,7 +78,7 @@ def assert_same(first: FitState, second: FitState) -> None:
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_bits_are_those_of_the_slow_twin(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_give_the_bits_of_a_slow_twin(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     if case.is_crowded:
         monkeypatch.setattr(tiled_view, "CROWDED", 0)
         monkeypatch.setattr(tiled_view, "CROWDED_EACH", 0)
@@ -95,7 +95,7 @@ def test_bits_are_those_of_the_slow_twin(case: Case, monkeypatch: pytest.MonkeyP
             assert np.abs(twin.poses.x).min() > 0
 
 
-def test_cut_lists_are_shorter_and_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_with_cut_lists_gives_the_same_state(monkeypatch: pytest.MonkeyPatch) -> None:
     """Five opaque curtains near the cameras, which are about the origin, hide what is behind them."""
     truth, lengths, states = scenes.self_made(0)[1], [], []
     near, wide = np.tile(0.2 * truth.means.mean(0), (5, 1)), np.full((5, 3), 5 * np.ptp(truth.means), np.float32)
@@ -113,7 +113,7 @@ def test_cut_lists_are_shorter_and_change_nothing(monkeypatch: pytest.MonkeyPatc
     assert_same(*states)
 
 
-def test_all_low_passes_draw_the_same(truth: Gaussians, photos: Pair) -> None:
+def test_steps_of_all_draw_modes_give_the_bits_of_a_slow_twin(truth: Gaussians, photos: Pair) -> None:
     """Sampled and whole photos of both sizes, with and without antialiasing."""
     states = []
     for take_step in (step_slowly, Optimiser.step):
@@ -135,7 +135,7 @@ def test_a_state_without_gaussians_takes_steps(photos: Pair, truth: Gaussians) -
     assert errors[0] == errors[1] > 0
 
 
-def test_buffers_follow_the_state_and_the_threads() -> None:
+def test_buffers_are_made_again_for_other_threads_or_rows() -> None:
     state, _, optimiser = take_steps(Case(), Optimiser.step)
     buffers = optimiser.buffers
     step = Schedule(optimiser.run).draw(1, 0.9, len(state.x))

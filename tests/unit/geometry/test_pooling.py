@@ -17,7 +17,7 @@ from gsmerge.kernels.elementary import exp, log, log1p
 from gsmerge.types import Gaussians
 
 
-def members(count: int, seed: int = 0, coefficients: int = 1, opacity: float | None = None) -> Members:
+def random_members(count: int, seed: int = 0, coefficients: int = 1, opacity: float | None = None) -> Members:
     rng = np.random.default_rng(seed)
     columns = (
         rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), 0.05 * exp(0.3 * rng.normal(size=(count, 3))),
@@ -28,16 +28,16 @@ def members(count: int, seed: int = 0, coefficients: int = 1, opacity: float | N
     return gaussian_members(Gaussians(*values), footprints)
 
 
-def merged(of: Members) -> Gaussians:
-    """All members as one Gaussian."""
+def pool_all(of: Members) -> Gaussians:
+    """Pool all members into one Gaussian."""
     m = pool_members(of, np.array([0, len(of.means)]), np.arange(len(of.means)))
     return to_gaussians(m.covars, m.extinctions, m.means, m.sh)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_one_member_is_itself_but_for_the_floor(seed: int) -> None:
-    one = members(1, seed, coefficients=16)
-    result = merged(one)
+def test_pooling_one_member_gives_itself_but_for_the_floor(seed: int) -> None:
+    one = random_members(1, seed, coefficients=16)
+    result = pool_all(one)
     covar = covariances(result.quats.astype(np.float64), result.scales.astype(np.float64))[0]
     np.testing.assert_allclose(result.means, one.means, rtol=1e-6)
     floor = (0.1 * 0.05) ** 2 * np.eye(3)
@@ -56,16 +56,16 @@ def test_one_member_is_itself_but_for_the_floor(seed: int) -> None:
     assert float(result.opacities[0]) == pytest.approx(one.opacities[0], rel=0.05)
 
 
-def test_two_members_by_hand() -> None:
+def test_pooling_two_members_is_as_by_hand() -> None:
     """Balls of radius 1 at x = 0 and 4, opacities 0.3 and 0.1: weights 3 to 1."""
-    two = members(2, opacity=0.3)
+    two = random_members(2, opacity=0.3)
     two.opacities[1] = 0.1
     two.means[:] = [[0, 0, 0], [4, 0, 0]]
     two.quats[:] = [1, 0, 0, 0]
     two.scales[:] = 1
     two.footprints[:] = 1e-6
     two.sh0[:, 0] = [[0, 0, 0], [1, 2, 4]]
-    result = merged(two)
+    result = pool_all(two)
     np.testing.assert_allclose(result.means[0], [1, 0, 0], atol=1e-6)
     np.testing.assert_allclose(np.sort(result.scales[0]), [1, 1, 2], rtol=1e-6)
     np.testing.assert_allclose(result.sh0[0, 0], [0.25, 0.5, 1], rtol=1e-6)
@@ -73,24 +73,24 @@ def test_two_members_by_hand() -> None:
     assert float(result.opacities[0]) == pytest.approx(1 - np.exp(-depth), rel=1e-5)
 
 
-def test_tiles_of_a_sheet_keep_it_closed() -> None:
+def test_pooling_the_tiles_of_a_sheet_keeps_it_closed() -> None:
     """A square of n x n tiles: the peak optical depth is 12 / 2 pi times the sheet's mean (stability.md)."""
     n, sigma, depth = 40, 0.6, 0.7
     xs, ys = np.meshgrid(np.arange(n), np.arange(n))
-    sheet = members(n * n, opacity=1 - exp(-depth))
+    sheet = random_members(n * n, opacity=1 - exp(-depth))
     sheet.means[:] = np.stack([xs.ravel(), ys.ravel(), np.zeros(n * n)], 1)
     sheet.quats[:] = [1, 0, 0, 0]
     sheet.scales[:] = [sigma, sigma, 0.1]
     sheet.footprints[:] = 1e-3
-    result = merged(sheet)
+    result = pool_all(sheet)
     mean_depth = depth * 2 * np.pi * sigma**2  # per unit area
     peak = -log1p(-float(result.opacities[0]))
     assert peak == pytest.approx(mean_depth * 12 / (2 * np.pi), rel=0.01)
 
 
-def test_many_groups_match_one_by_one() -> None:
+def test_pooling_many_groups_matches_pooling_one_by_one() -> None:
     """More groups than one task takes."""
-    of = members(9000)
+    of = random_members(9000)
     starts = np.arange(0, 9001, 2)
     at_once = pool_members(of, starts, np.arange(9000))
     for g in (0, 4095 // 2, 4096 // 2 + 1, 4499):
@@ -99,9 +99,9 @@ def test_many_groups_match_one_by_one() -> None:
             np.testing.assert_array_equal(getattr(at_once, name)[g], getattr(alone, name)[0])
 
 
-def test_paper_rule_by_hand() -> None:
+def test_pooling_by_the_rule_of_the_paper_is_as_by_hand() -> None:
     """Spread of the means alone, and an opacity that is the members' mean."""
-    of = members(3)
+    of = random_members(3)
     of.means[:] = [[0, 0, 0], [2, 0, 0], [0, 4, 0]]
     of.opacities[:] = [0.2, 0.2, 0.4]
     m = pool_members(of, np.array([0, 3]), np.arange(3), "paper")
@@ -112,13 +112,13 @@ def test_paper_rule_by_hand() -> None:
     assert float(made.opacities[0]) == pytest.approx(0.8 / 3, rel=1e-5)
 
 
-def test_scales_have_a_floor() -> None:
+def test_scales_of_an_empty_covariance_are_above_zero() -> None:
     scales, quats = principal_axes(np.zeros((1, 3, 3)))
     assert (scales > 0).all()
     np.testing.assert_allclose(np.linalg.norm(quats), 1)
 
 
-def test_footprints_are_depth_over_focal_length() -> None:
+def test_footprints_of_members_are_depth_over_focal_length() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=1)
     actual = scene_members(scene)
     assert actual.sh0.shape == (3 * 24 * 32, 1, 3)

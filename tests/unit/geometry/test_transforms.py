@@ -41,12 +41,12 @@ HALF = math.sqrt(0.5)
         ([0.0, 0, 0, 1], [-1.0, 0, 0]),
     ],
 )
-def test_quarter_turns(quat: list[float], image_of_x: list[float]) -> None:
+def test_quarter_turns_rotate_the_x_axis_as_by_hand(quat: list[float], image_of_x: list[float]) -> None:
     rotmat = quat_to_rotmat(np.array(quat))
     assert np.allclose(rotmat[:, 0], image_of_x, atol=1e-12)
 
 
-def test_rotations_are_rotations_whatever_the_length() -> None:
+def test_quaternions_of_any_length_are_rotations() -> None:
     quats = np.random.default_rng(0).normal(size=(4, 50, 4))
     rotmats = quat_to_rotmat(quats)
     assert rotmats.shape == (4, 50, 3, 3)
@@ -56,12 +56,12 @@ def test_rotations_are_rotations_whatever_the_length() -> None:
         assert np.allclose(quat_to_rotmat(other), rotmats, atol=1e-12)
 
 
-def test_covariance_by_hand() -> None:
+def test_a_covariance_is_as_by_hand() -> None:
     covar = covariances(np.array([HALF, 0, 0, HALF]), np.array([1.0, 2.0, 3.0]))
     assert np.allclose(covar, np.diag([4.0, 1.0, 9.0]), atol=1e-6)
 
 
-def test_projection_by_hand() -> None:
+def test_a_projection_is_as_by_hand() -> None:
     """Eye at (1, 0, 0), looking along x: the world's y is to the left and its z up, which is -y in the image."""
     viewmat = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, -1], [0, 0, 0, 1]])
     K = np.array([[10.0, 0, 8], [0, 20, 6], [0, 0, 1]])
@@ -73,7 +73,7 @@ def test_projection_by_hand() -> None:
     np.testing.assert_allclose(depths[0], [2, 2, 2, -1])
 
 
-def test_quaternions_of_rotations_and_back() -> None:
+def test_quaternions_are_read_back_from_their_rotations() -> None:
     """Half turns about every axis too, where a quaternion's first component is zero."""
     quats = np.concatenate([normalize(np.random.default_rng(3).normal(size=(64, 4))), np.eye(4)])
     actual = rotmat_to_quat(quat_to_rotmat(quats))
@@ -83,7 +83,7 @@ def test_quaternions_of_rotations_and_back() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 5, 1_000, 300_000, 300_001])
 @pytest.mark.parametrize("kind", ["random", "ascending", "few values", "periodic"])
-def test_median_of_few_and_of_many_values(count: int, kind: str) -> None:
+def test_the_median_of_any_number_of_values_is_that_of_numpy(count: int, kind: str) -> None:
     """Also if a sample at even steps says nothing about the median, as with periodic values."""
     values = np.random.default_rng(count).exponential(size=count)
     if kind == "ascending":
@@ -125,13 +125,13 @@ def one_camera() -> Cameras:
     return Cameras(np.eye(4)[None], K[None], 100, 80)
 
 
-def test_middle_depth_is_of_the_points_in_the_picture_alone() -> None:
+def test_the_middle_depth_is_that_of_points_in_the_picture_alone() -> None:
     points = np.array([[0.0, 0, 4], [0, 0, 5], [0.1, 0, 6], [0, 0, -9], [900, 0, 9]])
     assert middle_depth(points, one_camera()) == 5
     assert middle_depth(points[3:], one_camera()) == middle_depth(points[:0], one_camera()) == 1
 
 
-def test_a_camera_steps_back_and_turns_about_what_it_sees() -> None:
+def test_a_camera_that_steps_outside_turns_about_what_it_sees() -> None:
     viewmat = one_camera().viewmats[0]
     assert camera_centres(step_outside(viewmat, 4, 0.5)) == pytest.approx([0, 0, -2])
     pivot = np.array([[0.0, 0, 4]])

@@ -19,7 +19,7 @@ from gsmerge.io import read_ply, write_ply
 from gsmerge.measure.coverage import extents
 
 
-def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:
+def test_inspecting_a_scene_that_fits_reports_its_facts(tiny_folder: Path, tiny: Tiny) -> None:
     actual = inspect(tiny_folder)
     assert json.loads(json.dumps(actual, allow_nan=False)) == actual
     assert actual["count"] == 840
@@ -37,7 +37,7 @@ def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:
     assert actual["extents"]["box_high"] == pytest.approx(high, abs=1e-4)
 
 
-def test_a_ply_without_cameras(tmp_path: Path, tiny: Tiny) -> None:
+def test_a_ply_without_cameras_has_an_alignment_problem(tmp_path: Path, tiny: Tiny) -> None:
     path = tiny.save(tmp_path, cameras=False, images=False) / "scene.ply"
     write_ply(path, tiny.gaussians[np.random.default_rng(0).permutation(840)], overwrite=True)
     actual = inspect(path)
@@ -46,7 +46,7 @@ def test_a_ply_without_cameras(tmp_path: Path, tiny: Tiny) -> None:
     assert "cameras" in actual["alignment_problem"]
 
 
-def test_cameras_that_do_not_fit_are_reported(tiny_folder: Path, tiny: Tiny) -> None:
+def test_cameras_that_do_not_fit_are_an_alignment_problem(tiny_folder: Path, tiny: Tiny) -> None:
     some = np.random.default_rng(0).permutation(840)[:700]
     write_ply(tiny_folder / "scene.ply", tiny.gaussians[some], overwrite=True)
     actual = inspect(tiny_folder)
@@ -62,7 +62,7 @@ def test_cameras_that_do_not_fit_are_reported(tiny_folder: Path, tiny: Tiny) -> 
     assert noted(actual["notes"], "transforms.json", "and the photos in", "left out", "expected JSON")
 
 
-def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
+def test_odd_values_of_a_ply_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
     opacities, quats, scales = (getattr(tiny.gaussians, f).copy() for f in ("opacities", "quats", "scales"))
     opacities[:4], opacities[4:9] = 1, 0
     scales[3] = 1e14
@@ -83,7 +83,7 @@ def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
     assert actual["alignment"] is not None
 
 
-def test_outliers_and_large_scales_are_shares(tiny_folder: Path, tiny: Tiny) -> None:
+def test_outliers_and_large_scales_are_reported_as_shares(tiny_folder: Path, tiny: Tiny) -> None:
     means, scales = tiny.gaussians.means.copy(), tiny.gaussians.scales.copy()
     means[:7] += 1000
     scales[:21, 1] = 50
@@ -97,14 +97,14 @@ def test_outliers_and_large_scales_are_shares(tiny_folder: Path, tiny: Tiny) -> 
     assert actual["diagonal"] == pytest.approx(float(np.linalg.norm(high - low)))
 
 
-def test_an_empty_or_single_point_has_extents(tiny: Tiny) -> None:
+def test_extents_of_no_or_one_gaussian_are_zero(tiny: Tiny) -> None:
     assert extents(tiny.gaussians[:0])["share_outliers"] == 0
     one = extents(tiny.gaussians[:1])
     assert one["diagonal"] == 0
     assert one["share_outliers"] == 0
 
 
-def test_coverage_per_view(tiny_folder: Path, tiny: Tiny) -> None:
+def test_coverage_is_reported_for_each_view(tiny_folder: Path, tiny: Tiny) -> None:
     opacities = tiny.gaussians.opacities.copy()
     opacities[280:350] = 0
     write_ply(tiny_folder / "scene.ply", replace(tiny.gaussians, opacities=opacities), overwrite=True)
@@ -122,7 +122,7 @@ def test_coverage_per_view(tiny_folder: Path, tiny: Tiny) -> None:
     assert actual["sight"]["share_seen"] == 1
 
 
-def test_what_compact_would_give(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
+def test_inspecting_estimates_the_result_of_compact(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
     actual = inspect(tiny_folder)
     result = compact(read_scene(tiny_folder), fit="none")
     assert actual["compact"]["num_gaussians"] == pytest.approx(len(result.gaussians), abs=3)
@@ -135,13 +135,13 @@ def test_what_compact_would_give(tiny_folder: Path, tmp_path: Path, tiny: Tiny) 
 
 @pytest.fixture
 def pruned(tmp_path: Path) -> Path:
-    """The folder of a scene with half of its rows, in no order."""
+    """Save a scene with half of its rows, in no order."""
     smooth = smooth_scene(24, 18)
     some = np.random.default_rng(0).permutation(1296)[:640]
     return replace(smooth, gaussians=smooth.gaussians[some]).save(tmp_path / "scene")
 
 
-def test_a_scene_without_pixels(pruned: Path) -> None:
+def test_a_scene_without_pixels_is_inspected_by_sight(pruned: Path) -> None:
     actual = inspect(pruned)
     assert actual["alignment"] is None
     assert actual["sight"]["ok"]
@@ -155,7 +155,7 @@ def test_a_scene_without_pixels(pruned: Path) -> None:
     assert alone["compact"] is not None
 
 
-def test_a_scene_without_views(pruned: Path) -> None:
+def test_a_scene_without_views_has_no_coverage(pruned: Path) -> None:
     (pruned / "transforms.json").unlink()
     alone = inspect(pruned, order="none")
     assert alone["coverage"] == []
@@ -169,8 +169,8 @@ SMOOTH = smooth_scene(48, 36)
 PIXELS = np.arange(3 * 36 * 48).reshape(3, 36 * 48)
 
 
-def said(path: Path, **options: Path) -> dict[str, str]:
-    """The lines by their first word; notes and all lines of one word joined."""
+def lines_by_word(path: Path, **options: Path) -> dict[str, str]:
+    """Return the lines by their first word; notes and all lines of one word joined."""
     actual: dict[str, str] = {}
     for line in inspection_lines(inspect(path, **options)):
         word, rest = line[:11].strip(), line[11:]
@@ -178,32 +178,32 @@ def said(path: Path, **options: Path) -> dict[str, str]:
     return actual
 
 
-def test_dropped_pixels(tmp_path: Path) -> None:
+def test_dropped_pixels_are_counted_as_missing(tmp_path: Path) -> None:
     kept = np.concatenate([np.flatnonzero(depth_map_mask(d)) + i * d.size for i, d in enumerate(SMOOTH.depths)])
     save_export(tmp_path / "gs_ply", SMOOTH, export_rows(SMOOTH, kept), cameras=False, name="0000.ply")
     write_npz(tmp_path / "exports/npz/results.npz", SMOOTH, depth=SMOOTH.depths.astype(np.float32))
-    lines = said(tmp_path)
+    lines = lines_by_word(tmp_path)
     missing = PIXELS.size - len(kept)
     assert names(lines["alignment"], f"none for {missing:,}")
     assert not lines["coverage"].startswith("100 %")
     assert inspect(tmp_path)["num_missing"] == missing
 
 
-def test_no_cameras(tmp_path: Path) -> None:
+def test_lines_of_a_scene_without_cameras_name_the_remedy(tmp_path: Path) -> None:
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH)[np.lexsort(SMOOTH.gaussians.means.T)], cameras=False)  # no grid
-    lines = said(tmp_path)
+    lines = lines_by_word(tmp_path)
     assert names(lines["alignment"], "not", "no cameras")
     assert names(lines["method"], "pair by pair", "fit: full")
     assert names(lines["note"], "no cameras", "--cameras", "--images")
 
 
-def test_our_own_files(tmp_path: Path) -> None:
+def test_files_of_gsmerge_are_named_as_such(tmp_path: Path) -> None:
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH))
     write_ply(tmp_path / "own.ply", read_ply(tmp_path / "scene.ply").gaussians[::7])
-    assert said(tmp_path / "own.ply")["exporter"] == "gsmerge"
+    assert lines_by_word(tmp_path / "own.ply")["exporter"] == "gsmerge"
 
 
-def test_a_repeated_view_counts_once_as_in_a_run() -> None:
+def test_a_repeated_view_counts_once_in_the_estimate() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 24, 18))
     again, options = scenes.take_views(scene, [0, 1, 2, 2]), CompactOptions().with_settings({"effort": "draft"})
     said = "1 view repeats another in every pixel and counts once"

@@ -1,4 +1,4 @@
-"""Archives: what may be packed in them."""
+"""Archives are read member by member, within the sizes that they state."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_stored_and_deflated_members_alone_are_read(method: int, tmp_path: Path)
         assert read_member(archive, archive.getinfo("b")) == bytes(1000)
 
 
-def test_a_member_unpacks_to_what_it_promises(tmp_path: Path) -> None:
+def test_a_member_is_read_up_to_the_size_that_it_states(tmp_path: Path) -> None:
     """A longer one, whose checksum is that of its start, as ``zipfile`` has it, is read so far."""
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -25,7 +25,7 @@ def write_half_and_fail(path: Path, error: BaseException) -> None:
         raise error
 
 
-def test_a_finished_file_takes_its_name(tmp_path: Path) -> None:
+def test_an_output_takes_its_name_when_it_is_finished(tmp_path: Path) -> None:
     with atomic_output(tmp_path / "out.png") as temporary:
         assert temporary.parent == tmp_path
         assert temporary.suffix == ".png"
@@ -37,7 +37,7 @@ def test_a_finished_file_takes_its_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [RuntimeError("boom"), KeyboardInterrupt()])
 @pytest.mark.parametrize("earlier", [[], ["out.txt"]])
-def test_a_failure_in_the_middle_leaves_what_was_there(
+def test_a_failure_while_writing_leaves_the_earlier_file(
     tmp_path: Path, error: BaseException, earlier: list[str]
 ) -> None:
     for name in earlier:
@@ -48,7 +48,7 @@ def test_a_failure_in_the_middle_leaves_what_was_there(
     assert all((tmp_path / name).read_text() == "old" for name in earlier)
 
 
-def test_an_existing_file_needs_overwrite(tmp_path: Path) -> None:
+def test_an_existing_file_is_replaced_with_overwrite_alone(tmp_path: Path) -> None:
     target = tmp_path / "out.txt"
     target.write_text("old")
     with pytest.raises(SceneError, match="exists already"), atomic_output(target) as temporary:
@@ -59,7 +59,7 @@ def test_an_existing_file_needs_overwrite(tmp_path: Path) -> None:
     assert target.read_text() == "new"
 
 
-def test_missing_folders_are_made_and_removed_where_the_block_fails(tmp_path: Path) -> None:
+def test_missing_folders_stay_only_below_a_finished_output(tmp_path: Path) -> None:
     with atomic_output(tmp_path / "a" / "b" / "out.txt") as temporary:
         temporary.write_text("new")
     assert (tmp_path / "a" / "b" / "out.txt").read_text() == "new"
@@ -68,36 +68,42 @@ def test_missing_folders_are_made_and_removed_where_the_block_fails(tmp_path: Pa
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
 
 
-def test_a_file_as_folder_and_a_folder_as_target_are_refused(tmp_path: Path) -> None:
+def test_outputs_below_a_file_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for place, named in (("file/out.txt", "out.txt"), ("file/deeper/out.txt", "deeper")):
         with refuses(SceneError, named, *NO_FOLDER), atomic_output(tmp_path / place):
             pass
+
+
+def test_an_output_in_the_place_of_a_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="found a folder"), atomic_output(tmp_path, overwrite=True):
         pass
 
 
-def left_by(pid: int, path: Path) -> Path:
-    """The temporary file of an output that a process has left."""
+def temporary_file_of(pid: int, path: Path) -> Path:
+    """Return the temporary file of an output that a process has left."""
     ours = temporary_path(path)
     return ours.with_name(ours.name.replace(f"-{os.getpid()}-", f"-{pid}-"))
 
 
-def dead_process() -> int:
+def pid_of_ended_process() -> int:
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return process.pid
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no call asks for a process there")
-def test_what_dead_processes_left_is_removed_and_what_others_write_is_not(tmp_path: Path) -> None:
-    dead = [left_by(dead_process(), tmp_path / name) for name in ("out.ply", "other name.tar.gz", "no suffix")]
+def test_only_temporary_files_of_dead_processes_are_removed(tmp_path: Path) -> None:
+    dead = [
+        temporary_file_of(pid_of_ended_process(), tmp_path / name)
+        for name in ("out.ply", "other name.tar.gz", "no suffix")
+    ]
     kept = [
-        left_by(os.getpid(), tmp_path / "out.ply"),
-        *(left_by(pid, tmp_path / "out.ply") for pid in (os.getppid(), 1)),
+        temporary_file_of(os.getpid(), tmp_path / "out.ply"),
+        *(temporary_file_of(pid, tmp_path / "out.ply") for pid in (os.getppid(), 1)),
         tmp_path / ".out-00112233.ply",
     ]
-    elsewhere = [left_by(dead_process(), tmp_path / name) for name in ("out.ply", "old.ply")]
+    elsewhere = [temporary_file_of(pid_of_ended_process(), tmp_path / name) for name in ("out.ply", "old.ply")]
     recent, old = [path.with_name(path.name.replace(atomic._machine_hash(), "00000000")) for path in elsewhere]
     for path in (*dead, *kept, recent, old):
         path.touch()
@@ -108,10 +114,10 @@ def test_what_dead_processes_left_is_removed_and_what_others_write_is_not(tmp_pa
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="states of processes as Linux shows them")
-def test_what_a_process_left_is_removed_before_its_parent_knows_of_its_end(tmp_path: Path) -> None:
+def test_temporary_files_of_a_zombie_process_are_removed(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", ""]) as process:
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        left = left_by(process.pid, tmp_path / "out.ply")
+        left = temporary_file_of(process.pid, tmp_path / "out.ply")
         left.touch()
         remove_stale(tmp_path)
         assert not left.exists()
@@ -126,7 +132,7 @@ def write_both(folder: Path, second: str, *, fail: bool = False) -> None:
             raise OSError(errno.ENOSPC, "No space left on device", str(temporary))
 
 
-def test_several_files_are_all_there_or_none(tmp_path: Path) -> None:
+def test_several_outputs_are_all_written_or_none(tmp_path: Path) -> None:
     (tmp_path / "b.txt").write_text("old")
     with refuses(SceneError, "b.txt", "No space left"):
         write_both(tmp_path, "b.txt", fail=True)
@@ -155,8 +161,8 @@ def write_three(folder: Path, *, overwrite: bool = True) -> None:
             add(folder / name).write_text("new")
 
 
-def contents(folder: Path) -> list[str | None]:
-    """The texts of the three files, after a look that nothing else is there."""
+def texts_of_three(folder: Path) -> list[str | None]:
+    """Return the texts of the three files, after a look that nothing else is there."""
     names = ["a.txt", "b.txt", "c.txt"]
     assert {path.name for path in folder.iterdir()} <= set(names)
     return [(folder / name).read_text() if (folder / name).exists() else None for name in names]
@@ -171,7 +177,7 @@ def test_a_rename_that_fails_leaves_each_file_old_or_new(
     fail_at(monkeypatch, call, OSError(errno.EIO, "Input/output error"))
     with refuses(SceneError, "a.txt", "Input/output error"):
         write_three(tmp_path)
-    assert contents(tmp_path) == ["new"] * call + ["old", "old", None][call:]
+    assert texts_of_three(tmp_path) == ["new"] * call + ["old", "old", None][call:]
 
 
 @pytest.mark.parametrize("linked", [True, False], ids=["links", "no links"])
@@ -185,10 +191,10 @@ def test_a_name_that_appears_meanwhile_is_not_replaced(
         for name in ("a.txt", "b.txt"):
             add(tmp_path / name).write_text("new")
         (tmp_path / "b.txt").write_text("another's")
-    assert contents(tmp_path) == [None, "another's", None]
+    assert texts_of_three(tmp_path) == [None, "another's", None]
 
 
-def test_a_writer_inside_writes_the_same_file(tmp_path: Path) -> None:
+def test_an_output_inside_an_output_is_the_same_file(tmp_path: Path) -> None:
     with atomic_output(tmp_path / "a.txt") as outer, atomic_output(outer, overwrite=True) as inner:
         assert inner == outer
         inner.write_text("new")
@@ -205,7 +211,7 @@ def test_a_disk_error_names_the_file_that_was_asked_for(tmp_path: Path, inside: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_data_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_is_flushed_to_the_disk_before_the_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     events: list[str] = []
     flush, replace = os.fsync, os.replace
 
@@ -232,7 +238,7 @@ def test_data_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
-def test_a_link_stays_one_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
+def test_an_output_at_a_link_replaces_the_target_of_the_link(tmp_path: Path) -> None:
     (tmp_path / "far").mkdir()
     (tmp_path / "far" / "file.txt").write_text("old")
     for name, target, found in (("link.txt", "far/file.txt", "exists"), ("dangling.txt", "far/new.txt", "link to")):
@@ -255,15 +261,18 @@ def test_pipes_and_devices_are_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a" * 251 + ".ply", "\N{SNOWMAN}" * 83 + ".ply", "a." + "b" * 250, "." + "a" * 254])
-def test_names_as_long_as_there_are(tmp_path: Path, name: str) -> None:
+def test_names_of_outputs_may_be_as_long_as_systems_allow(tmp_path: Path, name: str) -> None:
     with atomic_output(tmp_path / name) as temporary:
         temporary.write_text("new")
     assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_an_output_of_a_longer_name_is_refused(tmp_path: Path) -> None:
     with refuses(SceneError, "a" * 300), atomic_output(tmp_path / ("a" * 300)):
         pass
 
 
-def test_an_error_of_the_caller_stays_what_it_is(tmp_path: Path) -> None:
+def test_an_error_of_the_caller_is_raised_unchanged(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), atomic_output(tmp_path / "out.txt"):
         (tmp_path / "no such input").read_text()
     assert list(tmp_path.iterdir()) == []
@@ -281,7 +290,7 @@ def test_an_unwritable_folder_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_get_the_usual_permissions(tmp_path: Path) -> None:
+def test_new_outputs_have_the_usual_permissions(tmp_path: Path) -> None:
     (tmp_path / "plain").touch()
     with atomic_output(tmp_path / "atomic"):
         pass
@@ -295,7 +304,7 @@ def mode_of(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def made(path: Path, mode: int) -> Path:
+def make_file(path: Path, mode: int) -> Path:
     path.write_text("old")
     path.chmod(mode)
     return path
@@ -304,8 +313,8 @@ def made(path: Path, mode: int) -> Path:
 @posix
 @pytest.mark.parametrize("link", [False, True])
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444, 0o666, 0o200, 0o000, 0o755])
-def test_a_replaced_file_keeps_its_mode_and_is_private_before(tmp_path: Path, mode: int, link: bool) -> None:
-    target = path = made(tmp_path / "out.txt", mode)
+def test_a_replaced_file_is_private_until_it_has_its_mode_again(tmp_path: Path, mode: int, link: bool) -> None:
+    target = path = make_file(tmp_path / "out.txt", mode)
     if link:
         path = tmp_path / "link.txt"
         path.symlink_to(target)
@@ -318,11 +327,11 @@ def test_a_replaced_file_keeps_its_mode_and_is_private_before(tmp_path: Path, mo
 
 
 @posix
-def test_the_mode_is_that_of_the_file_at_the_end(tmp_path: Path) -> None:
+def test_an_output_has_the_mode_of_the_earlier_file_at_the_end(tmp_path: Path) -> None:
     """A run takes minutes, in which its owner may make a file private, or remove it."""
     with atomic_outputs(overwrite=True) as add:
         for name in ("changed", "gone"):
-            add(made(tmp_path / name, 0o644)).write_text("new")
+            add(make_file(tmp_path / name, 0o644)).write_text("new")
         (tmp_path / "changed").chmod(0o600)
         (tmp_path / "gone").unlink()
     assert [mode_of(tmp_path / name) for name in ("changed", "gone")] == [0o600, 0o600]
@@ -330,7 +339,7 @@ def test_the_mode_is_that_of_the_file_at_the_end(tmp_path: Path) -> None:
 
 @posix
 def test_new_files_have_no_rights_that_one_beside_them_lacked(tmp_path: Path) -> None:
-    made(tmp_path / "index", 0o640)
+    make_file(tmp_path / "index", 0o640)
     with atomic_outputs(overwrite=True) as add:
         for name in ("index", "chunk"):
             add(tmp_path / name).write_text("new")
@@ -347,7 +356,7 @@ def test_a_new_file_has_at_most_the_rights_of_the_files_it_holds(
 ) -> None:
     (tmp_path / "photos" / "deeper").mkdir(parents=True)
     for number, mode in enumerate(modes):
-        made(tmp_path / "photos" / ("deeper" if number else ".") / f"{number}.png", mode)
+        make_file(tmp_path / "photos" / ("deeper" if number else ".") / f"{number}.png", mode)
     before = os.umask(umask)
     try:
         with atomic_output(tmp_path / "out", mode=common_mode([tmp_path / "photos", tmp_path / "gone"])) as temporary:
@@ -362,11 +371,11 @@ def test_a_new_file_has_at_most_the_rights_of_the_files_it_holds(
     ([], 0o640, 0o640), (["owner"], 0o640, 0o640), (["owner"], 0o664, 0o664),  # as for a user who is in the group
     (["owner", "group"], 0o640, 0o600), (["owner", "group"], 0o664, 0o644), (["owner", "group"], 0o604, 0o604),
 ])  # fmt: skip
-def test_owner_and_group_stay_where_that_is_allowed(
+def test_owner_and_group_of_a_replaced_file_stay_where_allowed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: list[str], mode: int, expected: int
 ) -> None:
     """Another group gets no rights that others do not have."""
-    target, ask = made(tmp_path / "out.txt", mode), os.stat
+    target, ask = make_file(tmp_path / "out.txt", mode), os.stat
     owner, group = 4321, 8765
     kept: dict[str, int] = {}
 

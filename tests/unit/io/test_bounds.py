@@ -1,4 +1,4 @@
-"""Limits on what a file may ask for."""
+"""Limits bound what a file may ask for."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsmerge.io.image_names import list_images
 from gsmerge.scene.content_hash import content_hash
 
 
-def test_images_beyond_all_use_are_refused(tmp_path: Path) -> None:
+def test_images_of_too_many_pixels_or_none_are_refused(tmp_path: Path) -> None:
     check_image_size("a", 8192, 8192)
     with refuses(SceneError, "a", "67 million", "8193 x 8192"):
         check_image_size("a", 8193, 8192)
@@ -26,7 +26,7 @@ def test_images_beyond_all_use_are_refused(tmp_path: Path) -> None:
         check_image_size("a", 0, 5)
 
 
-def test_only_files_are_read(tmp_path: Path) -> None:
+def test_pipes_and_folders_are_refused_as_files(tmp_path: Path) -> None:
     if hasattr(os, "mkfifo"):
         os.mkfifo(tmp_path / "pipe")
         with refuses(SceneError, tmp_path / "pipe", "pipe"):
@@ -53,7 +53,7 @@ def test_bytes_that_are_no_text_are_refused(read: Callable[[Path], object], tmp_
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
-def test_folders_of_photos_have_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_of_too_many_photos_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a/1.png", "a/b/2.png"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
@@ -67,7 +67,7 @@ def test_folders_of_photos_have_an_end(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize(("size", "memory", "steps"), [(0, 64_000_000, 250_000), (10**6, 84_000_000, 350_000)])
-def test_a_budget_grows_with_the_file(size: int, memory: int, steps: int) -> None:
+def test_a_read_budget_grows_with_the_file(size: int, memory: int, steps: int) -> None:
     budget = ReadBudget("a", size)
     budget.check_memory(memory, "rows")
     budget.check_steps(steps, "rows")
@@ -81,7 +81,7 @@ def test_a_budget_grows_with_the_file(size: int, memory: int, steps: int) -> Non
 @pytest.mark.parametrize(
     "item", ["[]", "{}", "[0]", "1.5", '"ab"', '{"a":1}', '{"a":{"b":[]}}', "[[0,0],[1.5]]", '{"a":0,"b":0,"c":0}']
 )
-def test_the_memory_of_json_is_foreseen(item: str) -> None:
+def test_json_that_would_take_too_much_memory_is_refused(item: str) -> None:
     text = f"[{','.join([item] * 20_000)}]"
     tracemalloc.start()
     json.loads(text)
@@ -93,7 +93,7 @@ def test_the_memory_of_json_is_foreseen(item: str) -> None:
         parse_json(text, allowed)
 
 
-def test_content_is_names_and_bytes(tmp_path: Path) -> None:
+def test_the_content_hash_is_of_names_and_bytes(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
     (folder / "a.png").write_bytes(b"1")
@@ -104,5 +104,8 @@ def test_content_is_names_and_bytes(tmp_path: Path) -> None:
     renamed = content_hash([folder])
     (folder / "a.png").write_bytes(b"3")
     assert len({before, renamed, content_hash([folder])}) == 3
+
+
+def test_the_content_hash_of_a_missing_file_is_refused(tmp_path: Path) -> None:
     with refuses(SceneError, "nothing", "No such file"):
         content_hash([tmp_path / "nothing"])

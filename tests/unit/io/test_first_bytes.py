@@ -26,7 +26,7 @@ CONTENTS = [
 
 
 @pytest.mark.parametrize(("ending", "name"), CONTENTS)
-def test_what_stands_in_the_place_of_a_scene(ending: str, name: str, tmp_path: Path) -> None:
+def test_other_content_in_the_place_of_a_scene_is_named(ending: str, name: str, tmp_path: Path) -> None:
     content, found = (OTHER_CONTENT | GLTF)[name]
     (tmp_path / f"a{ending}").write_bytes(content)
     with refuses(SceneError, f"a{ending}", *found):
@@ -34,7 +34,7 @@ def test_what_stands_in_the_place_of_a_scene(ending: str, name: str, tmp_path: P
 
 
 @pytest.mark.parametrize(("content", "found"), [(LFS, "LFS"), (PAGE, "page")])
-def test_what_stands_in_the_place_of_a_photo(content: bytes, found: str, tmp_path: Path) -> None:
+def test_other_content_in_the_place_of_a_photo_is_named(content: bytes, found: str, tmp_path: Path) -> None:
     (tmp_path / "a.JPG").write_bytes(content)
     with refuses(SceneError, "a.JPG", found):
         check_file(tmp_path / "a.JPG")
@@ -48,14 +48,14 @@ def test_what_stands_in_the_place_of_a_photo(content: bytes, found: str, tmp_pat
         ("a.ppm", b"P3\n1 1\n255\n0 0 0\n"),
     ],
 )  # fmt: skip
-def test_right_files_are_let_through(name: str, content: bytes, tmp_path: Path) -> None:
+def test_files_of_the_right_content_are_accepted(name: str, content: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     assert check_file(tmp_path / name) == len(content)
 
 
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 2**32 - 1), size=st.floats(1e-3, 1e4))
-def test_positions_of_splats_are_no_other_content(
+def test_positions_of_splats_are_not_taken_for_other_content(
     seed: int, size: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("splats") / "a.splat"

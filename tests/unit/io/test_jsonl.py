@@ -63,11 +63,11 @@ except SceneError as error:
     assert path.read_bytes() == whole
 
 
-def values(path: Path) -> list[object]:
+def read_values(path: Path) -> list[object]:
     return [value for _, value in each_line(path)]
 
 
-def test_every_way_to_cut_the_last_line(tmp_path: Path) -> None:
+def test_a_cut_last_line_is_replaced_by_the_next_one(tmp_path: Path) -> None:
     path = tmp_path / "lines.jsonl"
     append_line(path, {"a": "odd \u2028 line\n"})
     start = path.stat().st_size
@@ -75,7 +75,7 @@ def test_every_way_to_cut_the_last_line(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for length in range(start, len(whole)):
         path.write_bytes(whole[:length])
-        assert values(path) == [{"a": "odd \u2028 line\n"}]
+        assert read_values(path) == [{"a": "odd \u2028 line\n"}]
         append_line(path, {"b": 2})
         assert path.read_bytes() == whole
 
@@ -83,18 +83,18 @@ def test_every_way_to_cut_the_last_line(tmp_path: Path) -> None:
 def test_a_damaged_line_in_the_middle_costs_that_line_alone(tmp_path: Path) -> None:
     path = tmp_path / "lines.jsonl"
     path.write_bytes(b'{"a": 1}\n' + b"\x00" * 20 + b"\n" + b"[" * 100_000 + b'\n{"b": 2}\n')
-    assert values(path) == [{"a": 1}, None, None, {"b": 2}]
+    assert read_values(path) == [{"a": 1}, None, None, {"b": 2}]
 
 
-def test_what_is_no_json_is_refused_and_leaves_the_file_alone(tmp_path: Path) -> None:
+def test_a_value_that_is_no_json_is_refused_before_it_is_written(tmp_path: Path) -> None:
     path = tmp_path / "lines.jsonl"
     append_line(path, {"a": 1})
     with pytest.raises(ValueError, match="JSON"):
         append_line(path, {"a": float("nan")})
-    assert values(path) == [{"a": 1}]
+    assert read_values(path) == [{"a": 1}]
 
 
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with refuses(SceneError, "lines.jsonl", "exists", "--output"):
         append_line(tmp_path / "file" / "lines.jsonl", {})

@@ -61,7 +61,7 @@ def leave(folder: Path, tiny: Tiny, name: str) -> None:
         (("notes.txt",), "photos", ("Depth Anything 3", "AnySplat")),
     ],
 )
-def test_a_folder_without_gaussians(
+def test_a_folder_without_gaussians_is_refused_with_a_remedy(
     tmp_path: Path, tiny: Tiny, left: tuple[str, ...], found: str, said: tuple[str, ...]
 ) -> None:
     """As ``compact`` and ``inspect`` say it; ``batch`` has the same remedy for a folder of such folders."""
@@ -88,7 +88,9 @@ def test_a_folder_without_gaussians(
         ("OUTPUT.GLB", ("points", "--cameras")),
     ],
 )
-def test_a_file_that_holds_no_gaussians(tmp_path: Path, tiny: Tiny, name: str, said: tuple[str, ...]) -> None:
+def test_a_file_without_gaussians_is_refused_with_a_remedy(
+    tmp_path: Path, tiny: Tiny, name: str, said: tuple[str, ...]
+) -> None:
     leave(tmp_path, tiny, name)
     if name.endswith("GLB"):
         write_points_glb(tmp_path / name)
@@ -109,7 +111,7 @@ def test_the_only_file_of_another_format_is_the_scene(tmp_path: Path, tiny: Tiny
     assert find_scene_files(tmp_path).ply == tmp_path / "room.ply"
 
 
-def test_no_pattern_is_in_two_rows() -> None:
+def test_every_pattern_of_files_without_gaussians_is_in_one_row() -> None:
     patterns = [pattern for row in POINTS_ONLY for pattern in row.files]
     assert len(set(patterns)) == len(patterns)
     assert all(row.title and row.remedy and not names(row.remedy, "None") for row in POINTS_ONLY)

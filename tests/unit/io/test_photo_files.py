@@ -32,7 +32,7 @@ def touch(folder: Path, *names: str) -> Path:
     return folder
 
 
-def test_values_and_colour_order(tmp_path: Path, tiny: Tiny) -> None:
+def test_photos_are_read_as_floats_in_rgb_order(tmp_path: Path, tiny: Tiny) -> None:
     write_images(tmp_path, tiny)
     images = read_images(tmp_path, tiny.names)
     assert images.dtype == np.float32
@@ -45,19 +45,19 @@ def test_values_and_colour_order(tmp_path: Path, tiny: Tiny) -> None:
     lambda n: n, lambda n: Path(n).name, lambda n: Path(n).stem, lambda n: f"images/{n}", lambda n: f"./{n}",
     lambda n: n.removesuffix(".png"), lambda n: n.replace(".png", ".jpg"), lambda n: n.replace("/", "\\"),
 ])  # fmt: skip
-def test_names_with_and_without_folder_and_extension(tmp_path: Path, tiny: Tiny, shorten) -> None:
+def test_names_are_matched_with_or_without_folder_or_extension(tmp_path: Path, tiny: Tiny, shorten) -> None:
     write_images(tmp_path, tiny)
     order = [2, 0, 1]
     images = read_images(tmp_path, [shorten(tiny.names[i]) for i in order])
     assert np.array_equal((images * 255).round(), tiny.images[order])
 
 
-def test_names_with_dots(tmp_path: Path) -> None:
+def test_names_with_dots_are_matched(tmp_path: Path) -> None:
     touch(tmp_path, "view.0001.png", "view.0002.png")
     assert [p.name for p in match_images(tmp_path, ["view.0002", "view.0001"])] == ["view.0002.png", "view.0001.png"]
 
 
-def test_the_longest_path_decides(tmp_path: Path) -> None:
+def test_the_longest_path_decides_between_photos_of_one_name(tmp_path: Path) -> None:
     touch(tmp_path, "left/1.png", "right/1.png")
     actual = match_images(tmp_path, ["right/1", "left/1.png"])
     assert [p.parent.name for p in actual] == ["right", "left"]
@@ -75,7 +75,7 @@ def test_unknown_names_take_the_order_if_the_counts_agree(tmp_path: Path) -> Non
         match_images(tmp_path, ["1", "view 1", "2"])
 
 
-def test_a_list_of_files(tmp_path: Path) -> None:
+def test_photos_are_matched_in_a_list_of_files(tmp_path: Path) -> None:
     touch(tmp_path, "a.png", "b.png")
     files = [tmp_path / "b.png", tmp_path / "a.png"]
     assert match_images(files, ["a", "b"]) == files[::-1]
@@ -90,7 +90,7 @@ def test_one_image_cannot_serve_two_views(tmp_path: Path) -> None:
         match_images(tmp_path, ["left/1.png", "right/1.png"])
 
 
-def test_what_cannot_be_read(tmp_path: Path, tiny: Tiny) -> None:
+def test_photos_in_a_wrong_place_are_refused(tmp_path: Path, tiny: Tiny) -> None:
     write_images(tmp_path, tiny)
     with pytest.raises(SceneError, match="no such"):
         read_images(tmp_path / "none", tiny.names)
@@ -164,8 +164,8 @@ def chunk(kind: bytes, content: bytes, crc: int | None = None) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", own)
 
 
-def beside(more: bytes) -> bytes:
-    """A chunk between the header and the picture."""
+def with_chunk(more: bytes) -> bytes:
+    """Put a chunk between the header and the picture."""
     return DATA[:33] + more + DATA[33:]
 
 
@@ -180,14 +180,14 @@ def read(path: Path, data: bytes) -> np.ndarray:
         DATA,
         DATA + b"junk",
         DATA[:-1] + b"x",
-        beside(chunk(b"iCCP", b"ICC\0\0" + zlib.compress(b"no profile"))),
-        beside(chunk(b"tEXt", b"a\0b", crc=0)),
-        beside(chunk(b"gAMA", struct.pack(">I", 220_000))),
-        beside(chunk(b"eXIf", b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0")),
+        with_chunk(chunk(b"iCCP", b"ICC\0\0" + zlib.compress(b"no profile"))),
+        with_chunk(chunk(b"tEXt", b"a\0b", crc=0)),
+        with_chunk(chunk(b"gAMA", struct.pack(">I", 220_000))),
+        with_chunk(chunk(b"eXIf", b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0")),
     ],
     ids=["sound", "more behind", "end", "profile", "text", "gamma", "orientation"],
 )
-def test_what_is_beside_the_picture_does_not_matter(
+def test_chunks_beside_the_picture_do_not_change_a_photo(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], data: bytes
 ) -> None:
     assert np.array_equal(read(tmp_path / "a.png", data), PICTURE)
@@ -195,7 +195,7 @@ def test_what_is_beside_the_picture_does_not_matter(
 
 
 @pytest.mark.parametrize("kind", ["grey", "16 bit", "alpha", "palette"])
-def test_kinds_of_png_are_decoded_as_ever(tmp_path: Path, kind: str) -> None:
+def test_kinds_of_png_are_decoded_as_by_opencv(tmp_path: Path, kind: str) -> None:
     rng, path = np.random.default_rng(1), tmp_path / "a.png"
     pictures = {
         "grey": PICTURE[..., 0],
@@ -228,7 +228,9 @@ def test_a_file_that_several_views_name_is_decoded_once(tmp_path: Path, monkeypa
     assert [photo.max() for photo in actual] == [1, 0, 1, 1]
 
 
-def test_photos_together_take_what_their_files_allow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photos_of_more_pixels_than_their_files_allow_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each view counts, and the bytes of each file once."""
     path = tmp_path / "a.png"
     path.write_bytes(DATA)
@@ -239,7 +241,7 @@ def test_photos_together_take_what_their_files_allow(tmp_path: Path, monkeypatch
         photos.decode_images([path] * 4)
 
 
-def test_running_out_of_memory_is_said_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_running_out_of_memory_is_not_taken_for_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenCV returns nothing then, as for a damaged file."""
     path = tmp_path / "a.png"
     path.write_bytes(DATA)
@@ -305,7 +307,7 @@ def test_decoding_takes_no_more_memory_than_is_counted(kind: str, what: str, tmp
 
 
 @pytest.mark.parametrize(("kind", "subsampling", "side"), [("webp", None, 330), ("jpg", 0, 360), ("jpg", 2, 560)])
-def test_photos_take_what_their_bytes_allow(
+def test_a_photo_of_more_pixels_than_its_bytes_allow_is_refused(
     kind: str, subsampling: int | None, side: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / f"a.{kind}"

@@ -1,4 +1,4 @@
-"""Photos with more pixels than the grid: found, read late, and showing what the grid shows."""
+"""Photos with more pixels than the grid are found, read late, and show what the grid shows."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def made_once() -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A copy that a test may change."""
+    """Copy the scene, so that a test may change it."""
     return Path(shutil.copytree(made_once(), tmp_path / "scene"))
 
 
@@ -49,7 +49,7 @@ def enlarge(document: dict[str, float]) -> None:
 
 
 def shift_between(scene: Scene, scale: float) -> tuple[float, float]:
-    """Where a larger photo, brought to the grid by the two cameras, fits the grid's own best, in the grid's pixels."""
+    """Find where a larger photo, brought to the grid by the two cameras, fits the grid's own best; grid pixels."""
     photos = large_photos(scene, scale)
     image = cv2.GaussianBlur(photos.image(1), (0, 0), 0.35 * scale)
     to_large = photos.Ks[1] @ np.linalg.inv(scene.cameras.Ks[1])
@@ -91,7 +91,7 @@ def test_views_of_an_unaligned_scene_are_reduced_but_not_their_photos(folder: Pa
     np.testing.assert_allclose(scene.large_photos.Ks, scene.cameras.Ks * [[SCALE], [SCALE], [1]])
 
 
-def test_photos_inside_another_file(folder: Path) -> None:
+def test_large_photos_inside_an_npz_are_read(folder: Path) -> None:
     scene = gsmerge.read_scene(folder)
     photos = np.stack([scene.large_photos.read(view) for view in range(len(scene))])
     camera_file = gsmerge.read_cameras(folder)
@@ -105,7 +105,7 @@ def test_photos_inside_another_file(folder: Path) -> None:
     np.testing.assert_array_equal(inside.large_photos.read(1), photos[1])
 
 
-def test_a_photo_that_is_gone_when_it_is_needed(folder: Path) -> None:
+def test_a_large_photo_that_is_gone_when_it_is_needed_is_refused(folder: Path) -> None:
     scene = gsmerge.read_scene(folder)
     (folder / "images" / "view_001.png").unlink()
     with refuses(SceneError, "view_001.png", "no such file"):
@@ -142,7 +142,7 @@ def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> No
     assert np.abs(scene.images * 255 - small).max() < 0.6
 
 
-def test_cameras_without_photos_are_resized_too(tmp_path: Path) -> None:
+def test_cameras_of_unaligned_scenes_are_resized_without_photos(tmp_path: Path) -> None:
     folder = save(tmp_path)
     for path in (folder / "images").rglob("*.png"):
         path.unlink()
@@ -160,7 +160,7 @@ def test_scenes_with_pixels_keep_their_grid(tmp_path: Path) -> None:
     assert loaded.scene.cameras.width == 24
 
 
-def test_memory_is_bounded_before_pixels_are_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_photos_than_fit_into_memory_are_resized_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """More photos than fit are resized first."""
     monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 3 * 52 * 39 * 12)
     loaded = load_scene(save(tmp_path), max_side=48)
@@ -176,6 +176,6 @@ def test_photos_that_may_be_the_grid_are_never_resized(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("value", [0, 15, -3, 99.5, True, "many"])
-def test_sizes_that_make_no_sense(tmp_path: Path, value: object) -> None:
+def test_impossible_sides_of_views_are_refused(tmp_path: Path, value: object) -> None:
     with refuses(ValueError, "max_side", 16, value):
         load_scene(tmp_path, max_side=value)

@@ -1,4 +1,4 @@
-"""Safetensors files: the same arrays as its own reader gives, and what is refused."""
+"""Safetensors files are read as by the library's own reader, or refused."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_read(path: Path) -> None:
+def test_arrays_are_those_that_the_safetensors_library_reads(path: Path) -> None:
     metadata, arrays = read_tensors(path, "a file", REMEDY)
     expected = load_file(path)
     assert metadata == {"of": "a test"}
@@ -39,7 +39,7 @@ def test_what_is_read(path: Path) -> None:
         np.testing.assert_array_equal(array, expected[name], name)
 
 
-def test_a_file_that_shrinks_while_it_is_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tensor_file_that_shrinks_while_it_is_read_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One line, not the signal that reading mapped pages beyond the end would be."""
     parse = tensor_file.parse_json
 
@@ -52,7 +52,7 @@ def test_a_file_that_shrinks_while_it_is_read(path: Path, monkeypatch: pytest.Mo
         read_tensors(path, "a file", REMEDY)
 
 
-def test_types_that_numpy_lacks(tmp_path: Path) -> None:
+def test_types_that_numpy_lacks_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.gsm"
     head = json.dumps({"a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}).encode()
     path.write_bytes(len(head).to_bytes(8, "little") + head + bytes(2))
@@ -60,7 +60,7 @@ def test_types_that_numpy_lacks(tmp_path: Path) -> None:
         read_tensors(path, "a file", REMEDY)
 
 
-def test_more_arrays_than_a_file_may_have(tmp_path: Path) -> None:
+def test_more_arrays_than_a_file_may_have_are_refused(tmp_path: Path) -> None:
     """Each of 55 bytes, of which the reader would make 1.7 kB."""
     path = tmp_path / "a.gsm"
     head = json.dumps({f"{i}": {"dtype": "U8", "shape": [0], "data_offsets": [0, 0]} for i in range(100_000)}).encode()

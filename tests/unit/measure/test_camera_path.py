@@ -1,4 +1,4 @@
-"""Paths through a scene: where the cameras of the frames stand, and how they look."""
+"""Cameras of a video stand along a spline or an orbit through the scene."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DEPTH = 3.0
 
 
 def make_cameras(centres: Sequence[Sequence[float]], turns: Sequence[Sequence[float]]) -> Cameras:
-    """Cameras at places in the world, turned by rotation vectors (radians)."""
+    """Make cameras at places in the world, turned by rotation vectors (radians)."""
     viewmats = motion_matrices(-np.concatenate([turns, np.zeros((len(turns), 3))], 1))
     viewmats[:, :3, 3] = -(viewmats[:, :3, :3] * np.asarray(centres)[:, None]).sum(-1)
     K = np.array([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
@@ -41,20 +41,20 @@ def make_cameras(centres: Sequence[Sequence[float]], turns: Sequence[Sequence[fl
 
 @pytest.fixture
 def walk() -> Cameras:
-    """Six cameras at uneven distances on a winding way, which turn by more than half a turn."""
+    """Make six cameras at uneven distances on a winding way, which turn by more than half a turn."""
     places = [[0, 0, 0], [0.2, 0.1, 0.5], [1, 0, 1], [2.5, -0.1, 1.1], [3, 0, 2], [3, 0.2, 2.3]]
     turns = [[0, 0, 0], [0, 0.4, 0], [0.1, 1.2, 0], [0, 1.8, 0.1], [0, 2.7, 0], [0, 3.6, 0]]
     return make_cameras(places, turns)
 
 
 def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles (radians) between rotations ``[n,4,4]``."""
+    """Return angles (radians) between rotations ``[n,4,4]``."""
     cosines = ((a[:, :3, :3] * b[:, :3, :3]).sum((1, 2)) - 1) / 2
     return elementary.arccos(cosines.clip(-1, 1))
 
 
-def pose_steps(path: Cameras, depth: float = DEPTH) -> np.ndarray:
-    """How far each camera is from the one before, turns by what they move at the depth."""
+def step_lengths(path: Cameras, depth: float = DEPTH) -> np.ndarray:
+    """Return how far each camera is from the one before, turns by what they move at the depth."""
     shifts = np.linalg.norm(np.diff(camera_centres(path.viewmats), axis=0), axis=1)
     turns = angles_between(path.viewmats[1:], path.viewmats[:-1])
     return np.sqrt(shifts**2 + (depth * turns) ** 2)
@@ -63,7 +63,7 @@ def pose_steps(path: Cameras, depth: float = DEPTH) -> np.ndarray:
 def test_a_spline_passes_through_all_cameras_at_even_speed(walk: Cameras) -> None:
     path = spline(walk, DEPTH, 400)
     np.testing.assert_allclose(path.viewmats[[0, -1]], walk.viewmats[[0, -1]], atol=1e-12)
-    steps = pose_steps(path)
+    steps = step_lengths(path)
     assert steps.max() / steps.min() < 1.03
     for viewmat in walk.viewmats:
         away = np.linalg.norm(camera_centres(path.viewmats) - camera_centres(viewmat), axis=1)
@@ -80,7 +80,7 @@ def test_a_spline_has_no_corners(walk: Cameras) -> None:
     assert (straight[1:] * straight[:-1]).sum(1).min() < 0.8  # while the way itself has some
 
 
-def test_cameras_that_only_turn_are_turned_evenly() -> None:
+def test_a_spline_of_cameras_that_only_turn_turns_evenly() -> None:
     turns = [[0, 0.0, 0], [0, 0.3, 0], [0, 1.5, 0], [0, 1.7, 0]]
     path = spline(make_cameras(np.tile([1.0, 2, 3], (4, 1)).tolist(), turns), DEPTH, 35)
     np.testing.assert_allclose(camera_centres(path.viewmats), np.tile([1, 2, 3], (35, 1)), atol=1e-12)
@@ -88,14 +88,17 @@ def test_cameras_that_only_turn_are_turned_evenly() -> None:
     assert np.allclose(path.viewmats[:, 1, :3], [0, 1, 0])  # upright between upright ones
 
 
-def test_repeated_cameras_count_once(walk: Cameras) -> None:
+def test_repeated_cameras_count_once_in_a_spline(walk: Cameras) -> None:
     path = spline(walk[[0, 0, 1, 2, 3, 3, 3, 4, 5]], DEPTH, 50)
     np.testing.assert_allclose(path.viewmats, spline(walk, DEPTH, 50).viewmats, atol=1e-12)
+
+
+def test_a_spline_of_one_camera_is_refused(walk: Cameras) -> None:
     with refuses(ValueError, "spline", 2, 1):
         spline(walk[[2, 2, 2]], DEPTH, 50)
 
 
-def test_two_cameras_make_a_straight_way_and_intrinsics_follow(walk: Cameras) -> None:
+def test_a_spline_of_two_cameras_runs_straight_between_them(walk: Cameras) -> None:
     two = walk[[0, 2]]
     two.Ks[1, 0, 0] = 80
     path = spline(two, DEPTH, 5)
@@ -114,7 +117,7 @@ def test_a_spline_far_from_the_origin_is_the_same(walk: Cameras) -> None:
 
 
 @sweep("count", [60, 2, 7])
-def test_an_orbit_is_closed_even_upright_and_looks_at_its_middle(walk: Cameras, count: int) -> None:
+def test_an_orbit_goes_evenly_around_the_middle_it_looks_at(walk: Cameras, count: int) -> None:
     path = orbit(walk, DEPTH, count)
     centres = camera_centres(path.viewmats)
     home = walk.viewmats[median_camera(walk)]
@@ -139,14 +142,14 @@ def test_an_orbit_is_as_wide_as_the_cameras_stand_within_limits(apart: float, ra
     assert np.abs(centres).max(0)[:2] == pytest.approx([radius, VERTICAL[0] * DEPTH], rel=0.01)
 
 
-def test_the_middle_camera_is_none_that_looks_elsewhere() -> None:
+def test_the_median_camera_is_not_one_that_looks_elsewhere() -> None:
     places = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [1.1, 0, 0]]
     turns = [[0, 0, 0], [0, 3, 0], [0, 0.1, 0], [0, 0.1, 0]]
     assert median_camera(make_cameras(places, turns)) == 3
 
 
 @sweep("turn", [90.0, 20.0])
-def test_a_wide_orbit_turns_that_far_and_keeps_its_distance(walk: Cameras, turn: float) -> None:
+def test_an_orbit_of_an_angle_turns_by_it_at_one_distance(walk: Cameras, turn: float) -> None:
     path = orbit(walk, DEPTH, 60, turn)
     home = walk.viewmats[median_camera(walk)]
     centres, focus = camera_centres(path.viewmats), camera_centres(home) + DEPTH * home[2, :3]
@@ -161,7 +164,7 @@ def test_a_wide_orbit_turns_that_far_and_keeps_its_distance(walk: Cameras, turn:
 
 
 @sweep("kind", ["orbit:30", "spline", "orbit"], often=2)
-def test_a_step_back_keeps_what_is_looked_at(kind: str, walk: Cameras) -> None:
+def test_a_path_that_steps_back_keeps_its_directions(kind: str, walk: Cameras) -> None:
     path, back = (sample_path(parse_camera_path(text), walk, DEPTH, 20) for text in (kind, f"{kind},back:0.5"))
     if kind == "spline":  # even speed is another one farther away: the ends are the same cameras
         path, back = path[[0, -1]], back[[0, -1]]
@@ -182,7 +185,7 @@ def test_a_step_back_keeps_what_is_looked_at(kind: str, walk: Cameras) -> None:
         ("room/orbit:45", None),
     ],
 )
-def test_parse_path(text: str, path: CameraPath | None) -> None:
+def test_camera_paths_are_read_from_text(text: str, path: CameraPath | None) -> None:
     assert parse_camera_path(text) == path
 
 
@@ -195,7 +198,7 @@ def test_parse_path(text: str, path: CameraPath | None) -> None:
         ("orbit:9,back:1,back:1", "path", "orbit[:DEGREES][,back:SHARE]"), ("spline:9", "path", "spline:9"),
     ],
 )  # fmt: skip
-def test_other_paths_are_refused(text: str, place: str, found: str) -> None:
+def test_impossible_camera_paths_are_refused(text: str, place: str, found: str) -> None:
     with refuses(ValueError, place, found):
         parse_camera_path(text)
 
@@ -220,6 +223,6 @@ def test_a_path_moves_with_its_scene(kind: str, walk: Cameras) -> None:
     np.testing.assert_allclose(other.viewmats @ motion, path.viewmats, atol=1e-9)
 
 
-def test_a_path_has_two_frames_at_least(walk: Cameras) -> None:
+def test_a_path_of_one_frame_is_refused(walk: Cameras) -> None:
     with refuses(ValueError, "frames", 2, 1):
         sample_path(CameraPath("orbit"), walk, DEPTH, 1)

@@ -1,4 +1,4 @@
-"""Videos: what is written can be read back, whole, and without a word from the libraries below."""
+"""Videos can be read back as a whole, and the libraries below write no words."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from gsmerge.measure import clip
 from gsmerge.measure.preview import BytePicture
 
 
-def frames(count: int, height: int = 48, width: int = 64) -> Iterator[BytePicture]:
-    """A red bar on grey that grows from the left."""
+def draw_frames(count: int, height: int = 48, width: int = 64) -> Iterator[BytePicture]:
+    """Draw a red bar on grey that grows from the left."""
     for i in range(count):
         picture = np.full((height, width, 3), 90, np.uint8)
         picture[:, : 4 * i + 4] = 220, 20, 20
         yield picture
 
 
-def read(path: Path) -> list[np.ndarray]:
+def read_frames(path: Path) -> list[np.ndarray]:
     reader, pictures = cv2.VideoCapture(str(path)), []
     while (step := reader.read())[0]:
         pictures.append(step[1][..., ::-1])
@@ -54,13 +54,13 @@ writer.release()
 
 @pytest.fixture(autouse=True)
 def no_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that all machines write the same."""
+    """Hide ffmpeg, so that all machines write the same."""
     monkeypatch.setenv("PATH", os.devnull)
 
 
 @pytest.fixture
 def ffmpeg(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A program that takes what ffmpeg takes, on the PATH."""
+    """Put a program that takes what ffmpeg takes on the PATH."""
     program = tmp_path_factory.mktemp("bin") / "ffmpeg"
     program.write_text(FFMPEG, encoding="utf-8")
     program.chmod(0o755)
@@ -69,51 +69,51 @@ def ffmpeg(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.skipif(os.name == "nt", reason="programs are no scripts there")
-def test_h264_where_ffmpeg_is_at_hand(ffmpeg: Path, tmp_path: Path) -> None:
-    assert clip.write_clip(tmp_path / "a.webm", frames(2), 24) in ("VP8", "VP9")
-    assert clip.write_clip(tmp_path / "a.mp4", frames(12, 47, 63), 24) == "H.264"
-    shown = read(tmp_path / "a.mp4")
+def test_videos_are_h264_where_ffmpeg_has_it(ffmpeg: Path, tmp_path: Path) -> None:
+    assert clip.write_clip(tmp_path / "a.webm", draw_frames(2), 24) in ("VP8", "VP9")
+    assert clip.write_clip(tmp_path / "a.mp4", draw_frames(12, 47, 63), 24) == "H.264"
+    shown = read_frames(tmp_path / "a.mp4")
     assert len(shown) == 12
-    for drawn, picture in zip(frames(12, 48, 64), shown, strict=True):
+    for drawn, picture in zip(draw_frames(12, 48, 64), shown, strict=True):
         assert np.abs(drawn.astype(float) - picture).mean() < 12
     ffmpeg.write_text(FFMPEG.replace("libx264", "libx265"), encoding="utf-8")
-    assert clip.write_clip(tmp_path / "b.mp4", frames(2), 24) != "H.264"
+    assert clip.write_clip(tmp_path / "b.mp4", draw_frames(2), 24) != "H.264"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="programs are no scripts there")
-def test_an_ffmpeg_that_fails_leaves_nothing(ffmpeg: Path, tmp_path: Path) -> None:
+def test_an_ffmpeg_that_fails_leaves_no_file(ffmpeg: Path, tmp_path: Path) -> None:
     ffmpeg.write_text(FFMPEG.replace("width, height", "sys.exit(1)  # ", 1), encoding="utf-8")
     with refuses(SceneError, "a.mp4", 12):
-        clip.write_clip(tmp_path / "a.mp4", frames(12), 24)
+        clip.write_clip(tmp_path / "a.mp4", draw_frames(12), 24)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "A.MP4"])
-def test_a_video_is_what_was_drawn(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    encoding = clip.write_clip(tmp_path / name, frames(12), 24)
+def test_a_video_shows_the_frames_that_were_drawn(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    encoding = clip.write_clip(tmp_path / name, draw_frames(12), 24)
     assert encoding in ("VP9", "VP8", "MPEG-4")
-    shown = read(tmp_path / name)
+    shown = read_frames(tmp_path / name)
     assert len(shown) == 12
-    for drawn, picture in zip(frames(12), shown, strict=True):
-        assert np.abs(drawn.astype(float) - picture).mean() < 12
+    for drawn, picture in zip(draw_frames(12), shown, strict=True):
+        assert np.abs(drawn.astype(float) - picture).mean() < 12  # of 255: encoders lose that much
     assert cv2.VideoCapture(str(tmp_path / name)).get(cv2.CAP_PROP_FPS) == 24
     assert [path.name for path in tmp_path.iterdir()] == [name]
     assert is_clip(tmp_path / name)
     assert capfd.readouterr() == ("", "")
 
 
-def test_another_encoder_stands_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_encoder_stands_in_for_a_missing_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(clip.ENCODERS, ".mp4", (("none", "None"), ("mp4v", "MPEG-4")))
-    assert clip.write_clip(tmp_path / "a.mp4", frames(3), 30) == "MPEG-4"
-    assert len(read(tmp_path / "a.mp4")) == 3
+    assert clip.write_clip(tmp_path / "a.mp4", draw_frames(3), 30) == "MPEG-4"
+    assert len(read_frames(tmp_path / "a.mp4")) == 3
 
 
-def test_without_an_encoder_nothing_is_left(
+def test_a_video_without_an_encoder_is_refused_without_a_file_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(clip.ENCODERS, ".mp4", (("none", "VP9"), ("nope", "MPEG-4")))
     with refuses(SceneError, "a.mp4", "VP9", "MPEG-4"):
-        clip.write_clip(tmp_path / "a.mp4", frames(3), 30)
+        clip.write_clip(tmp_path / "a.mp4", draw_frames(3), 30)
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr().err == ""
 
@@ -124,7 +124,7 @@ def test_a_folder_that_vanishes_is_not_blamed_on_opencv(before: int, tmp_path: P
     folder.mkdir()
 
     def vanishing() -> Iterator[BytePicture]:
-        for done, picture in enumerate(frames(4)):
+        for done, picture in enumerate(draw_frames(4)):
             if done == before:
                 shutil.rmtree(folder)
             yield picture
@@ -145,18 +145,20 @@ def test_a_cut_video_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(clip, "_check_frames", cut)
     with refuses(SceneError, name, 12):
-        clip.write_clip(tmp_path / name, frames(12), 24)
+        clip.write_clip(tmp_path / name, draw_frames(12), 24)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_gif_has_one_palette_and_plays_again(tmp_path: Path) -> None:
-    drawn = list(frames(5))
+def test_a_gif_repeats_its_frames_with_one_palette(tmp_path: Path) -> None:
+    drawn = list(draw_frames(5))
     assert clip.write_clip(tmp_path / "a.gif", iter(drawn), 12.5) == "GIF"
     with Image.open(tmp_path / "a.gif") as gif:
         assert (gif.n_frames, gif.info["loop"], gif.info["duration"]) == (5, 0, 80)
         for i, frame in enumerate(drawn):
             gif.seek(i)
-            assert np.abs(np.asarray(gif.convert("RGB")).astype(float) - frame).mean() < 3
+            assert (
+                np.abs(np.asarray(gif.convert("RGB")).astype(float) - frame).mean() < 3
+            )  # of 255: the palette has fewer colours
     header = (tmp_path / "a.gif").read_bytes()
     assert header[10] & 0x80  # a palette for all; a frame with one of its own has the same bit in its descriptor
     assert [block[8] & 0x80 for block in header.split(b"\x21\xf9\x04")[1:] if len(block) > 14 and block[5] == 0x2C] == [
@@ -164,7 +166,7 @@ def test_a_gif_has_one_palette_and_plays_again(tmp_path: Path) -> None:
     ] * 5
 
 
-def test_lines_between_scenes_start_evenly_and_stay_inside() -> None:
+def test_borders_between_scenes_swing_evenly_inside_the_frame() -> None:
     for count in (2, 3):
         places = np.array(clip.swipe_borders(count, 48, 8.0, 600))
         np.testing.assert_array_equal(places[0], np.arange(count + 1) * 600 // count)
@@ -207,7 +209,7 @@ def test_an_interruption_does_not_wait_for_the_encoder(tmp_path: Path, monkeypat
             waited.append(may_end.wait(20))
 
     def interrupted() -> Iterator[BytePicture]:
-        yield from frames(3)
+        yield from draw_frames(3)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(clip, "_open_writer", lambda *_: (Writer(), "VP9"))

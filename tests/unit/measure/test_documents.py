@@ -10,14 +10,14 @@ from gsmerge.runtime.memory import human_bytes, human_share
     ("count", "text"),
     [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (1_234_567, "1.2 MB"), (7e9, "7.0 GB"), (2e12, "2000.0 GB")],
 )
-def test_human_bytes(count: float, text: str) -> None:
+def test_counts_of_bytes_are_written_with_a_unit(count: float, text: str) -> None:
     assert human_bytes(count) == text
 
 
 @pytest.mark.parametrize(
     ("share", "text"), [(0, "0.00 %"), (0.044, "4.40 %"), (1, "100.00 %"), (1e-4, "0.01 %"), (3.26e-5, "0.003 %")]
 )
-def test_human_share(share: float, text: str) -> None:
+def test_shares_are_written_in_percent(share: float, text: str) -> None:
     assert human_share(share) == text
 
 

@@ -1,4 +1,4 @@
-"""Which view a name means."""
+"""A view is found by its name."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ NAMES = ["images/00005.jpg", "images/00006.jpg", "images/00060.jpg", "a/0.png", 
     ("00006", 1), ("00006.jpg", 1), ("images/00006.jpg", 1), ("6.jpg", 1), ("6", 1), ("060", 2), ("0.png", 3),
     ("view 7", 4), ("000", 3),
 ])  # fmt: skip
-def test_views_have_names_and_numbers(view: str, expected: int) -> None:
+def test_a_view_is_found_by_its_name_or_number(view: str, expected: int) -> None:
     assert find_view(view, NAMES) == expected
 
 
 @pytest.mark.parametrize("view", ["61.jpg", "5a", "images"])
-def test_no_such_view(view: str) -> None:
+def test_a_view_of_an_unknown_name_is_refused(view: str) -> None:
     with refuses(UsageError, f"--views {view}", "no view of this name"):
         find_view(view, NAMES)
 
 
-def test_two_such_views() -> None:
+def test_a_name_of_two_views_is_refused() -> None:
     with refuses(UsageError, "--views 6.jpg", "2 views of this name"):
         find_view("6.jpg", ["a/06.jpg", "b/006.jpg"])

@@ -1,4 +1,4 @@
-"""Evaluation: figures agree with scikit-image and with the metrics by hand, and say what they are of."""
+"""Scores of an evaluation agree with scikit-image, and say what they compare."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def actual() -> Evaluation:
     return evaluate(scene, {"half": scene.gaussians[::2]}, held_out(), PLAIN)
 
 
-def test_figures_are_scikit_image_s(actual: Evaluation, half: Gaussians) -> None:
+def test_psnr_and_ssim_are_those_of_scikit_image(actual: Evaluation, half: Gaussians) -> None:
     views = held_out()
     images = gsmerge.render(half, views.cameras).images.clip(0, 1)
     scores = [s for s in actual.results[1].scores if s.split == "target"]
@@ -64,7 +64,7 @@ def test_figures_are_scikit_image_s(actual: Evaluation, half: Gaussians) -> None
         assert score.full.ssim == pytest.approx(expected, abs=1e-5)
 
 
-def test_masked_figures_count_visible_pixels_alone(actual: Evaluation) -> None:
+def test_masked_scores_count_visible_pixels_alone(actual: Evaluation) -> None:
     targets = [s for s in actual.results[0].scores if s.split == "target"]
     assert 0.3 < targets[1].visible < 0.95
     assert targets[1].masked.psnr is not None
@@ -72,7 +72,7 @@ def test_masked_figures_count_visible_pixels_alone(actual: Evaluation) -> None:
     assert all(s.masked == s.full for s in actual.results[0].scores if s.split == "context")
 
 
-def test_what_the_input_covers_is_measured_apart(scene: Scene, half: Gaussians) -> None:
+def test_pixels_that_the_input_covers_are_scored_apart(scene: Scene, half: Gaussians) -> None:
     """Of the input's own views by the rows of the file, of the others by its renders."""
     missing = np.zeros_like(scene.pixels.shown)
     missing[:, :12] = True
@@ -94,7 +94,9 @@ def test_what_the_input_covers_is_measured_apart(scene: Scene, half: Gaussians) 
     assert whole.results[0].mean_covered("context")[0] is None
 
 
-def test_what_is_counted(actual: Evaluation, scene: Scene, half: Gaussians) -> None:
+def test_counts_of_an_evaluation_are_those_of_what_it_compares(
+    actual: Evaluation, scene: Scene, half: Gaussians
+) -> None:
     assert [r.name for r in actual.results] == [INPUT, "half"]
     assert actual.results[1].num_gaussians == len(half)
     assert actual.results[1].ratio == pytest.approx(len(half) / len(scene.gaussians))
@@ -112,11 +114,11 @@ def test_held_out_views_of_another_scene_are_a_warning(scene: Scene, capsys: pyt
 
 
 def no_pixels(scene: Scene) -> Scene:
-    """The same Gaussians without photos, and without the pixels that they belong to."""
+    """Return the same Gaussians without photos, and without the pixels that they belong to."""
     return replace(scene, images=None, pixels=None)
 
 
-def test_without_photos_the_colours_of_pixels_are_the_reference(scene: Scene, half: Gaussians) -> None:
+def test_colours_of_pixels_are_the_reference_without_photos(scene: Scene, half: Gaussians) -> None:
     bare = replace(scene, images=None)
     actual = evaluate(bare, {"half": half}, None, PLAIN)
     expected = evaluate(replace(bare, images=scene_pictures(bare)), {"half": half}, None, PLAIN)
@@ -125,7 +127,7 @@ def test_without_photos_the_colours_of_pixels_are_the_reference(scene: Scene, ha
         assert before.mean("context")[0].psnr == pytest.approx(after.mean("context")[0].psnr, abs=1e-3)
 
 
-def test_without_photos_and_pixels_the_input_s_renders_are_the_reference(scene: Scene, half: Gaussians) -> None:
+def test_renders_of_the_input_are_the_reference_without_photos_or_pixels(scene: Scene, half: Gaussians) -> None:
     actual = evaluate(no_pixels(scene), {"half": half}, None, PLAIN)
     assert actual.reference == "renders of the input"
     assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
@@ -135,7 +137,7 @@ def test_without_photos_and_pixels_the_input_s_renders_are_the_reference(scene: 
     assert document["results"][0]["mean"]["context"]["psnr"] is None  # strict JSON knows no infinity
 
 
-def test_a_scene_in_no_order(scene: Scene, half: Gaussians) -> None:
+def test_a_scene_in_no_order_is_scored_as_one_with_pixels(scene: Scene, half: Gaussians) -> None:
     unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     actual = evaluate(unaligned, {"half": half}, held_out(), PLAIN)
     usual = evaluate(scene, {"half": half}, held_out(), PLAIN)
@@ -145,12 +147,14 @@ def test_a_scene_in_no_order(scene: Scene, half: Gaussians) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_threads_do_not_matter(threads: int, scene: Scene, half: Gaussians, actual: Evaluation) -> None:
+def test_the_number_of_threads_does_not_change_scores(
+    threads: int, scene: Scene, half: Gaussians, actual: Evaluation
+) -> None:
     again = evaluate(scene, {"half": half}, held_out(), replace(PLAIN, threads=threads))
     assert [r.scores for r in again.results] == [r.scores for r in actual.results]
 
 
-def test_bad_arguments(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
+def test_impossible_arguments_of_an_evaluation_are_refused(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     empty = Scene(half, scene.cameras[[]], None, None, ())
     refuse_all(ValueError, [
         (lambda: EvaluateOptions(lpips=("squeeze",)), "lpips", "'squeeze'"),
@@ -166,7 +170,7 @@ def test_bad_arguments(scene: Scene, half: Gaussians, actual: Evaluation) -> Non
 
 
 def halved(views: Views) -> Views:
-    """Half as many pixels per side, made by hand."""
+    """Make half as many pixels per side by hand."""
     cameras, (v, h, w, _) = views.cameras, views.images.shape
     Ks = cameras.Ks * np.array([[0.5], [0.5], [1]])
     images = views.images.reshape(v, h // 2, 2, w // 2, 2, 3).mean((2, 4))
@@ -174,20 +178,19 @@ def halved(views: Views) -> Views:
 
 
 def figures(evaluation: Evaluation) -> np.ndarray:
-    """PSNR and SSIM of every result in every view, over all pixels and the visible ones."""
+    """Return PSNR and SSIM of every result in every view, over all pixels and the visible ones."""
     scores = [score for result in evaluation.results for score in result.scores]
     return np.array([(quality.psnr, quality.ssim) for s in scores for quality in (s.full, s.masked)], float)
 
 
 def expect_equal(actual: Evaluation, expected: Evaluation) -> None:
-    """The same figures, over the same pixels."""
+    """Check that figures are the same, over the same pixels."""
     np.testing.assert_allclose(figures(actual), figures(expected), atol=2e-4)
     seen = [[score.visible for result in one.results for score in result.scores] for one in (actual, expected)]
     assert seen[0] == seen[1]
 
 
-def test_a_photo_side_is_what_hand_resized_photos_and_cameras_give(scene: Scene, half: Gaussians) -> None:
-    options = PLAIN
+def test_a_photo_side_gives_the_scores_of_views_resized_by_hand(scene: Scene, half: Gaussians) -> None:
     unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     masks = np.ones(scene.images.shape[:3], bool)
     masks[:, :, :9] = False
@@ -195,19 +198,19 @@ def test_a_photo_side_is_what_hand_resized_photos_and_cameras_give(scene: Scene,
     by_hand = Scene(scene.gaussians, small.cameras, small.images, None, scene.names)
     own = {"half": scene.cameras[[1, 2, 0]]}  # of a result that moved them
     actual = evaluate(
-        replace(unaligned, masks=masks), {"half": half}, held_out(), replace(options, photo_side=24), cameras=own
+        replace(unaligned, masks=masks), {"half": half}, held_out(), replace(PLAIN, photo_side=24), cameras=own
     )
     expected = evaluate(
         replace(by_hand, masks=~(np.arange(24) < 5) & np.ones((3, 18, 1), bool)), {"half": half}, halved(held_out()),
-        options, cameras={"half": small.cameras[[1, 2, 0]]},
+        PLAIN, cameras={"half": small.cameras[[1, 2, 0]]},
     )  # fmt: skip
     expect_equal(actual, expected)
     assert actual.results[0].scores[0].visible < 0.9  # without what the masks leave out, in part too
-    usual = evaluate(unaligned, {"half": half}, held_out(), options)
+    usual = evaluate(unaligned, {"half": half}, held_out(), PLAIN)
     assert actual.results[0].mean("target") != usual.results[0].mean("target")
 
 
-def test_a_photo_side_of_a_scene_with_pixels(scene: Scene, half: Gaussians) -> None:
+def test_a_photo_side_keeps_the_samples_of_a_scene_with_pixels(scene: Scene, half: Gaussians) -> None:
     """Every Gaussian stays a sample of what the input views see."""
     options = replace(PLAIN, context=False)
     actual = evaluate(scene, {"half": half}, held_out(), replace(options, photo_side=24))
@@ -220,7 +223,7 @@ def test_a_photo_side_enlarges_nothing(side: int, scene: Scene, half: Gaussians,
     assert [r.scores for r in again.results] == [r.scores for r in actual.results]
 
 
-def test_a_photo_side_without_photos(scene: Scene, half: Gaussians) -> None:
+def test_a_photo_side_without_photos_is_reported(scene: Scene, half: Gaussians) -> None:
     actual = evaluate(no_pixels(scene), {"half": half}, None, replace(PLAIN, photo_side=24))
     assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
     document = evaluation_document(actual, {})
@@ -229,7 +232,7 @@ def test_a_photo_side_without_photos(scene: Scene, half: Gaussians) -> None:
     assert "photo_side" not in evaluation_document(replace(actual, options=PLAIN), {})
 
 
-def test_antialiased(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
+def test_antialiased_scores_are_those_of_antialiased_renders(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     views = held_out()
     result = evaluate(scene, {"half": half}, views, replace(PLAIN, antialiased=True, context=False)).results[1]
     image = gsmerge.render(half, views.cameras[[0]], antialiased=True).images[0].clip(0, 1)
@@ -257,7 +260,7 @@ def test_names_in_csv_are_no_formulas(name: str, actual: Evaluation) -> None:
 
 
 def document_of(actual: Evaluation) -> dict[str, Any]:
-    """A document with facts of files and costs, under a name that is markup."""
+    """Return a document with facts of files and costs, under a name that is markup."""
     odd = replace(actual, results=(actual.results[0], replace(actual.results[1], name="a|b<i>")))
     facts: dict[str, dict[str, Any]] = {
         "input": {"path": "in.ply", "bytes": 4000},
@@ -266,7 +269,7 @@ def document_of(actual: Evaluation) -> dict[str, Any]:
     return evaluation_document(odd, facts, ["first <note>"])
 
 
-def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
+def test_every_result_has_its_own_fog_and_holes(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     given, result = actual.results
     assert given.fog == {}
     expected = measure_fog(scene.gaussians, {"half": half}, scene.cameras, near_plane(scene))["half"]
@@ -276,7 +279,7 @@ def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual:
     assert evaluate(scene, {"half": half}, None, replace(PLAIN, fog=False)).results[1].fog == {}
 
 
-def test_rows_that_were_put_back_are_no_fog(scene: Scene) -> None:
+def test_filled_rows_are_not_counted_as_fog(scene: Scene) -> None:
     """As for the fit: where an exporter dropped pixels, a result that shows their surfaces is right."""
     filled = scene.gaussians.means[:, 0] > 0
     unfilled = evaluate(scene, {"all": scene.gaussians}, None, PLAIN)
@@ -302,7 +305,7 @@ def test_documents_have_fog_and_holes(actual: Evaluation) -> None:
     assert row.split() == ["half", *(f"{result[name]:.3f}" for name in names)]
 
 
-def test_haze_is_noted(scene: Scene, half: Gaussians) -> None:
+def test_a_result_with_haze_is_noted(scene: Scene, half: Gaussians) -> None:
     curtain = half[[0]]
     curtain = replace(curtain, scales=np.full_like(curtain.scales, 1e4), opacities=np.full_like(curtain.opacities, 0.3))
     actual = evaluate(scene, {"half": half, "foggy": Gaussians.concat([half, curtain])}, held_out(), PLAIN)
@@ -311,7 +314,7 @@ def test_haze_is_noted(scene: Scene, half: Gaussians) -> None:
     assert [note.split(":")[0] for note in notes] == ["foggy"]
 
 
-def test_progress_is_reported(scene: Scene, half: Gaussians) -> None:
+def test_progress_is_reported_for_every_view(scene: Scene, half: Gaussians) -> None:
     """A stage before each that takes long, and every view."""
     said: list[tuple[str, int, int]] = []
     evaluate(scene, {"half": half}, held_out(), PLAIN, progress=lambda *step: said.append(step))
@@ -323,7 +326,7 @@ def test_progress_is_reported(scene: Scene, half: Gaussians) -> None:
     assert [done for _, done, _ in outside] == list(range(outside[0][2]))
 
 
-def test_tensors_give_the_same(scene: Scene, half: Gaussians, torch: Any) -> None:
+def test_tensors_give_the_scores_of_arrays(scene: Scene, half: Gaussians, torch: Any) -> None:
     views = held_out()
     tensors = Views(views.cameras.to("cpu"), torch.from_numpy(views.images), views.names)
     actual, expected = (
@@ -333,14 +336,14 @@ def test_tensors_give_the_same(scene: Scene, half: Gaussians, torch: Any) -> Non
     assert actual == expected
 
 
-def test_pictures_too_small_for_ssim() -> None:
+def test_pictures_too_small_for_ssim_have_none() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 6, 5))
     score = evaluate(scene, {}, None, PLAIN).results[0].scores[0]
     assert score.full.ssim is None
     assert score.full.psnr is not None
 
 
-def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_too_small_for_lpips_have_none(monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
     monkeypatch.setattr("gsmerge.measure.lpips.lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
     scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 32, 24))
@@ -349,7 +352,7 @@ def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
     assert looked == ["vgg"]
 
 
-def test_what_results_are_compared_with(scene: Scene) -> None:
+def test_the_reference_is_named_for_every_kind_of_scene(scene: Scene) -> None:
     bare, unaligned = replace(scene, images=None), no_pixels(scene)
     assert evaluate(unaligned, {}, held_out(), PLAIN).reference == "photos, and renders of the input in its own views"
     assert evaluate(bare, {}, held_out(), PLAIN).reference == f"photos, and {ROW_COLORS} in its own views"

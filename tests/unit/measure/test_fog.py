@@ -1,4 +1,4 @@
-"""Fog, veils and holes of cases that can be worked out: curtains of a known opacity, walls with pieces missing."""
+"""Fog, veils and holes are measured in cases that can be worked out by hand."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WIDTH, HEIGHT = 160, 120  # pixels, and the focal length is the width
 
 
 def balls(means: np.ndarray, scale: float, opacity: float) -> Gaussians:
-    """Grey round Gaussians at ``means [n,3]``."""
+    """Make grey round Gaussians at ``means [n,3]``."""
     n = len(means)
     return Gaussians(
         means.astype(np.float32), np.tile(np.float32([1, 0, 0, 0]), (n, 1)), np.full((n, 3), scale, np.float32),
@@ -43,13 +43,13 @@ def balls(means: np.ndarray, scale: float, opacity: float) -> Gaussians:
 
 
 def wall(left: float = -1.0, right: float = 1.0) -> Gaussians:
-    """An opaque wall between two x, at which the picture spans -1 to 1."""
+    """Make an opaque wall between two x, at which the picture spans -1 to 1."""
     x, y = np.meshgrid(np.arange(left, right, 0.02) + 0.01, np.arange(-0.75, 0.75, 0.02) + 0.01)
     return balls(np.stack([x.ravel(), y.ravel(), np.full(x.size, DEPTH)], 1), 0.014, 0.95)
 
 
 def curtain(opacity: float, place: tuple[float, float, float] = (0, 0, DEPTH), size: float = 1e4) -> Gaussians:
-    """One Gaussian, which has everywhere the same opacity unless its size, world units, says otherwise."""
+    """Make one Gaussian, which has everywhere the same opacity unless its size, world units, says otherwise."""
     return balls(np.array([place]), size, opacity)
 
 
@@ -58,7 +58,7 @@ def cameras(width: int = WIDTH, height: int = HEIGHT, views: int = 1) -> Cameras
 
 
 def needle(length: float, width: float) -> Gaussians:
-    """A white Gaussian in the middle of the wall, along x; standard deviations, world units."""
+    """Make a white Gaussian in the middle of the wall, along x; standard deviations, world units."""
     one = balls(np.array([[0, 0, DEPTH - 0.2]]), width, 0.95)
     return replace(one, scales=np.float32([[length, width, width]]), sh0=one.sh0 + np.float32(1.7))
 
@@ -68,7 +68,7 @@ def fog_of(given: Gaussians, result: Gaussians, seen: Cameras | None = None, nea
 
 
 def figures(kinds: dict[str, Fog]) -> np.ndarray:
-    """Near fog, far fog, holes and veils ``[3,5]``, of cameras stepped back, turned, and all."""
+    """Return near fog, far fog, holes and veils ``[3,5]``, of cameras stepped back, turned, and all."""
     return np.array([list(vars(kinds[kind]).values()) for kind in (*FOG_CAMERAS, ALL)], float)
 
 
@@ -94,33 +94,35 @@ def test_a_rim_about_the_outline_is_no_fog() -> None:
     assert wide.fog_far == pytest.approx(0, abs=2e-3)
 
 
-def test_pixels_that_count() -> None:
+def test_pixels_count_by_their_distance_from_the_outline() -> None:
     """Of a picture of 100 columns whose left 20 are solid: empty from the 28th on, far from the 30th on."""
     given, result = np.zeros((50, 100)), np.zeros((50, 100))
     given[:, :20] = 0.95
     result[:, :5], result[:, 20:28], result[:, 28:30] = 0.6, 1, 0.5
-    counts = pixels(given, result)
+    counts = count_pixels(given, result)
     assert counts[:3] == pytest.approx(np.array([[50 * 2 * 0.5, 50 * 72], [0, 50 * 70], [50 * 15, 50 * 20]]))
     assert mean_fog(counts[None]) == Fog(1 / 72, 0, 0.75, 0, 0)
     given[:, 50] = 0.06  # neither solid nor empty, so that the rim is about it, too
-    assert pixels(given, result)[:3, 1] == pytest.approx([50 * (72 - 17), 50 * (70 - 21), 50 * 20])
+    assert count_pixels(given, result)[:3, 1] == pytest.approx([50 * (72 - 17), 50 * (70 - 21), 50 * 20])
 
 
-def test_in_a_narrow_picture_far_is_no_nearer_than_near() -> None:
+def test_far_pixels_of_a_narrow_picture_are_no_nearer_than_near_ones() -> None:
     given = np.zeros((50, 40))
     given[:, 0] = 0.95
-    near, far, *_ = pixels(given, given)
+    near, far, *_ = count_pixels(given, given)
     assert near.tolist() == far.tolist() == [0, 50 * 31]
 
 
-def test_a_veil_is_what_stands_before_seven_tenths_of_a_surface() -> None:
-    """Behind which depth it begins, and that cameras count alike, whatever they see of the input."""
+def test_a_veil_is_what_stands_before_seven_tenths_of_the_depth() -> None:
     for depth, veil in ((0.69, 1), (0.71, 0)):
         result = curtain(0.95, (0, 0, depth * (DEPTH + 1) - 1), size=50)
         assert fog_of(wall(), result)["back"].veil == pytest.approx(veil / 2, abs=0.01)
         assert fog_of(wall(), result)["back"].veil_worst == pytest.approx(veil, abs=0.01)
     near = curtain(0.95, (0, 0, -0.51), size=50)  # nearer to one camera than a quarter of the depth
     assert fog_of(wall(), Gaussians.concat([wall(), near]))["back"].veil == pytest.approx(0.5, abs=0.01)
+
+
+def test_cameras_count_alike_in_a_veil_whatever_they_see() -> None:
     seen, half, ones = np.full((4, 4), 0.95), np.repeat([[2.0, 0.5]], 4, 0).repeat(2, 1), np.ones((4, 4))
     few = np.zeros((4, 4))
     few[0, 3] = 0.95
@@ -132,7 +134,7 @@ def test_a_veil_is_what_stands_before_seven_tenths_of_a_surface() -> None:
     assert (fog.veil, fog.veil_worst) == (0.75, 1)
 
 
-def pixels(given: np.ndarray, result: np.ndarray) -> np.ndarray:
+def count_pixels(given: np.ndarray, result: np.ndarray) -> np.ndarray:
     """Count the pixels of two pictures of opacities at one depth."""
     return sum_pixels(*(OutsidePicture(one, one, np.ones_like(one)) for one in (given, result)))
 
@@ -145,13 +147,13 @@ def test_missing_pieces_are_holes() -> None:
     assert fog_of(wall(), curtain(0.45))[ALL].holes == 1
 
 
-def test_nothing_empty_and_nothing_solid() -> None:
+def test_pictures_without_empty_or_solid_pixels_have_no_score_of_them() -> None:
     kinds = (*FOG_CAMERAS, ALL)
     assert fog_of(curtain(0.95), curtain(0.95)) == dict.fromkeys(kinds, Fog(None, None, 0.0, 0.0, 0.0, 0.0, 0.0))
     assert fog_of(curtain(0.5), curtain(0.2)) == dict.fromkeys(kinds, Fog(spikes=0.0, strokes=0.0))
 
 
-def test_places_of_the_cameras() -> None:
+def test_fog_cameras_stand_behind_or_beside_their_views() -> None:
     """Of each view two behind it, and two beside it at half the depth more from what it looks at."""
     seen = cameras(views=7)
     seen.viewmats[:, 1, 3] = -np.arange(7) / 10  # the second, fourth and sixth are taken
@@ -166,7 +168,7 @@ def test_places_of_the_cameras() -> None:
 
 
 @pytest.mark.parametrize("size", [(1920, 1440), (1440, 1920)])
-def test_large_pictures_are_shrunk(size: tuple[int, int]) -> None:
+def test_fog_of_large_pictures_is_measured_in_smaller_ones(size: tuple[int, int]) -> None:
     result = Gaussians.concat([wall(-1.0, 0.5), curtain(0.3)])
     large, small = cameras(*size), cameras(size[0] // 4, size[1] // 4)
     for _, camera, _ in fog_cameras(wall(), large):
@@ -175,7 +177,7 @@ def test_large_pictures_are_shrunk(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1, 1e3])
-def test_units_and_rigid_motions_change_nothing(factor: float) -> None:
+def test_fog_does_not_depend_on_units_or_rigid_motions(factor: float) -> None:
     """With holes and a curtain on one side; the near plane is in the scene's units."""
     added = curtain(0.8, (1.5, 0.2, DEPTH), size=0.2), curtain(0.9, (0.3, 0, 0.5), size=0.1)
     result = Gaussians.concat([wall(-1.0, 0.5), *added])
@@ -191,7 +193,7 @@ def test_units_and_rigid_motions_change_nothing(factor: float) -> None:
     assert figures(actual)[:, 3:] == pytest.approx(expected[:, 3:], abs=3e-3)  # pixels at its edge are few
 
 
-def test_a_note_on_haze() -> None:
+def test_haze_or_a_thick_veil_is_described() -> None:
     assert describe_fog("a", Fog(0.9, HAZE, 0)) is None
     assert describe_fog("a", Fog(None, None, 0, 0.08, VEILED)) is None
     assert says(describe_fog("a", Fog(None, None, 0, 0.02, 0.3)) or "", "a", "outside", "30 %")
@@ -213,7 +215,7 @@ def test_long_thin_gaussians_are_spikes(length: float, width: float, spikes: boo
 
 
 @pytest.mark.parametrize("views", [2, 7, 12])
-def test_no_fit_looks_from_where_it_is_measured(views: int) -> None:
+def test_fog_cameras_are_not_the_outside_views_of_a_fit(views: int) -> None:
     """Cameras outside are a fiftieth of the depth apart, or look elsewhere by a degree."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(views, 32, 24))
     points = scene.gaussians.means

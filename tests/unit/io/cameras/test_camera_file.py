@@ -1,4 +1,4 @@
-"""Cameras of one size, and cameras whose lens is no pinhole."""
+"""Camera files become cameras of one size, and photos of a lens are undistorted."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_to_cameras_needs_one_size(tmp_path: Path, tiny: Tiny) -> None:
         to_cameras(actual)
 
 
-def test_axes_by_hand(tmp_path: Path) -> None:
+def test_opengl_axes_become_those_of_opencv_as_by_hand(tmp_path: Path) -> None:
     """A camera at (0, 0, 5) that looks down the world's -z: an OpenGL identity rotation."""
     pose = np.eye(4)
     pose[2, 3] = 5
@@ -90,7 +90,7 @@ def bent(x: np.ndarray, y: np.ndarray, model: str, c: list[float]) -> tuple[np.n
         ("fisheye", [0.05, -0.01, 0.004, 0.002]),
     ],
 )
-def test_a_pinhole_s_pixel_shows_what_the_lens_puts_elsewhere(model: str, coefficients: list[float]) -> None:
+def test_undistorted_photos_follow_the_formulas_of_the_lens(model: str, coefficients: list[float]) -> None:
     width, height = 200, 150
     y, x = np.mgrid[:height, :width].astype(np.float64)
     photo = np.stack([x, y, 0 * x], -1).astype(np.uint8)  # every pixel says where it is
@@ -102,7 +102,7 @@ def test_a_pinhole_s_pixel_shows_what_the_lens_puts_elsewhere(model: str, coeffi
     assert np.abs(straight[..., :2] - expected).max() < 0.6
 
 
-def test_zero_coefficients_are_a_pinhole_but_not_of_a_fisheye() -> None:
+def test_zero_coefficients_are_a_lens_of_a_fisheye_alone() -> None:
     assert make_lens("A", "perspective", [0, 0.0, 0]) is None
     lens = make_lens("B", "fisheye", [0, 0])
     assert lens.coefficients == (0, 0)
@@ -128,7 +128,7 @@ def as_transforms(folder: Path, tiny: Tiny, coefficients: list[float]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["colmap text", "colmap binary", "transforms"])
-def test_photos_are_undistorted_and_it_is_said(tmp_path: Path, kind: str) -> None:
+def test_photos_of_a_lens_are_undistorted_with_a_note(tmp_path: Path, kind: str) -> None:
     coefficients = [-0.3, 0.08, 0.01, -0.01]
     taken = bent_photos(SMOOTH, coefficients)
     taken.save(tmp_path, cameras=False)
@@ -148,7 +148,7 @@ def test_photos_are_undistorted_and_it_is_said(tmp_path: Path, kind: str) -> Non
     assert after < 0.4 * before
 
 
-def test_no_photos_or_others_are_refused(tmp_path: Path) -> None:
+def test_cameras_with_a_lens_are_refused_without_their_photos(tmp_path: Path) -> None:
     SMOOTH.save(tmp_path, cameras=False, images=False)
     as_transforms(tmp_path, SMOOTH, [0.1, 0, 0, 0])
     with refuses(SceneError, "transforms.json", "OPENCV", "--images"):
@@ -173,7 +173,9 @@ def test_no_photos_or_others_are_refused(tmp_path: Path) -> None:
         ("RADIAL_FISHEYE", "30 9 8 0.1 0.2", ("fisheye", (0.1, 0.2))),
     ],
 )
-def test_colmap_models_with_distortion(tmp_path: Path, tiny: Tiny, model: str, params: str, expected: tuple) -> None:
+def test_colmap_models_with_distortion_have_a_lens(
+    tmp_path: Path, tiny: Tiny, model: str, params: str, expected: tuple
+) -> None:
     write_colmap_text(tmp_path, tiny)
     (tmp_path / "cameras.txt").write_text(f"7 {model} 20 14 {params}\n")
     actual = read_cameras(tmp_path)
@@ -182,7 +184,7 @@ def test_colmap_models_with_distortion(tmp_path: Path, tiny: Tiny, model: str, p
     assert len(select_views(actual, [1]).lenses) == 1
 
 
-def test_one_lens_among_pinholes(tmp_path: Path, tiny: Tiny) -> None:
+def test_a_lens_among_pinholes_belongs_to_its_view_alone(tmp_path: Path, tiny: Tiny) -> None:
     data = frames_of(tiny)
     data["frames"][1]["k1"] = 0.1
     (tmp_path / "transforms.json").write_text(json.dumps(data))

@@ -1,4 +1,4 @@
-"""COLMAP models, as text and binary, whole and damaged."""
+"""COLMAP models are read as text or binary, and damaged ones are refused."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from gsmerge.io.cameras import colmap
 
 @pytest.mark.parametrize("write", [write_colmap_text, write_colmap_binary])
 @pytest.mark.parametrize("place", [".", "sparse/0", "sparse", "colmap/sparse/0", "colmap"])
-def test_colmap_models(tmp_path: Path, tiny: Tiny, write: Callable[[Path, Tiny], None], place: str) -> None:
+def test_colmap_models_are_found_in_every_usual_folder(
+    tmp_path: Path, tiny: Tiny, write: Callable[[Path, Tiny], None], place: str
+) -> None:
     write(tmp_path / place, tiny)
     actual = read_cameras(tmp_path)
     assert_same(actual, tiny)
@@ -28,7 +30,7 @@ def test_colmap_models(tmp_path: Path, tiny: Tiny, write: Callable[[Path, Tiny],
     assert actual.convention == ("world-to-camera", "OpenCV")
 
 
-def test_colmap_by_one_of_its_files(tmp_path: Path, tiny: Tiny) -> None:
+def test_a_colmap_model_is_read_by_the_name_of_one_file(tmp_path: Path, tiny: Tiny) -> None:
     write_colmap_binary(tmp_path, tiny)
     assert_same(read_cameras(tmp_path / "images.bin"), tiny)
     (tmp_path / "cameras.bin").unlink()
@@ -37,7 +39,7 @@ def test_colmap_by_one_of_its_files(tmp_path: Path, tiny: Tiny) -> None:
 
 
 @pytest.mark.parametrize(("centre", "size"), [((20, 14), (40, 28)), ((20, 24), (80, 56)), ((20.3, 14.2), (80, 56))])
-def test_sizes_that_are_the_photos_not_those_of_intrinsics(
+def test_sizes_of_photos_become_those_of_the_intrinsics(
     tmp_path: Path, tiny: Tiny, centre: tuple[float, float], size: tuple[int, int]
 ) -> None:
     """WorldMirror 1 writes them: twice the principal point is whole and has the photos' shape."""
@@ -47,7 +49,7 @@ def test_sizes_that_are_the_photos_not_those_of_intrinsics(
     assert (cameras.widths[0], cameras.heights[0]) == size
 
 
-def test_colmap_models_without_distortion(tmp_path: Path, tiny: Tiny) -> None:
+def test_colmap_models_of_zero_distortion_are_pinholes(tmp_path: Path, tiny: Tiny) -> None:
     write_colmap_text(tmp_path / "a", tiny, "OPENCV", " 0 0 0 0")
     assert_same(read_cameras(tmp_path / "a"), tiny)
     write_colmap_binary(tmp_path / "b", tiny, 4, (0.0, 0.0, 0.0, 0.0))
@@ -70,7 +72,9 @@ def test_unknown_colmap_models_are_refused(
         read_cameras(tmp_path / name)
 
 
-def test_a_model_that_shrinks_while_it_is_read(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_colmap_model_that_shrinks_while_it_is_read_is_refused(
+    tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The message is one line. Reading mapped pages beyond the end would end the process by a signal."""
     write_colmap_binary(tmp_path, tiny)
     path, make_pose = tmp_path / "images.bin", colmap._make_pose
@@ -88,7 +92,7 @@ def test_a_model_that_shrinks_while_it_is_read(tmp_path: Path, tiny: Tiny, monke
 
 
 @pytest.mark.parametrize("kept", ["none", "all but empty ones", "the empty ones"])
-def test_colmap_text_without_the_lines_of_points(tmp_path: Path, tiny: Tiny, kept: str) -> None:
+def test_colmap_text_is_read_without_the_lines_of_points(tmp_path: Path, tiny: Tiny, kept: str) -> None:
     write_colmap_text(tmp_path, tiny)
     lines = (tmp_path / "images.txt").read_text().splitlines()
     if kept != "all but empty ones":
@@ -101,7 +105,7 @@ def test_colmap_text_without_the_lines_of_points(tmp_path: Path, tiny: Tiny, kep
     assert actual.names == tiny.names
 
 
-def test_whole_numbers_of_points_are_no_image(tmp_path: Path, tiny: Tiny) -> None:
+def test_points_of_whole_numbers_are_not_taken_for_an_image(tmp_path: Path, tiny: Tiny) -> None:
     write_colmap_text(tmp_path, tiny)
     lines = (tmp_path / "images.txt").read_text().replace("10.5 3.5 -1 4.0 4.0 12 ", "10 3 7 4 4 7 5 6 7 1 1 7 ")
     (tmp_path / "images.txt").write_text(lines)

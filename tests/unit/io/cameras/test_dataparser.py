@@ -1,4 +1,4 @@
-"""How a program moved its cameras into the Gaussians' world: nerfstudio's file beside the scene, and Metashape's."""
+"""Cameras are moved into the frame of Gaussians by the file that nerfstudio leaves beside a scene."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TURN, SHIFT, SCALE = rotation(0.4, -1.2, 0.7), np.array([1.5, -2.0, 0.5]), 0.3
 NOTE = "the cameras are moved into the Gaussians' frame by dataparser_transforms.json"
 
 
-def trained(folder: Path, *, move: bool = True) -> Tiny:
+def save_trained(folder: Path, *, move: bool = True) -> Tiny:
     """Save some Gaussians in random order, moved as nerfstudio does: X' = s (T [X; 1]); with photos beside them."""
     some = np.random.default_rng(0).permutation(1296)[:864]
     gaussians = SMOOTH.gaussians[some]
@@ -48,15 +48,15 @@ def assert_moved(folder: Path) -> None:
     assert np.array_equal(loaded.cameras.viewmats, loaded.scene.cameras.viewmats)
 
 
-def test_cameras_of_the_capture_are_moved(tmp_path: Path) -> None:
-    trained(tmp_path)
+def test_cameras_of_the_capture_are_moved_into_the_frame_of_gaussians(tmp_path: Path) -> None:
+    save_trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     assert_moved(tmp_path)
 
 
-def test_other_cameras_of_the_capture_are_moved_with_them(tmp_path: Path) -> None:
+def test_cameras_of_a_path_are_moved_as_those_of_the_capture(tmp_path: Path) -> None:
     """Held-out views, or those of a path, are in the capture's world and share no view with the scene."""
-    trained(tmp_path)
+    save_trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     write_transforms(tmp_path / "path.json", replace(SMOOTH, names=("x.png", "y.png", "z.png")))
     placed, shared = read_into_frame(load_scene(tmp_path), tmp_path / "path.json")
@@ -68,9 +68,9 @@ def test_other_cameras_of_the_capture_are_moved_with_them(tmp_path: Path) -> Non
     np.testing.assert_allclose(placed.viewmats, expected, atol=1e-6)
 
 
-def test_poses_that_are_moved_already(tmp_path: Path) -> None:
+def test_poses_with_an_applied_transform_are_moved_by_the_rest(tmp_path: Path) -> None:
     """The poses are in the world after ``applied_transform``, but ``transform`` starts from the world before it."""
-    trained(tmp_path)
+    save_trained(tmp_path)
     applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.25], [0, 0, 0, 1]])
     data = frames_of(SMOOTH)
     poses = applied @ SMOOTH.c2w @ FLIP
@@ -86,16 +86,16 @@ def test_poses_that_are_moved_already(tmp_path: Path) -> None:
     assert_moved(tmp_path)
 
 
-def test_it_is_left_alone_where_it_does_not_help(tmp_path: Path) -> None:
-    trained(tmp_path, move=False)
+def test_a_dataparser_file_that_does_not_help_is_not_applied(tmp_path: Path) -> None:
+    save_trained(tmp_path, move=False)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     loaded = load_scene(tmp_path)
     assert NOTE not in loaded.notes
     assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
 
 
-def test_without_it_the_cameras_do_not_see_the_gaussians(tmp_path: Path) -> None:
-    trained(tmp_path)
+def test_cameras_of_the_capture_are_refused_without_the_dataparser_file(tmp_path: Path) -> None:
+    save_trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     (tmp_path / "dataparser_transforms.json").unlink()
     with refuses(SceneError, "scene.ply", 1296, 864):
@@ -113,8 +113,8 @@ def test_without_it_the_cameras_do_not_see_the_gaussians(tmp_path: Path) -> None
     ],
     often=1,
 )
-def test_a_damaged_file(tmp_path: Path, text: str, found: object) -> None:
-    trained(tmp_path)
+def test_a_damaged_dataparser_file_is_refused(tmp_path: Path, text: str, found: object) -> None:
+    save_trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     (tmp_path / "dataparser_transforms.json").write_text(text)
     with refuses(SceneError, "dataparser_transforms.json", found):

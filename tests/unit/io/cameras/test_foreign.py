@@ -68,7 +68,7 @@ FILES = [
 
 
 @pytest.mark.parametrize(("name", "start", "program", "remedy"), FILES)
-def test_what_lies_there_is_named_with_what_is_read_of_it(
+def test_files_of_a_foreign_program_are_refused_with_the_export_to_use(
     tmp_path: Path, name: str, start: str, program: str, remedy: str, tiny: Tiny
 ) -> None:
     path = tmp_path / name
@@ -88,7 +88,7 @@ def test_what_lies_there_is_named_with_what_is_read_of_it(
         np.testing.assert_allclose(read_cameras(other / export).viewmats, tiny.w2c, atol=1e-5)
 
 
-def test_each_layout_that_is_not_read_is_tried() -> None:
+def test_every_foreign_program_has_a_case() -> None:
     programs = {foreign.program for foreign in PROGRAMS}
     assert all(any(name in program for _, _, name, _ in FILES) for program in programs)
 
@@ -101,12 +101,12 @@ def test_each_layout_that_is_not_read_is_tried() -> None:
         ("a.xmp", "<x:xmpmeta>"),
     ],
 )  # fmt: skip
-def test_files_of_others_are_none(tmp_path: Path, name: str, start: str) -> None:
+def test_other_files_are_not_taken_for_foreign_cameras(tmp_path: Path, name: str, start: str) -> None:
     (tmp_path / name).write_text(start)
     assert find_unread(tmp_path) is None
 
 
-def test_cameras_of_a_scene_below_are_its_own(tmp_path: Path, tiny: Tiny) -> None:
+def test_foreign_cameras_beside_a_scene_belong_to_it_alone(tmp_path: Path, tiny: Tiny) -> None:
     below = tmp_path / "other/rc.csv"
     below.parent.mkdir()
     below.write_text("#name,x")
@@ -117,7 +117,7 @@ def test_cameras_of_a_scene_below_are_its_own(tmp_path: Path, tiny: Tiny) -> Non
     assert find_scene_files(below.with_name("b.ply")).cameras == below
 
 
-def test_cameras_that_are_read_go_first(tmp_path: Path, tiny: Tiny) -> None:
+def test_cameras_that_are_read_come_before_foreign_ones(tmp_path: Path, tiny: Tiny) -> None:
     (tmp_path / "a.nvm").write_text("NVM_V3")
     (tmp_path / "a.ply").write_text("ply\n")
     assert find_scene_files(tmp_path / "a.ply").cameras == tmp_path / "a.nvm"

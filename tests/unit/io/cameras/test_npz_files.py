@@ -1,4 +1,4 @@
-"""Cameras and arrays in ``.npz``."""
+"""Cameras and arrays are read from ``.npz``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmerge.io import read_cameras
 from gsmerge.io.cameras.npz_files import array_names, read_arrays
 
 
-def test_npz_forms(tmp_path: Path, tiny: Tiny) -> None:
+def test_every_form_of_cameras_in_an_npz_is_read(tmp_path: Path, tiny: Tiny) -> None:
     write_npz(tmp_path / "a.npz", tiny, extrinsics=tiny.w2c, image=None)
     actual = read_cameras(tmp_path / "a.npz")
     assert_same(actual, tiny, atol=1e-6)
@@ -44,7 +44,7 @@ def test_npz_intrinsics_of_a_colmap_export_of_the_same_call_are_scaled_back(tmp_
     assert_same(read_cameras(tmp_path / "exports/npz"), tiny, K=centred, atol=1e-2)
 
 
-def test_damage_is_told_in_the_same_words_every_time(tmp_path: Path) -> None:
+def test_the_message_on_a_damaged_npz_is_the_same_every_time(tmp_path: Path) -> None:
     """NumPy's message has the address of an object, which differs in every process."""
     head = b"{'descr': name, 'fortran_order': False, 'shape': (3,)}\n"
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:

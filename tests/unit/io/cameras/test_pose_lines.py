@@ -29,7 +29,7 @@ def write_poses(folder: Path, rows: int, intrinsics: str) -> Path:
 
 
 @pytest.mark.parametrize(("rows", "intrinsics"), [(3, FOCAL), (4, FOCAL * VIEWS)])
-def test_poses_and_intrinsics_are_read(tmp_path: Path, rows: int, intrinsics: str) -> None:
+def test_poses_are_read_with_the_intrinsics_beside_them(tmp_path: Path, rows: int, intrinsics: str) -> None:
     assert find_cameras(tmp_path) is None
     assert write_poses(tmp_path, rows, intrinsics) == find_cameras(tmp_path)
     actual = read_cameras(tmp_path)
@@ -47,7 +47,9 @@ def test_poses_and_intrinsics_are_read(tmp_path: Path, rows: int, intrinsics: st
         ("intrinsic.txt", "a b c d", ("intrinsic.txt: line 1", "'a'")),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, file: str, content: str, named: tuple[str, ...]) -> None:
+def test_wrong_lines_are_named_by_file_with_what_was_found(
+    tmp_path: Path, file: str, content: str, named: tuple[str, ...]
+) -> None:
     path = write_poses(tmp_path, 4, FOCAL)
     (tmp_path / file).write_text(content)
     with refuses(SceneError, *named):

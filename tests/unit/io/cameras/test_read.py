@@ -13,7 +13,7 @@ from gsmerge.io import read_cameras
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras
 
 
-def test_what_is_no_camera_file(tmp_path: Path) -> None:
+def test_other_files_are_refused_as_cameras(tmp_path: Path) -> None:
     for name, text, found in (
         ("none.json", None, "no such file"),
         ("text.json", "hello", "JSON"),
@@ -29,7 +29,7 @@ def test_what_is_no_camera_file(tmp_path: Path) -> None:
         read_cameras(tmp_path)
 
 
-def test_the_first_place_wins(tmp_path: Path, tiny: Tiny) -> None:
+def test_cameras_are_read_from_the_first_of_their_usual_places(tmp_path: Path, tiny: Tiny) -> None:
     write_colmap_text(tmp_path / "sparse/0", tiny)
     write_inria(tmp_path / "cameras.json", tiny)
     assert read_cameras(tmp_path).source == "INRIA cameras.json"
@@ -38,14 +38,14 @@ def test_the_first_place_wins(tmp_path: Path, tiny: Tiny) -> None:
     assert read_cameras(tmp_path / "sparse").source == "COLMAP text"
 
 
-def test_metashape_s_file_of_any_name(tmp_path: Path) -> None:
+def test_a_file_of_metashape_is_found_under_any_name(tmp_path: Path) -> None:
     path = FORMATS["Metashape"].write(tmp_path).rename(tmp_path / "Chunk 1.xml")
     (tmp_path / "other.xml").write_text("<a/>")
     assert find_cameras(tmp_path) is None
     assert find_other_cameras(tmp_path) == path
 
 
-def test_many_elements_take_no_more_memory_than_allowed(tmp_path: Path) -> None:
+def test_xml_of_more_elements_than_its_bytes_allow_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "cameras.xml"
     path.write_text("<a>" + "<b/>" * 2_000_000 + "</a>")
     with refuses(SceneError, "cameras.xml", "XML", "MB"):

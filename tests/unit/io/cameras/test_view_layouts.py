@@ -1,4 +1,4 @@
-"""Files of each declared layout: all views are read, and what is wrong is named by file, view and key."""
+"""Files of each declared layout are read, and what is wrong is named by file, view and key."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ Change = Callable[[Any], object]
 ANGLE = 2 * float(arctan2(0.5, 1.0))  # of view: the focal length is the side's length
 
 
-def test_each_layout_is_tried() -> None:
+def test_every_declared_layout_has_a_case() -> None:
     assert {row.name for row in CAMERA_FORMATS if isinstance(row.read, ViewLayout)} == FORMATS.keys()
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_all_views_are_read(tmp_path: Path, name: str) -> None:
+def test_all_views_of_a_layout_are_read(tmp_path: Path, name: str) -> None:
     path = FORMATS[name].write(tmp_path)
     actual = read_cameras(path)
     assert actual.source == name
@@ -44,7 +44,7 @@ def test_all_views_are_read(tmp_path: Path, name: str) -> None:
     assert (find_cameras(tmp_path) or find_other_cameras(tmp_path)) == path
 
 
-def test_a_new_layout_needs_no_function(tmp_path: Path) -> None:
+def test_a_new_layout_is_declared_without_a_function(tmp_path: Path) -> None:
     """It has quaternions, numbers that all views share, and alternative keys."""
     path = tmp_path / "new.json"
     views = [
@@ -140,7 +140,9 @@ SIZES = [(WIDTH, HEIGHT)] * VIEWS
         ("OpenSfM", in_file("focal_x", "focal_y", "c_x", "c_y", focal=0.5), diagonal(12, 12), SIZES),
     ],
 )
-def test_other_forms(tmp_path: Path, name: str, change: Change, Ks: np.ndarray, sizes: list[tuple[int, int]]) -> None:
+def test_other_forms_of_a_layout_are_read(
+    tmp_path: Path, name: str, change: Change, Ks: np.ndarray, sizes: list[tuple[int, int]]
+) -> None:
     path = FORMATS[name].write(tmp_path)
     with edited_json(path) as data:
         change(data)
@@ -216,7 +218,7 @@ def test_world_mirror_s_size_is_twice_the_principal_point(
     assert set(zip(actual.widths.tolist(), actual.heights.tolist(), strict=True)) == {size}
 
 
-def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path) -> None:
+def test_cameras_of_long_lrm_are_moved_into_the_frame_of_gaussians(tmp_path: Path) -> None:
     """A point of the cameras' world and its image in the Gaussians' are seen in the same direction."""
     path = FORMATS["Long-LRM"].write(tmp_path)
     (tmp_path / "input_frame_idx.txt").write_text("2 0")
@@ -230,7 +232,7 @@ def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path) -> None:
     assert actual.names == ("2.png", "0.png")
 
 
-def test_poses_that_instantsplat_optimised(tmp_path: Path) -> None:
+def test_poses_that_instantsplat_optimised_replace_the_first_ones(tmp_path: Path) -> None:
     FORMATS["INRIA cameras.json"].write(tmp_path)
     turn = np.eye(4)
     turn[:3, :3] = rotation(0.02, 0.01, 0)
@@ -266,7 +268,7 @@ def test_poses_that_instantsplat_optimised(tmp_path: Path) -> None:
         ("Metashape", 'type="frame"', 'type="fisheye"', "fisheye", (0, 0, 0, 0)),
     ],
 )  # fmt: skip
-def test_lenses_are_read(
+def test_lenses_of_a_layout_are_read(
     tmp_path: Path, name: str, old: str, new: str, model: str, coefficients: tuple[float, ...]
 ) -> None:
     lens = read_cameras(FORMATS[name].write(tmp_path, old, new)).lenses[0]
@@ -327,7 +329,9 @@ def test_lenses_are_read(
         ("Metashape", 'type="frame"', 'type="spherical"', "view 0.png", "SPHERICAL"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named(tmp_path: Path, name: str, old: str, new: str, place: str, found: object) -> None:
+def test_wrong_values_are_named_by_file_view_and_key(
+    tmp_path: Path, name: str, old: str, new: str, place: str, found: object
+) -> None:
     path = FORMATS[name].write(tmp_path, old, new)
     file = next(iter(FORMATS[name].files)).split("/")[-1]
     with refuses(SceneError, f"{file}: {place}" if place.startswith("view") else file, found):

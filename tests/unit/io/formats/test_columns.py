@@ -33,13 +33,13 @@ def with_columns(path: Path, *more: str, kind: str = "<f4") -> Path:
         ("velocity_0", "lifespan"), ("velocity_x", "duration"), ("f_offset_0", "f_anchor_feat_0"),
     ],
 )  # fmt: skip
-def test_gaussians_that_come_and_go_are_refused(more: tuple[str, ...], tmp_path: Path) -> None:
+def test_columns_of_gaussians_that_change_in_time_are_refused(more: tuple[str, ...], tmp_path: Path) -> None:
     known = next(name for name in more if name.startswith(("trbf", "scal", "t_", "life", "dur", "f_off")))
     with refuses(SceneError, "a.ply", known):
         read_ply(with_columns(tmp_path / "a.ply", *more))
 
 
-def test_columns_are_refused_before_missing_ones(tmp_path: Path) -> None:
+def test_columns_to_refuse_are_named_before_missing_ones(tmp_path: Path) -> None:
     left = tuple(f"rot_l_{i}" for i in range(4))
     rows = columns(names=(*(name for name in NAMES if name[:3] != "rot"), *left, "t_scale"))
     with refuses(SceneError, "a.ply", "t_scale", "moment"):
@@ -66,7 +66,7 @@ def test_unused_columns_are_in_one_note(more: tuple[str, ...], said: tuple[str, 
     assert ply.info.extra_columns == (*more, "label", "semantic_0", "red", "confidence")
 
 
-def test_whole_numbers_that_are_unknown_have_no_note(tmp_path: Path) -> None:
+def test_unknown_columns_of_whole_numbers_have_no_note(tmp_path: Path) -> None:
     assert file_notes(read_ply(with_columns(tmp_path / "a.ply", "foo", kind="u1")).info) == ()
 
 
@@ -118,7 +118,7 @@ def test_opacities_of_0_to_255_are_refused(tmp_path: Path) -> None:
         read_ply(save(tmp_path / "c.ply", rows.astype([(n, "u1" if n == "opacity" else "<f4") for n in NAMES])))
 
 
-def test_rotations_of_another_name(tmp_path: Path) -> None:
+def test_columns_of_rotations_may_have_another_name(tmp_path: Path) -> None:
     rows = columns(6)
     path = save(tmp_path / "a.ply", rows)
     rows.dtype.names = tuple(name.replace("rot_", "rotation_") for name in NAMES)
@@ -131,7 +131,9 @@ def test_rotations_of_another_name(tmp_path: Path) -> None:
     ("old", "new", "said"),
     [(b"0.5", b"0,5", ("commas", "decimal points")), (b"float x", b"half x", ("'half'", "float"))],
 )
-def test_texts_that_no_ply_has(tmp_path: Path, old: bytes, new: bytes, said: tuple[str, ...]) -> None:
+def test_decimal_commas_or_unknown_types_are_refused(
+    tmp_path: Path, old: bytes, new: bytes, said: tuple[str, ...]
+) -> None:
     head = "".join(f"property float {name}\n" for name in NAMES)
     text = f"ply\nformat ascii 1.0\nelement vertex 1\n{head}end_header\n{'0.5 ' * len(NAMES)}\n".encode()
     (path := tmp_path / "a.ply").write_bytes(text)

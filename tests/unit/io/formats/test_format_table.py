@@ -26,11 +26,11 @@ FUNCTIONS = [entry.func if isinstance(entry, partial) else entry for entry in EN
 @pytest.mark.parametrize(
     "function", sorted({entry for entry in FUNCTIONS if isinstance(entry, LazyFunction)}, key=str), ids=str
 )
-def test_a_function_that_a_table_names_is_there(function: LazyFunction) -> None:
+def test_functions_that_a_table_names_exist(function: LazyFunction) -> None:
     assert callable(function.load())
 
 
-def test_the_table_has_the_degrees_of_the_writers() -> None:
+def test_degrees_of_the_table_are_those_of_the_writers() -> None:
     writers = {".sog": sog, ".splat": splat, ".spz": spz, ".glb": glb}
     degrees = {ending: writer.MAX_DEGREE for ending, writer in writers.items()}
     assert {row.ending: row.max_degree for row in FORMATS if row.ending in degrees} == degrees

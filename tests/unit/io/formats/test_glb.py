@@ -64,7 +64,7 @@ def save_glb(
         "nodes": nodes or [{"mesh": 0}], "meshes": [{"primitives": [primitive]}], "accessors": accessors,
         "bufferViews": views, "buffers": [{"byteLength": len(content)}],
     }  # fmt: skip
-    put(path, document, content)
+    write_document(path, document, content)
     return document
 
 
@@ -74,14 +74,14 @@ def write_scene(path: Path, scene: Scene, *, overwrite: bool = False) -> None:
     write_outputs(outputs, Contents([scene.gaussians], cameras=scene.cameras, names=scene.names))
 
 
-def put(path: Path, document: Document, content: bytes) -> None:
+def write_document(path: Path, document: Document, content: bytes) -> None:
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
-def same(actual: Gaussians, expected: Gaussians, atol: float = 2e-6) -> None:
+def assert_same_gaussians(actual: Gaussians, expected: Gaussians, atol: float = 2e-6) -> None:
     """Compare all columns, rotations up to their sign, and scales and sizes relative to their own."""
     sign = np.where((actual.quats * expected.quats).sum(1) < 0, -1, 1)[:, None]
     np.testing.assert_allclose(actual.quats * sign, expected.quats, atol=atol)
@@ -91,11 +91,11 @@ def same(actual: Gaussians, expected: Gaussians, atol: float = 2e-6) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_what_is_written_is_read_back(degree: int, scene: Scene, tmp_path: Path) -> None:
+def test_a_glb_is_read_back_as_it_was_written(degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, degree)
     write_gaussians(tmp_path / "a.glb", gaussians)
     actual = read_gaussians(tmp_path / "a.glb")
-    same(actual.gaussians, gaussians, 2e-5)  # rotations and opacities have 16 bits
+    assert_same_gaussians(actual.gaussians, gaussians, 2e-5)  # rotations and opacities have 16 bits
     np.testing.assert_allclose(actual.gaussians.scales, gaussians.scales, rtol=1e-6)
     np.testing.assert_array_equal(actual.gaussians.means, gaussians.means)
     np.testing.assert_array_equal(actual.gaussians.shN, gaussians.shN)
@@ -115,10 +115,10 @@ def test_axis_y_of_other_writers_points_up(scene: Scene, tmp_path: Path) -> None
         gaussians.means * np.array([-1, -1, 1], np.float32), multiply_quats(half_turn, gaussians.quats),
         gaussians.scales, gaussians.opacities, gaussians.sh0, gaussians.shN * signs,
     )  # fmt: skip
-    same(read_gaussians(tmp_path / "a.glb").gaussians, expected)
+    assert_same_gaussians(read_gaussians(tmp_path / "a.glb").gaussians, expected)
 
 
-def test_nodes_move_their_gaussians(scene: Scene, tmp_path: Path) -> None:
+def test_nodes_of_a_glb_move_their_gaussians(scene: Scene, tmp_path: Path) -> None:
     """Two copies, of which one is moved by its node's parts, and one by the matrices of two nodes."""
     gaussians = drawn(scene, 0)
     turn = np.array([0.5, 0.1, -0.7, 0.2])
@@ -137,16 +137,16 @@ def test_nodes_move_their_gaussians(scene: Scene, tmp_path: Path) -> None:
     parts = [{name[:-1]: at for name, at in primitive["attributes"].items() if name[-1] == i} for i in "01"]
     document["meshes"] = [{"primitives": [primitive | {"attributes": part}]} for part in parts]
     content = (tmp_path / "a.glb").read_bytes()[-document["buffers"][0]["byteLength"] :]
-    put(tmp_path / "a.glb", document, content)
+    write_document(tmp_path / "a.glb", document, content)
     actual = read_gaussians(tmp_path / "a.glb").gaussians
     count = len(gaussians)
     means = (2 * gaussians.means @ matrix[:3, :3].T + [1, 2, 3]) * [-1, -1, 1]
-    same(actual[:count], actual[count:])
+    assert_same_gaussians(actual[:count], actual[count:])
     np.testing.assert_allclose(actual.means[:count], means, atol=1e-5)
     np.testing.assert_allclose(actual.scales[:count], 2 * gaussians.scales, rtol=1e-5)
 
 
-def test_quantised_values(scene: Scene, tmp_path: Path) -> None:
+def test_quantised_values_of_a_glb_are_read(scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, 0)
     columns = attributes_of(gaussians)
     save_glb(tmp_path / "plain.glb", columns)
@@ -161,18 +161,20 @@ def test_quantised_values(scene: Scene, tmp_path: Path) -> None:
     np.testing.assert_allclose(actual.opacities, expected.opacities, atol=0.5 / 255 + 1e-6)
 
 
-def test_whether_it_holds_gaussians(scene: Scene, tmp_path: Path) -> None:
+def test_a_glb_is_known_to_hold_gaussians_by_its_extension(scene: Scene, tmp_path: Path) -> None:
     document = save_glb(tmp_path / "a.glb", attributes_of(drawn(scene, 0)))
     assert holds_gaussians(tmp_path / "a.glb")
     document["extensionsUsed"] = []
-    put(tmp_path / "a.glb", document, b"")
+    write_document(tmp_path / "a.glb", document, b"")
     assert not holds_gaussians(tmp_path / "a.glb")
     (tmp_path / "a.glb").write_bytes(b"glTF")
     assert holds_gaussians(tmp_path / "a.glb")  # its reader says what is wrong with it
 
 
 @pytest.mark.parametrize(("num_more", "is_doubtful"), [(3, False), (12, True)])
-def test_bytes_beyond_the_stated_length(scene: Scene, tmp_path: Path, num_more: int, is_doubtful: bool) -> None:
+def test_more_than_padding_beyond_the_stated_length_of_a_glb_is_a_doubt(
+    scene: Scene, tmp_path: Path, num_more: int, is_doubtful: bool
+) -> None:
     write_gaussians(tmp_path / "a.glb", scene.gaussians)
     with (tmp_path / "a.glb").open("ab") as file:
         file.write(bytes(num_more))
@@ -184,7 +186,7 @@ def test_a_viewers_first_picture_is_that_of_the_middle_view(scene: Scene, tmp_pa
     """A camera node projects points as the view does, whose pixels are those of a picture of glTF's camera."""
     path = tmp_path / "a.glb"
     write_scene(path, scene)
-    document, _ = _read_document(path)
+    document, _ = read_document(path)
     nodes = [node for node in document["nodes"] if "camera" in node]
     assert [node["name"] for node in nodes] == [scene.names[view] for view in order_views(scene.cameras)]
     view, lens = order_views(scene.cameras)[0], document["cameras"][nodes[0]["camera"]]["perspective"]
@@ -199,20 +201,20 @@ def test_a_viewers_first_picture_is_that_of_the_middle_view(scene: Scene, tmp_pa
     np.testing.assert_allclose((1 + ndc * (1, -1)) / 2 * (width, height), pixels, atol=1e-2)
 
 
-def _read_document(path: Path) -> tuple[Document, int]:
+def read_document(path: Path) -> tuple[Document, int]:
     content = path.read_bytes()
     (length,) = struct.unpack_from("<I", content, 12)
     return json.loads(content[20 : 20 + length]), length
 
 
 @pytest.mark.parametrize("ending", [".glb", ".sog"])
-def test_without_cameras_viewers_start_at_a_placed_one(ending: str, scene: Scene, tmp_path: Path) -> None:
+def test_viewers_of_a_scene_without_cameras_start_at_a_placed_one(ending: str, scene: Scene, tmp_path: Path) -> None:
     """It sees the scene, and it is not written as if it were a photo's."""
     path = tmp_path / f"a{ending}"
     write_scene(path, replace(scene, cameras=scene.cameras[:0], names=(), pixels=None, images=None))
     assert not path.with_name("a.cameras.json").exists()
     if ending == ".glb":
-        (node,) = (node for node in _read_document(path)[0]["nodes"] if "camera" in node)
+        (node,) = (node for node in read_document(path)[0]["nodes"] if "camera" in node)
         pose = np.reshape(node["matrix"], (4, 4)).T
         position, forward = pose[:3, 3] * (-1, -1, 1), -pose[:3, 2] * (-1, -1, 1)
     else:
@@ -222,7 +224,7 @@ def test_without_cameras_viewers_start_at_a_placed_one(ending: str, scene: Scene
     assert float(((scene.gaussians.means - position) @ forward > 0).mean()) > 0.9
 
 
-def test_settings_start_a_viewer_at_that_view_and_those_of_a_user_stay(scene: Scene, tmp_path: Path) -> None:
+def test_settings_start_a_viewer_at_the_middle_view(scene: Scene, tmp_path: Path) -> None:
     path, settings = tmp_path / "a.sog", tmp_path / "a.settings.json"
     write_scene(path, scene)
     (camera,) = json.loads(settings.read_text())["cameras"]
@@ -243,6 +245,11 @@ def test_settings_start_a_viewer_at_that_view_and_those_of_a_user_stay(scene: Sc
     path.unlink()
     path.with_name("a.cameras.json").unlink()
     write_scene(path, scene)  # beside settings that stay
+
+
+def test_settings_of_a_user_beside_a_sog_stay(scene: Scene, tmp_path: Path) -> None:
+    path, settings = tmp_path / "a.sog", tmp_path / "a.settings.json"
+    write_scene(path, scene)
     settings.write_text("{}")
     write_scene(path, scene, overwrite=True)
     assert settings.read_text() == "{}"

@@ -1,4 +1,4 @@
-"""Marks of how viewers are to render Gaussians, and of the vertical axis: kept through formats and joins."""
+"""Marks of the render mode and of the vertical axis are kept through formats and joins."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gsmerge.io import kept_comments, read_gaussians, write_gaussians, write_ply
 from gsmerge.settings.placement import PlacementOptions
 
 
-def marked(path: Path, *comments: str) -> Path:
-    """A file of other programs with comments in its header."""
+def write_marked(path: Path, *comments: str) -> Path:
+    """Write a file as of another program, with comments in its header."""
     write_ply(path, corners())
     head, rows = path.read_bytes().split(b"element vertex", 1)
     more = b"".join(f"comment {comment}\n".encode() for comment in comments)
@@ -24,7 +24,7 @@ def marked(path: Path, *comments: str) -> Path:
     return path
 
 
-def marks(path: Path) -> list[str]:
+def read_marks(path: Path) -> list[str]:
     return list(kept_comments(read_gaussians(path).info))
 
 
@@ -38,14 +38,14 @@ def marks(path: Path) -> list[str]:
     ],
 )  # fmt: skip
 def test_marks_of_other_programs_are_kept(comments: tuple[str, ...], expected: list[str], tmp_path: Path) -> None:
-    assert marks(marked(tmp_path / "a.ply", *comments)) == expected
+    assert read_marks(write_marked(tmp_path / "a.ply", *comments)) == expected
 
 
 @pytest.mark.parametrize("mode", ["mip", "2dgs"])
-def test_a_sog_has_the_mode_as_its_model(mode: str, tmp_path: Path) -> None:
+def test_a_sog_stores_the_render_mode_as_its_model(mode: str, tmp_path: Path) -> None:
     comments = [f"SplatRenderMode: {mode}"]
     write_gaussians(tmp_path / "a.sog", corners(), comments=comments)
-    assert marks(tmp_path / "a.sog") == comments
+    assert read_marks(tmp_path / "a.sog") == comments
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         meta = json.loads(archive.read("meta.json"))
     assert meta["model"] == {"mip": "antialiased", "2dgs": "2dgs"}[mode]
@@ -53,25 +53,25 @@ def test_a_sog_has_the_mode_as_its_model(mode: str, tmp_path: Path) -> None:
 
 
 def test_gaussians_of_two_scales_are_marked_as_flat(tmp_path: Path) -> None:
-    path = marked(tmp_path / "a.ply")
+    path = write_marked(tmp_path / "a.ply")
     head, rows = path.read_bytes().split(b"end_header\n", 1)
     names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property")]
     place, count = names.index("scale_2"), len(names)
     kept = b"".join(rows[4 * i : 4 * i + 4] for i in range(len(rows) // 4) if i % count != place)
     path.write_bytes(head.replace(b"property float scale_2\n", b"") + b"end_header\n" + kept)
-    assert marks(path) == ["SplatRenderMode: 2dgs"]
+    assert read_marks(path) == ["SplatRenderMode: 2dgs"]
 
 
-def test_files_of_different_modes_are_joined_without_one(tmp_path: Path) -> None:
-    inputs = [marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z"), marked(tmp_path / "b.ply")]
+def test_marks_that_not_all_files_have_are_left_out_of_a_join(tmp_path: Path) -> None:
+    inputs = [write_marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z"), write_marked(tmp_path / "b.ply")]
     document = convert_files(ConvertOptions(inputs, plan_outputs(tmp_path / "both.ply")))
     assert [note for note in document["notes"] if note.startswith("not all files have the mark")] == [
         "not all files have the mark 'SplatRenderMode: mip', so the joined file has not",
         "not all files have the mark 'Vertical axis: z', so the joined file has not",
     ]
-    assert marks(tmp_path / "both.ply") == []
+    assert read_marks(tmp_path / "both.ply") == []
     convert_files(ConvertOptions([inputs[0], inputs[0]], plan_outputs(tmp_path / "same.ply")))
-    assert marks(tmp_path / "same.ply") == ["SplatRenderMode: mip", "Vertical axis: z"]
+    assert read_marks(tmp_path / "same.ply") == ["SplatRenderMode: mip", "Vertical axis: z"]
 
 
 @pytest.mark.parametrize(
@@ -81,14 +81,14 @@ def test_files_of_different_modes_are_joined_without_one(tmp_path: Path) -> None
         (".splat", ["SplatRenderMode: mip", "Vertical axis: z"]), (".sog", ["Vertical axis: z"]), (".ply", []),
     ],
 )  # fmt: skip
-def test_what_a_format_does_not_keep_is_said(ending: str, lost: list[str], tmp_path: Path) -> None:
-    path = marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z")
+def test_marks_that_a_format_cannot_store_are_noted(ending: str, lost: list[str], tmp_path: Path) -> None:
+    path = write_marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z")
     notes = convert_files(ConvertOptions([path], plan_outputs(tmp_path / f"b{ending}")))["notes"]
     assert [note for note in notes if "mark" in note] == [f"{ending} cannot store the mark {mark!r}" for mark in lost]
 
 
-def test_upward_is_what_the_file_is_marked_with(tmp_path: Path) -> None:
-    path = marked(tmp_path / "a.ply", "Vertical axis: z")
+def test_the_marked_vertical_axis_of_a_file_is_turned_upward(tmp_path: Path) -> None:
+    path = write_marked(tmp_path / "a.ply", "Vertical axis: z")
     convert_files(ConvertOptions([path], plan_outputs(tmp_path / "y.ply"), placement=PlacementOptions(up="y")))
     before, after = (read_gaussians(file).gaussians.means for file in (path, tmp_path / "y.ply"))
     assert abs(after[:, 1] - before[:, 2]).max() < 1e-5
@@ -97,8 +97,8 @@ def test_upward_is_what_the_file_is_marked_with(tmp_path: Path) -> None:
 
 
 def test_a_turned_file_has_no_axis_of_the_former_frame(tmp_path: Path) -> None:
-    path = marked(tmp_path / "a.ply", "Vertical axis: z")
+    path = write_marked(tmp_path / "a.ply", "Vertical axis: z")
     convert_files(
         ConvertOptions([path], plan_outputs(tmp_path / "turned.ply"), placement=PlacementOptions(rotate="90,0,0"))
     )
-    assert marks(tmp_path / "turned.ply") == []
+    assert read_marks(tmp_path / "turned.ply") == []

@@ -1,4 +1,4 @@
-"""Reading takes at most 64 MB and 20 times a file's bytes, in every format: measured in processes of their own."""
+"""Reading takes at most 64 MB and 20 times a file's bytes, as processes of their own measure."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory as Linux
 
 
 def some(count: int) -> Gaussians:
-    """Gaussians along a walk, few of which have harmonics of their own: they pack well."""
+    """Make Gaussians along a walk, few of which have harmonics of their own: they pack well."""
     rng = np.random.default_rng(0)
     means = np.cumsum(rng.normal(0, 0.02, (count, 3)), 0).astype(np.float32)
     quats = normalize(rng.normal(size=(50, 4)).astype(np.float32))[rng.integers(0, 50, count)]
@@ -53,7 +53,7 @@ def some(count: int) -> Gaussians:
 
 @pytest.mark.slow
 @sweep("ending", FILES)
-def test_memory_is_within_the_budget(ending: str, tmp_path: Path) -> None:
+def test_reading_a_file_takes_no_more_memory_than_its_budget(ending: str, tmp_path: Path) -> None:
     small, path = tmp_path / f"small{ending}", tmp_path / f"large{ending}"
     for place, count in {small: 300, path: FILES[ending]}.items():
         if ending == ".compressed.ply":
@@ -66,7 +66,7 @@ def test_memory_is_within_the_budget(ending: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("each", "num_higher"), [(8, 0), (10, 15), (12, 24)])
 @pytest.mark.parametrize("count", [100_000, 1_000_000, 4_000_000, 20_000_000])
-def test_files_of_real_density_are_read(count: int, each: int, num_higher: int) -> None:
+def test_files_as_dense_as_real_ones_are_within_the_budget(count: int, each: int, num_higher: int) -> None:
     """Bytes per Gaussian of the smallest .sog and .spz of real scenes, at any size; a twentieth of them are none."""
     check_gaussian_count(ReadBudget("a.sog", each * count), count, num_higher, PACKED_BYTES)
     with refuses(SceneError, "a.sog", f"{20 * count:,}"):
@@ -74,7 +74,7 @@ def test_files_of_real_density_are_read(count: int, each: int, num_higher: int) 
 
 
 @pytest.mark.slow
-def test_memory_of_text_is_within_the_budget(tmp_path: Path) -> None:
+def test_reading_text_takes_no_more_memory_than_its_budget(tmp_path: Path) -> None:
     """Numbers of one character, of columns of eight bytes."""
     small, path = tmp_path / "small.ply", tmp_path / "large.ply"
     write_ply(small, some(300))

@@ -45,7 +45,7 @@ def test_empty_lines_between_rows_of_text_are_passed_over(tmp_path: Path, newlin
 @pytest.mark.skipif(sys.platform == "win32", reason="a file that is mapped keeps its size there")
 @pytest.mark.parametrize("packed", [False, True], ids=["plain", "packed"])
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.9])
-def test_a_file_that_shrinks_while_it_is_read(
+def test_a_ply_that_shrinks_while_it_is_read_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, packed: bool
 ) -> None:
     """One line, not the signal that reading mapped pages beyond the end would be."""
@@ -67,7 +67,7 @@ def test_a_file_that_shrinks_while_it_is_read(
 
 
 @pytest.mark.parametrize("block", [slice(0, 7), slice(7, 12_345), slice(12_345, 20_000), slice(None)], ids=str)
-def test_rows_are_those_of_the_file(tmp_path: Path, block: slice) -> None:
+def test_rows_read_in_blocks_are_those_of_the_file(tmp_path: Path, block: slice) -> None:
     rows, path = columns(20_000), tmp_path / "a.ply"
     stored = open_ply(save(path, rows))[0]["vertex"].data
     assert isinstance(stored, np.memmap) == (sys.platform != "win32")
@@ -82,14 +82,16 @@ def test_a_file_that_was_read_takes_no_memory(tmp_path: Path) -> None:
     stored = open_ply(path)[0]["vertex"].data
     with open_rows(path, stored) as read:
         assert float(read(slice(None))["x"].sum()) != 0
-    assert resident(stored.filename) < 0.1 * stored.nbytes
+    assert resident_bytes(stored.filename) < 0.1 * stored.nbytes
 
 
 @pytest.mark.parametrize("kind", ["binary", "text", "packed"])
 @pytest.mark.parametrize(
     ("more", "is_doubtful"), [("none", False), ("newline", False), ("padding", False), ("row", True), ("file", True)]
 )
-def test_bytes_after_the_last_row(tmp_path: Path, kind: str, more: str, is_doubtful: bool) -> None:
+def test_more_than_padding_after_the_last_row_is_a_doubt(
+    tmp_path: Path, kind: str, more: str, is_doubtful: bool
+) -> None:
     """Elements after the vertices are none: the packed harmonics follow them."""
     path = save(tmp_path / "a.ply", columns(300, num_rest=45), text=kind == "text")
     if kind == "packed":
@@ -102,15 +104,15 @@ def test_bytes_after_the_last_row(tmp_path: Path, kind: str, more: str, is_doubt
     assert [doubt.split()[0] for doubt in doubts] == [f"{len(added.strip()):,}"] * is_doubtful
 
 
-def test_bytes_after_any_of_several_parts(tmp_path: Path) -> None:
+def test_bytes_after_any_of_several_parts_are_a_doubt(tmp_path: Path) -> None:
     """Not only by the first one."""
     paths = [save(tmp_path / f"{name}.ply", columns(50)) for name in "ab"]
     paths[1].write_bytes(paths[1].read_bytes() + bytes(100))
     assert any("100 bytes follow" in note for note in list_doubts(file_notes(read_parts(paths).info)))
 
 
-def resident(path: str) -> int:
-    """Bytes of a mapped file that are in this process's memory."""
+def resident_bytes(path: str) -> int:
+    """Count the bytes of a mapped file that are in this process's memory."""
     total, inside = 0, False
     for line in Path("/proc/self/smaps").read_text().splitlines():
         if not line.split(":")[0].isalpha() and "-" in line.split()[0]:
@@ -120,7 +122,7 @@ def resident(path: str) -> int:
     return total
 
 
-def test_what_a_header_promises(tmp_path: Path) -> None:
+def test_counts_are_read_from_a_header(tmp_path: Path) -> None:
     assert header_counts(save(tmp_path / "a.ply", columns(7))) == (7, 0)
     assert header_counts(save(tmp_path / "b.ply", columns(9, num_rest=45))) == (9, 45)
     assert header_counts(save(tmp_path / "c.ply", columns(3, num_rest=9), text=True)) == (3, 9)
@@ -148,7 +150,7 @@ PLAIN, LINES = [b"property float x"] * 4, b"\n".join
         (b"7", [b"property uchar f_rest_%d" % i for i in range(500)], 7 * 500, False, (7, 72)),
     ],
 )  # fmt: skip
-def test_a_header_counts_for_what_its_bytes_hold(
+def test_counts_of_a_header_hold_where_its_bytes_are_enough(
     tmp_path: Path, stated: bytes, properties: list[bytes], rows: int, text: bool, held: tuple[int, int]
 ) -> None:
     kind = b"ascii" if text else b"binary_little_endian"
@@ -158,7 +160,7 @@ def test_a_header_counts_for_what_its_bytes_hold(
     assert estimate_counts([tmp_path / "a.ply"] * 2) == (2 * held[0], held[1])
 
 
-def test_tensors_of_lyra_1_are_named(tmp_path: Path) -> None:
+def test_tensors_of_lyra_1_are_refused_with_the_remedy(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     torch.save(torch.zeros(1, 5, 14), tmp_path / "gaussians_0.ply")
     with refuses(SceneError, "gaussians_0.ply", "torch.save", "Lyra 1", "save_gaussians_orig: true"):

@@ -42,7 +42,7 @@ def save(path: Path, rows: np.ndarray, *, text: bool = False, order: str = "<", 
     return path
 
 
-def test_values_are_activated_by_hand(tmp_path: Path) -> None:
+def test_stored_values_are_activated_as_by_hand(tmp_path: Path) -> None:
     rows = columns(2)
     rows["opacity"] = (0.0, 2.0)
     rows["scale_1"] = (0.0, elementary.log(0.25))
@@ -58,7 +58,7 @@ def test_values_are_activated_by_hand(tmp_path: Path) -> None:
     assert scene.valid.all()
 
 
-def test_info_of_the_common_layouts(tmp_path: Path) -> None:
+def test_common_layouts_are_described_in_the_info(tmp_path: Path) -> None:
     info = read_ply(save(tmp_path / "a.ply", columns())).info
     assert (info.layout, info.format, info.count, info.sh_degree) == ("17-column export", "binary little-endian", 5, 0)
     assert info.opacity_encoding == "logit"
@@ -110,7 +110,7 @@ def test_float64_positions_keep_their_digits(tmp_path: Path) -> None:
     assert read_ply(save(tmp_path / "a.ply", rows)).gaussians.means[:, 0].tolist() == [5_000_000.125, 400_000.0625]
 
 
-def test_extra_columns_elements_and_comments_do_no_harm(tmp_path: Path) -> None:
+def test_extra_columns_or_elements_do_not_change_what_is_read(tmp_path: Path) -> None:
     rows = columns(4)
     mixed = np.zeros(4, [("label", "u1"), *((n, "u1" if n == "nx" else "<f4") for n in NAMES), ("time", "<f8")])
     for name in NAMES:
@@ -189,7 +189,7 @@ def test_scales_and_colours_are_recognised_by_their_distribution(tmp_path: Path)
 
 @pytest.mark.parametrize("prefix", ["scalar_", "scalar_scal_"])
 @pytest.mark.parametrize("text", [True, False])
-def test_columns_with_a_prefix(tmp_path: Path, prefix: str, text: bool) -> None:
+def test_columns_with_a_prefix_of_cloudcompare_are_read(tmp_path: Path, prefix: str, text: bool) -> None:
     rows = columns(40, 9)
     expected = read_ply(save(tmp_path / "a.ply", rows)).gaussians
     renamed = rows.astype([(name if name in "xyz" else prefix + name, "<f4") for name in rows.dtype.names])
@@ -206,7 +206,7 @@ def test_columns_with_a_prefix(tmp_path: Path, prefix: str, text: bool) -> None:
         read_ply(save(tmp_path / "c.ply", repack_fields(more[["x", "y", "z", f"{prefix}label"]])))
 
 
-def test_our_own_files_are_never_guessed_at(tmp_path: Path) -> None:
+def test_the_encoding_of_our_own_files_is_never_guessed(tmp_path: Path) -> None:
     gaussians = read_ply(save(tmp_path / "a.ply", columns(3))).gaussians
     faint = Gaussians(*(getattr(gaussians, f) if f != "opacities" else np.full((3,), 0.6) for f in (
         "means", "quats", "scales", "opacities", "sh0", "shN",
@@ -217,7 +217,7 @@ def test_our_own_files_are_never_guessed_at(tmp_path: Path) -> None:
     assert actual.gaussians.opacities.tolist() == pytest.approx([0.6] * 3, abs=1e-6)
 
 
-def test_infinite_logits_are_opacities(tmp_path: Path) -> None:
+def test_infinite_logits_are_opacities_of_zero_or_one(tmp_path: Path) -> None:
     rows = columns(3)
     rows["opacity"] = (np.inf, -np.inf, 0.0)
     actual = read_ply(save(tmp_path / "a.ply", rows), opacity="logit")
@@ -243,7 +243,7 @@ def test_a_row_with_nan_is_set_aside_in_place(tmp_path: Path, name: str) -> None
     assert actual.gaussians.means[3].tolist() == [rows[c][3] for c in "xyz"]
 
 
-def test_infinite_positions_are_set_aside_and_the_first_row_too(tmp_path: Path) -> None:
+def test_rows_with_infinite_values_are_set_aside(tmp_path: Path) -> None:
     rows = columns(3)
     rows["y"][0] = -np.inf
     rows["scale_0"][2] = np.inf
@@ -341,7 +341,7 @@ def test_linear_scales_are_recognised_by_the_size_of_the_scene(tmp_path: Path, f
     assert not any("scales" in note for note in file_notes(logs.info))
 
 
-def test_scales_are_logarithms_in_doubt(tmp_path: Path) -> None:
+def test_scales_in_doubt_are_read_as_logarithms_with_a_note(tmp_path: Path) -> None:
     """Equal positive scales may be either; the note names the hint."""
     rng = np.random.default_rng(0)
     rows = columns(40_000)
@@ -362,7 +362,7 @@ def test_scales_are_logarithms_in_doubt(tmp_path: Path) -> None:
         read_ply(tmp_path / "a.ply", scales="raw")
 
 
-def test_zero_and_extreme_quaternions(tmp_path: Path) -> None:
+def test_zero_or_extreme_quaternions_are_normalised(tmp_path: Path) -> None:
     rows = columns(5)
     for name in ("rot_0", "rot_1", "rot_2", "rot_3"):
         rows[name] = (0, 1e-30, 1e30, 2, -7)
@@ -373,7 +373,7 @@ def test_zero_and_extreme_quaternions(tmp_path: Path) -> None:
         assert actual.gaussians.quats[i].tolist() == pytest.approx([0.5 * sign] * 4, abs=1e-6)
 
 
-def test_many_blocks_and_any_number_of_threads_give_the_same(tmp_path: Path) -> None:
+def test_the_number_of_threads_does_not_change_what_is_read(tmp_path: Path) -> None:
     rows = columns(40_000, 9)
     rows["x"][::1000] = np.nan
     path = save(tmp_path / "a.ply", rows)
@@ -407,7 +407,7 @@ def test_2d_gaussians_get_a_thin_third_scale(tmp_path: Path, text: bool) -> None
 
 @pytest.mark.parametrize("linear", [True, False])
 @pytest.mark.parametrize("two", [True, False])
-def test_what_4dgt_writes(tmp_path: Path, linear: bool, two: bool) -> None:
+def test_files_of_4dgt_are_read(tmp_path: Path, linear: bool, two: bool) -> None:
     """Colours in [0, 1] as r, g, b, with activated opacities and scales; other programs keep logarithms."""
     rng = np.random.default_rng(0)
     names = ("x", "y", "z", "r", "g", "b", "opacity", "scale_0", "scale_1", "scale_2")[: 9 if two else 10]
@@ -432,7 +432,7 @@ def gaussians() -> Gaussians:
 
 
 @pytest.mark.parametrize("ending", [".spz", ".splat"])
-def test_the_same_as_a_slow_reader(ending: str, gaussians: Gaussians, tmp_path: Path) -> None:
+def test_a_file_is_read_as_by_a_slow_reader(ending: str, gaussians: Gaussians, tmp_path: Path) -> None:
     path = tmp_path / f"a{ending.upper()}"
     write_gaussians(path, gaussians)
     expected, actual = {".spz": read_spz, ".splat": read_splat}[ending](path), read_gaussians(path)
@@ -441,7 +441,7 @@ def test_the_same_as_a_slow_reader(ending: str, gaussians: Gaussians, tmp_path: 
         np.testing.assert_allclose(getattr(actual.gaussians, name), array, rtol=1e-5, atol=1e-5, err_msg=name)
 
 
-def test_what_the_file_is_called(gaussians: Gaussians, tmp_path: Path) -> None:
+def test_layouts_of_other_formats_are_described_in_the_info(gaussians: Gaussians, tmp_path: Path) -> None:
     names = {
         ".spz": ".spz version 3, SH degree 3",
         ".splat": ".splat, SH degree 0",
@@ -458,7 +458,7 @@ def test_what_the_file_is_called(gaussians: Gaussians, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", [".spz", ".sog"])
-def test_a_filter_of_their_own_is_passed_on(ending: str, gaussians: Gaussians, tmp_path: Path) -> None:
+def test_the_render_mode_of_a_file_is_passed_on(ending: str, gaussians: Gaussians, tmp_path: Path) -> None:
     for name, comments in {"mip": ["SplatRenderMode: mip"], "plain": []}.items():
         write_gaussians(tmp_path / f"{name}{ending}", gaussians, comments=comments)
         assert list(kept_comments(read_gaussians(tmp_path / f"{name}{ending}").info)) == comments
@@ -481,7 +481,7 @@ def test_parts_have_one_encoding_of_opacities(tmp_path: Path) -> None:
 
 
 def table_of(count: int) -> np.ndarray:
-    """Rows of Gaussians in the layout of INRIA, none of which is empty."""
+    """Return rows of Gaussians in the layout of INRIA, none of which is empty."""
     names = ("x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3)),
              *(f"rot_{i}" for i in range(4)))  # fmt: skip
     values = np.random.default_rng(0).uniform(0.1, 1, (count, len(names))).astype(np.float32)
@@ -517,7 +517,7 @@ def test_files_with_more_than_stray_impossible_rows_are_doubted(
 
 
 @pytest.mark.parametrize(("last", "others", "broken"), [(30, 0, True), (30, 9, True), (3, 9, False), (1, 0, False)])
-def test_files_that_broke_off_are_said_to_have(tmp_path: Path, last: int, others: int, broken: bool) -> None:
+def test_files_that_broke_off_are_noted(tmp_path: Path, last: int, others: int, broken: bool) -> None:
     rows = table_of(100)
     rows[-last:] = 0
     rows[:others] = 0

@@ -1,4 +1,4 @@
-"""What files keep of positions."""
+"""Notes say where files keep too few digits of positions."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ NAMES = ("lod-meta.json", "a.html", *(f"a{ending}" for ending in OUTPUT_FORMATS)
 
 @pytest.fixture(autouse=True)
 def program(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Any program that exists: none is run."""
+    """Name a program that exists; none is run."""
     monkeypatch.setenv(VARIABLE, sys.executable)
 
 
 @pytest.fixture
 def near() -> Gaussians:
-    """Gaussians around the origin, in float64, with a sky a thousand times as far."""
+    """Make Gaussians around the origin, in float64, with a sky a thousand times as far."""
     rng, n = np.random.default_rng(0), 200
     far = np.where(np.arange(n) < 150, 1.0, 1e3)[:, None]
     return Gaussians(
@@ -39,13 +39,13 @@ def near() -> Gaussians:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_far_from_the_origin_digits_are_lost(near: Gaussians, name: str) -> None:
+def test_digits_lost_far_from_the_origin_are_noted(near: Gaussians, name: str) -> None:
     assert rounding_notes(name, near) == []
     far = replace(near, means=near.means + 3e6 * np.array([1, -1, 1]))
     assert noted(rounding_notes(name, far), "--translate=-3000000,3000000,-3000000")
 
 
-def test_what_is_far_apart_takes_digits_of_a_spz_alone(near: Gaussians) -> None:
+def test_digits_lost_of_gaussians_far_apart_are_noted_for_a_spz_alone(near: Gaussians) -> None:
     factor = np.where(np.arange(len(near)) < 150, 1, 1e4)[:, None]
     apart = replace(near, means=near.means * factor, scales=near.scales * factor)
     assert noted(rounding_notes("a.spz", apart), "write a .ply")

@@ -1,4 +1,4 @@
-"""``.sog``: textures without loss, and codebooks and palettes that stand for many values."""
+"""A ``.sog`` has textures without loss, and codebooks and palettes that stand for many values."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def gaussians() -> Gaussians:
 
 
 @pytest.mark.parametrize("opacity", [0.0, 1.0])
-def test_sog_keeps_what_is_transparent_or_opaque(opacity: float, tmp_path: Path) -> None:
+def test_a_sog_keeps_opacities_of_zero_or_one(opacity: float, tmp_path: Path) -> None:
     """Where every alpha is 255, or 0, WebP stores no alpha, or no colours."""
     one = replace(corners(), opacities=np.full(3, opacity, np.float32))
     write_gaussians(tmp_path / "a.sog", one, overwrite=True)
@@ -35,7 +35,7 @@ def test_sog_keeps_what_is_transparent_or_opaque(opacity: float, tmp_path: Path)
     assert np.isfinite(actual.sh0).all()
 
 
-def test_sog_textures_lose_nothing(gaussians: Gaussians) -> None:
+def test_textures_of_a_sog_are_stored_without_loss(gaussians: Gaussians) -> None:
     """Written again, what is read gives the same textures but for the rounding of rotations."""
     with zipfile.ZipFile(io.BytesIO(sog_bytes(gaussians))) as archive:
         meta = json.loads(archive.read("meta.json"))
@@ -49,7 +49,7 @@ def test_sog_textures_lose_nothing(gaussians: Gaussians) -> None:
     assert (meta["count"], meta["shN"]["bands"], len(meta["shN"]["codebook"])) == (len(gaussians), 3, 256)
 
 
-def test_a_sog_without_its_zip_is_read(gaussians: Gaussians, tmp_path: Path) -> None:
+def test_a_sog_that_was_unpacked_is_read(gaussians: Gaussians, tmp_path: Path) -> None:
     """By the path of its ``meta.json``, or of the folder."""
     write_gaussians(tmp_path / "a.sog", gaussians)
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
@@ -70,7 +70,7 @@ def test_a_codebook_is_nearly_the_best_one() -> None:
     assert error < 1.05 * np.pi * np.sqrt(3) / 2 / 256**2
 
 
-def test_a_codebook_has_room_for_what_is_far_away() -> None:
+def test_a_codebook_includes_values_far_away() -> None:
     values = np.concatenate([np.random.default_rng(0).normal(size=10_000), [-400.0, 1e4]])
     codebook = fit_codebook(values)
     assert (codebook.shape, codebook[0], codebook[-1]) == ((256,), -400, 1e4)
@@ -84,7 +84,7 @@ def test_few_values_are_their_own_codes(values: list[float]) -> None:
     assert codebook.shape == (256,)
 
 
-def test_a_palette_stands_for_all_vectors() -> None:
+def test_a_palette_is_near_all_of_its_vectors() -> None:
     rng = np.random.default_rng(0)
     centres = rng.normal(size=(16, 9))
     vectors = centres[rng.integers(0, 16, 1000)] + rng.normal(0, 1e-3, (1000, 9))
@@ -92,6 +92,6 @@ def test_a_palette_stands_for_all_vectors() -> None:
     assert palette.shape == (64, 9)
     assert np.bincount(labels, minlength=64).min() >= 1000 // 64
     spread = np.abs(vectors - vectors.mean(0)).mean()
-    assert np.abs(vectors - palette[labels]).mean() < spread / 4
+    assert np.abs(vectors - palette[labels]).mean() < spread / 4  # far nearer than the mean of all
     few, own = fit_palette(vectors, 10)
     np.testing.assert_array_equal(few[own], vectors)

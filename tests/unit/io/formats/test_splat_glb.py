@@ -1,4 +1,4 @@
-"""Damaged ``.splat`` files are refused; whole ones are read in ``test_ply.py``."""
+"""A ``.glb`` has the layout of its specification, which a slow reader checks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmerge.io import write_gaussians
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The document of a binary glTF, and the attributes of its only primitive."""
+    """Return the document of a binary glTF, and the attributes of its only primitive."""
     data = path.read_bytes()
     magic, version, size, length, kind = struct.unpack_from("<4sII I4s", data)
     assert (magic, version, size, kind, length % 4) == (b"glTF", 2, len(data), b"JSON", 0)
@@ -40,7 +40,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_glb_holds_everything(degree: int, tmp_path: Path) -> None:
+def test_a_glb_holds_every_value_of_its_gaussians(degree: int, tmp_path: Path) -> None:
     gaussians = drawn(scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72)), degree)
     write_gaussians(tmp_path / "a.glb", gaussians)
     document, actual = read_glb(tmp_path / "a.glb")

@@ -1,4 +1,4 @@
-"""The program splat-transform, which writes levels, and the formats that it converts."""
+"""The program splat-transform is run, or named for the formats that it converts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsmerge.io.scene_files import find_scene_files
 
 
 @pytest.mark.parametrize("name", ["a.ksplat", "my meta.lcc", "meta.lcc2"])
-def test_what_the_program_converts_is_refused_with_its_command(name: str, tmp_path: Path) -> None:
+def test_formats_that_the_program_converts_are_refused_with_its_command(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.write_bytes(b"\0any")
     quoted = f"'{path}'" if " " in name else path
@@ -27,7 +27,7 @@ def test_what_the_program_converts_is_refused_with_its_command(name: str, tmp_pa
             read()
 
 
-def test_without_the_program_nothing_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_running_the_program_where_it_is_missing_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv(VARIABLE, raising=False)
     with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.CONVERTER_PACKAGE}"):
@@ -45,7 +45,7 @@ def test_without_the_program_nothing_is_written(monkeypatch: pytest.MonkeyPatch,
     ],
     ids=["fails", "says no error", "writes nothing", "does not end"],
 )
-def test_a_program_that_fails_is_one_line(
+def test_a_failure_of_the_program_is_one_line(
     script: str, limit: float, said: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(splat_transform, "TIME_LIMIT", limit)

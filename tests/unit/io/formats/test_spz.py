@@ -1,4 +1,4 @@
-"""``.spz`` of all versions: what Niantic's own program writes, older and newer ones, damage, and a missing library."""
+"""All versions of ``.spz`` are read, and damaged files are refused."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NIANTIC = bytes.fromhex(
 )
 
 
-def some(degree: int, count: int = 50) -> Gaussians:
+def some_gaussians(degree: int, count: int = 50) -> Gaussians:
     rng = np.random.default_rng(degree)
     quats = rng.normal(size=(count, 4))
     columns = (
@@ -50,7 +50,7 @@ def some(degree: int, count: int = 50) -> Gaussians:
     return Gaussians(*(column.astype(np.float32) for column in columns))
 
 
-def test_what_niantic_writes(tmp_path: Path) -> None:
+def test_a_spz_of_niantic_is_read(tmp_path: Path) -> None:
     (tmp_path / "a.spz").write_bytes(NIANTIC)
     ply = read_gaussians(tmp_path / "a.spz")
     actual = ply.gaussians
@@ -66,7 +66,7 @@ def test_what_niantic_writes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_older_spz(version: int, tmp_path: Path) -> None:
+def test_older_versions_of_spz_are_read(version: int, tmp_path: Path) -> None:
     position = struct.pack("<3e", 1.5, -2, 0.25) if version == 1 else b"".join(
         int(v * 4096).to_bytes(3, "little", signed=True) for v in (1.5, -2, 0.25)
     )  # fmt: skip
@@ -84,17 +84,17 @@ def test_older_spz(version: int, tmp_path: Path) -> None:
 def test_version_2_has_rotations_of_a_byte_each(tmp_path: Path) -> None:
     """All else is as in version 3."""
     for version in (2, 3):
-        contents = Contents([some(3)], options=FileOptions(spz_version=version))
-        (tmp_path / f"{version}.spz").write_bytes(encode_contents(some(3), contents))
+        contents = Contents([some_gaussians(3)], options=FileOptions(spz_version=version))
+        (tmp_path / f"{version}.spz").write_bytes(encode_contents(some_gaussians(3), contents))
     old, new = (read_gaussians(tmp_path / f"{version}.spz") for version in (2, 3))
     assert old.info.layout == ".spz version 2, SH degree 3"
-    assert float(np.abs((old.gaussians.quats * some(3).quats).sum(1)).min()) > 0.99
+    assert float(np.abs((old.gaussians.quats * some_gaussians(3).quats).sum(1)).min()) > 0.99
     for name in ("means", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(old.gaussians, name), getattr(new.gaussians, name))
 
 
-def test_harmonics_of_degree_4(tmp_path: Path) -> None:
-    path, gaussians = tmp_path / "a.spz", some(4)
+def test_harmonics_of_degree_4_are_read_in_version_4(tmp_path: Path) -> None:
+    path, gaussians = tmp_path / "a.spz", some_gaussians(4)
     path.write_bytes(spz4_bytes(gaussians, mip=True))
     ply = read_gaussians(path)
     assert ply.info.bytes_by_attribute["shN"] == 72 * len(gaussians)
@@ -107,9 +107,11 @@ def test_harmonics_of_degree_4(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("more", [b"", struct.pack("<2I3f", 0xADBE0002, 12, 0, 1, 2), axes_record(0), axes_record(6)])
 @pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
-def test_extensions_that_change_nothing(tmp_path: Path, write: Callable[[Gaussians], bytes], more: bytes) -> None:
+def test_extensions_without_an_effect_change_nothing(
+    tmp_path: Path, write: Callable[[Gaussians], bytes], more: bytes
+) -> None:
     """Limits of an orbit, and axes that say nothing or are those of a ``.ply``."""
-    for name, data in {"plain": write(some(1)), "more": add_record(write(some(1)), more)}.items():
+    for name, data in {"plain": write(some_gaussians(1)), "more": add_record(write(some_gaussians(1)), more)}.items():
         (tmp_path / f"{name}.spz").write_bytes(data)
     plain, extended = (read_gaussians(tmp_path / f"{name}.spz") for name in ("plain", "more"))
     assert file_notes(extended.info) == ()
@@ -123,7 +125,7 @@ def test_axes_are_turned_to_those_of_a_ply(
     tmp_path: Path, write: Callable[[Gaussians], bytes], number: int, axes: str
 ) -> None:
     """Of both hands: world directions of positions, ellipsoids and colours stay the same."""
-    content, orbit = write(some(2)), struct.pack("<2I3f", 0xADBE0002, 12, 0, 1, 2)
+    content, orbit = write(some_gaussians(2)), struct.pack("<2I3f", 0xADBE0002, 12, 0, 1, 2)
     (tmp_path / "plain.spz").write_bytes(content)
     (tmp_path / "axes.spz").write_bytes(add_record(content, orbit + axes_record(number)))
     plain, ply = read_gaussians(tmp_path / "plain.spz").gaussians, read_gaussians(tmp_path / "axes.spz")
@@ -142,7 +144,7 @@ def test_axes_are_turned_to_those_of_a_ply(
 
 
 @pytest.mark.parametrize(("how", "word"), [((9, zlib.Z_DEFAULT_STRATEGY), b"\2"), ((1, zlib.Z_RLE), b"\4")])
-def test_streams_name_no_time_and_the_same_system(how: tuple[int, ...], word: bytes) -> None:
+def test_gzip_streams_are_the_same_at_any_time_on_any_system(how: tuple[int, ...], word: bytes) -> None:
     """Python 3.10 to 3.13 write one of two systems into what ``gzip.compress`` returns."""
     data = spz_bytes(corners())
     actual = gzip_bytes([data], level=how[0], strategy=how[1])
@@ -151,8 +153,8 @@ def test_streams_name_no_time_and_the_same_system(how: tuple[int, ...], word: by
     assert data[:10] == gzip_bytes([b""])[:10]
 
 
-def test_a_wrong_version_leaks_no_warning(tmp_path: Path) -> None:
-    data = gzip.decompress(spz_bytes(some(0, 2000)))
+def test_a_spz_of_a_wrong_version_raises_no_warning(tmp_path: Path) -> None:
+    data = gzip.decompress(spz_bytes(some_gaussians(0, 2000)))
     (tmp_path / "a.spz").write_bytes(gzip.compress(data[:4] + struct.pack("<I", 1) + data[8:]))
     assert 0 < read_gaussians(tmp_path / "a.spz").info.num_nonfinite < 2000  # warnings are errors in tests
 
@@ -165,9 +167,9 @@ def checked_spz4(gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch) -> bytes
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_what_a_checksum_sees_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int) -> None:
+def test_damage_that_a_checksum_shows_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int) -> None:
     """One wrong bit anywhere in the compressed columns, or a stream without its end."""
-    content = spz_bytes(some(0)) if version == 3 else checked_spz4(some(0), monkeypatch)
+    content = spz_bytes(some_gaussians(0)) if version == 3 else checked_spz4(some_gaussians(0), monkeypatch)
     start = 10 if version == 3 else 32 + 5 * 16  # of what is compressed
     flipped = [content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :] for at in range(start, len(content))]
     for damaged in (*flipped, content[:-1], content[:-4], content[:-8]):
@@ -178,15 +180,15 @@ def test_what_a_checksum_sees_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
 @pytest.mark.parametrize(("num_more", "is_doubtful"), [(15, False), (16, True)])
-def test_bytes_after_the_streams(
+def test_more_than_padding_after_the_streams_is_a_doubt(
     tmp_path: Path, write: Callable[[Gaussians], bytes], num_more: int, is_doubtful: bool
 ) -> None:
-    (tmp_path / "a.spz").write_bytes(write(some(0)) + bytes(num_more))
+    (tmp_path / "a.spz").write_bytes(write(some_gaussians(0)) + bytes(num_more))
     notes = file_notes(read_gaussians(tmp_path / "a.spz").info)
     assert [note.startswith("16 bytes follow") for note in list_doubts(notes)] == [True] * is_doubtful
 
 
-def test_blocks_of_rows_make_the_same_file(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_size_of_blocks_does_not_change_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = {writer: writer(corners()) for writer in (spz_bytes, splat_bytes, glb_bytes)}
     monkeypatch.setattr("gsmerge.io.formats.arrays.BLOCK_ROWS", 3)
     assert {writer: writer(corners()) for writer in whole} == whole

@@ -1,4 +1,4 @@
-"""Streamed SOG: written by splat-transform or a stand-in, read, replaced whole; damage in one line."""
+"""Streamed SOG is written by splat-transform or a stand-in, read, and replaced as a whole."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def scene() -> Scene:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_a_small_level_is_the_sog_of_the_same(degree: int, scene: Scene, tmp_path: Path) -> None:
+def test_a_level_is_read_as_a_sog_of_its_gaussians(degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, degree)
     write_set(tmp_path / "lod-meta.json", [gaussians, gaussians[::4]], mip=True)
     for level, own in enumerate((gaussians, gaussians[::4])):
@@ -46,7 +46,7 @@ def test_a_small_level_is_the_sog_of_the_same(degree: int, scene: Scene, tmp_pat
     assert len(read_gaussians(tmp_path / "lod-meta.json").gaussians) == len(gaussians)
 
 
-def test_other_files_beside_a_chunk_do_not_count(scene: Scene, tmp_path: Path) -> None:
+def test_other_files_beside_a_chunk_do_not_count_as_bytes(scene: Scene, tmp_path: Path) -> None:
     """They would raise the memory that reading may take."""
     write_set(tmp_path / "lod-meta.json", [drawn(scene, 1)])
     before = read_gaussians(tmp_path / "lod-meta.json").info.file_bytes
@@ -69,7 +69,7 @@ def test_a_tree_and_an_environment_are_read(scene: Scene, tmp_path: Path) -> Non
 
 
 @needs_program()
-def test_the_program_writes_each_level(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_splat_transform_writes_each_level(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gaussians, index = drawn(scene, 1), tmp_path / "scene" / "lod-meta.json"
     levels = [gaussians, gaussians[::4], gaussians[::16]]
     write_levels(index, levels, comments=["SplatRenderMode: mip"])
@@ -87,18 +87,18 @@ def test_the_program_writes_each_level(scene: Scene, tmp_path: Path, capsys: pyt
     assert {path.name for path in index.parent.iterdir()} == {index.name, *used}
 
 
-def content(folder: Path) -> dict[str, bytes]:
+def files_in(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
 def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stand-in for it."""
+    """Put a stand-in for splat-transform in its place."""
     run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
 
 
 @pytest.mark.slow
-def test_failures_leave_existing_files_and_nothing_else(tmp_path: Path, program: None) -> None:
+def test_failures_leave_only_existing_files(tmp_path: Path, program: None) -> None:
     index = tmp_path / "scene" / "lod-meta.json"
     bad = corners()
     bad.opacities[1] = np.nan
@@ -107,19 +107,19 @@ def test_failures_leave_existing_files_and_nothing_else(tmp_path: Path, program:
             write_levels(index, levels)
     assert not index.parent.exists()
     write_levels(index, [corners()])
-    before = content(tmp_path)
+    before = files_in(tmp_path)
     with refuses(SceneError, "lod-meta.json", "exists"):
         write_levels(index, [corners()])
     with refuses(ValueError, "", "finite", 1):
         write_levels(index, [bad], overwrite=True)
-    assert content(tmp_path) == before
+    assert files_in(tmp_path) == before
     with refuses(SceneError, "scene", *NO_FOLDER):
         write_levels(index / "scene" / "lod-meta.json", [corners()])
     with refuses(UsageError, "levels.json", "lod-meta.json"):
         write_levels(tmp_path / "levels.json", [corners()])
 
 
-def test_a_set_is_replaced_whole(tmp_path: Path, program: None) -> None:
+def test_a_streamed_set_is_replaced_as_a_whole(tmp_path: Path, program: None) -> None:
     """The chunks of the old one go, whatever else is in the folder stays."""
     index, alone = tmp_path / "scene" / "lod-meta.json", tmp_path / "alone" / "lod-meta.json"
     write_levels(index, [corners(), corners()[:2], corners()[:1]])
@@ -130,11 +130,11 @@ def test_a_set_is_replaced_whole(tmp_path: Path, program: None) -> None:
         (index.parent / name).write_bytes(data)
     for path in (index, alone):
         write_levels(path, [corners(), corners()[:1]], overwrite=True)
-    assert content(index.parent) == {**content(alone.parent), **mine}
+    assert files_in(index.parent) == {**files_in(alone.parent), **mine}
 
 
 @pytest.mark.parametrize("call", [0, 8])
-def test_an_index_names_no_chunk_of_another(
+def test_a_failed_rename_leaves_the_old_set_whole(
     call: int, tmp_path: Path, program: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whichever rename fails: the old set is whole, and so is the new one after the next run."""
@@ -154,7 +154,9 @@ def test_an_index_names_no_chunk_of_another(
     assert len(read_gaussians(index).gaussians) == 3
 
 
-def test_without_the_program_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_levels_without_the_program_are_refused_with_the_command_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(VARIABLE, str(tmp_path / "none"))
     with refuses(UsageError, "splat-transform", f"npm install -g {splat_transform.CONVERTER_PACKAGE}"):
         output_format("lod-meta.json")
@@ -163,7 +165,7 @@ def test_without_the_program_one_line_says_how_to_get_it(tmp_path: Path, monkeyp
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_name_chooses_the_format_where_levels_are_written(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_name_chooses_the_format_where_levels_are_written(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, sys.executable)  # any program that exists
     assert output_format("scene/lod-meta.json").ending == "lod-meta.json"
     for name, alone in {"scene/lod-meta.json": True, "my-lod-meta.json": False, "LOD-meta.json": False}.items():
@@ -171,7 +173,7 @@ def test_the_name_chooses_the_format_where_levels_are_written(monkeypatch: pytes
             output_format(name, alone=alone)
 
 
-def test_check_reads_all_levels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspecting_reads_all_levels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_set(tmp_path / "lod-meta.json", [corners(), corners()[:1]])
     assert main(["inspect", str(tmp_path / "lod-meta.json")]) == 0
     assert "3 + 1 Gaussians at 2 levels" in capsys.readouterr().out

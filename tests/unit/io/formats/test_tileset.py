@@ -25,7 +25,7 @@ POLAR_RADIUS = 6356752.314245  # metres, of WGS 84
 
 @pytest.fixture(scope="module")
 def room() -> Gaussians:
-    """A room, and one of its Gaussians far away."""
+    """Make a room with one of its Gaussians far away."""
     gaussians = scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36)).gaussians
     means = gaussians.means.copy()
     means[7] = 900, 0, 0
@@ -50,7 +50,7 @@ def test_the_tile_holds_the_bytes_of_a_spz(room: Gaussians, tmp_path: Path) -> N
             np.testing.assert_array_equal(column, getattr(expected, name))
 
 
-def test_a_far_gaussian_does_not_enlarge_its_bounds(room: Gaussians, tmp_path: Path) -> None:
+def test_a_far_gaussian_does_not_enlarge_the_bounds_of_a_tileset(room: Gaussians, tmp_path: Path) -> None:
     box = json.loads(convert(room, tmp_path).read_text())["root"]["boundingVolume"]["box"]
     centre, halves = np.array(box[:3]), np.reshape(box[3:], (3, 3))
     assert np.array_equal(halves, np.diag(np.diag(halves)))
@@ -61,7 +61,7 @@ def test_a_far_gaussian_does_not_enlarge_its_bounds(room: Gaussians, tmp_path: P
     assert halves.max() < 20
 
 
-def test_a_place_on_the_globe(room: Gaussians, tmp_path: Path) -> None:
+def test_a_place_on_the_globe_is_the_transform_of_a_tileset(room: Gaussians, tmp_path: Path) -> None:
     stored = json.loads(convert(room, tmp_path, "10,50,100").read_text())["root"]["transform"]
     matrix = np.reshape(stored, (4, 4)).T @ np.diag([-1, -1, 1, 1])  # half a turn, so that photos look north
     np.testing.assert_array_equal(matrix, globe_matrix("10,50,100"))
@@ -74,12 +74,12 @@ def test_a_place_on_the_globe(room: Gaussians, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["8.5,47.4", "200,47,0", "8,97,0", "8,47,inf", "a,b,c", ""])
-def test_places_that_are_none(place: str) -> None:
+def test_impossible_places_on_the_globe_are_refused(place: str) -> None:
     with refuses(ValueError, "place", "LON", repr(place)):
         FileOptions(place=place)
 
 
-def test_what_viewers_see_on_its_side_is_noted(room: Gaussians, tmp_path: Path) -> None:
+def test_a_scene_that_viewers_see_on_its_side_is_noted(room: Gaussians, tmp_path: Path) -> None:
     cameras = scenes.arc(2)
     turned = replace(cameras, viewmats=cameras.viewmats[:, [1, 0, 2, 3]])
     assert frame_notes(Outputs(tmp_path / "a.glb"), cameras) == []
@@ -89,7 +89,7 @@ def test_what_viewers_see_on_its_side_is_noted(room: Gaussians, tmp_path: Path) 
     assert frame_notes(Outputs(tmp_path / "a.ply"), turned) == []
 
 
-def test_its_size_is_at_most_what_a_budget_counts(room: Gaussians, tmp_path: Path) -> None:
+def test_the_size_of_a_tileset_is_at_most_what_a_budget_counts(room: Gaussians, tmp_path: Path) -> None:
     out = convert(room, tmp_path, "-179.123456,-89.123456,1234567.891")
     assert out.stat().st_size + out.with_name("tileset.glb").stat().st_size <= most_bytes(room, NO_CAMERAS, ())
 
@@ -103,7 +103,9 @@ def test_its_size_is_at_most_what_a_budget_counts(room: Gaussians, tmp_path: Pat
         ("0,45,0", (4517590.8788, 0, 4487348.4088), (-(0.5**0.5), 0, 0.5**0.5)),  # as geodetic tables give it
     ],
 )
-def test_frames_on_the_ellipsoid(place: str, position: tuple[float, ...], north: tuple[float, ...]) -> None:
+def test_frames_on_the_globe_are_those_of_geodetic_tables(
+    place: str, position: tuple[float, ...], north: tuple[float, ...]
+) -> None:
     matrix = globe_matrix(place)
     np.testing.assert_allclose(matrix[:3, 3], position, atol=1e-3)
     np.testing.assert_allclose(matrix[:3, 1], north, atol=1e-12)
@@ -125,7 +127,7 @@ def test_other_tilesets_are_refused(tmp_path: Path, document: object) -> None:
         read_gaussians(tmp_path / "tileset.json")
 
 
-def test_a_tile_that_states_bytes_it_does_not_have(room: Gaussians, tmp_path: Path) -> None:
+def test_a_tile_that_states_bytes_it_lacks_is_refused(room: Gaussians, tmp_path: Path) -> None:
     tile = convert(room, tmp_path).with_name("tileset.glb")
     content = tile.read_bytes()
     length = str(len(spz_bytes(read_gaussians(tmp_path / "a.ply").gaussians))).encode()

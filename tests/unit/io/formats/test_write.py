@@ -1,4 +1,4 @@
-"""Formats of results: read back by slow, obvious readers, and by splat-transform where that is installed."""
+"""Slow, obvious readers, and splat-transform where it is installed, read back what is written."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def psnr(scene: Scene, one: Gaussians, other: Gaussians) -> float:
 
 
 @pytest.mark.parametrize(("ending", "degree"), FLOORS)
-def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
+def test_a_file_that_is_read_back_shows_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians, path = drawn(scene, degree), tmp_path / f"a{ending}"
     write_gaussians(path, gaussians)
     actual = read_back(path)
@@ -67,7 +67,7 @@ def test_a_compressed_ply_is_read_and_not_written(scene: Scene, tmp_path: Path) 
 
 @needs_program()
 @pytest.mark.parametrize(("ending", "degree"), FLOORS)
-def test_splat_transform_reads_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
+def test_splat_transform_reads_what_our_readers_read(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians, path, back = drawn(scene, degree), tmp_path / f"a{ending}", tmp_path / "back.ply"
     write_gaussians(path, gaussians)
     subprocess.run([find_program(), "-q", str(path), str(back)], check=True, capture_output=True)
@@ -85,7 +85,7 @@ def test_the_same_gaussians_give_the_same_bytes(ending: str, scene: Scene, tmp_p
 
 
 @pytest.mark.parametrize("ending", [".ply", *QUANTISED])
-def test_extremes_stay_finite(ending: str, tmp_path: Path) -> None:
+def test_extremes_are_read_back_as_finite_numbers(ending: str, tmp_path: Path) -> None:
     write_gaussians(tmp_path / f"a{ending}", corners())
     actual = read_back(tmp_path / f"a{ending}")
     for name, array in vars(actual).items():
@@ -110,7 +110,7 @@ def test_rotations_are_the_same_up_to_a_sign(ending: str, tmp_path: Path) -> Non
     assert float(np.abs(actual.means - means).max()) < 0.5
 
 
-def test_harmonics_without_room_are_noted() -> None:
+def test_harmonics_that_a_format_cannot_store_are_noted() -> None:
     assert limit_notes("a.ply", 3, 1) == []
     assert noted(limit_notes("a.ply", 4, 1), "above degree 3", ".ply")
     assert limit_notes("a.spz", 3, 1) == []
@@ -125,12 +125,14 @@ def test_more_gaussians_than_readers_take_are_noted() -> None:
 
 
 @pytest.mark.parametrize(("ending", "degree"), [(".ply", 3), (".spz", 3), (".sog", 3), (".splat", 0)])
-def test_a_higher_degree_loses_its_top(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
+def test_harmonics_above_the_degree_of_a_format_are_left_out(
+    ending: str, degree: int, scene: Scene, tmp_path: Path
+) -> None:
     write_gaussians(tmp_path / f"a{ending}", drawn(scene, 4))
     assert read_back(tmp_path / f"a{ending}").sh_degree == degree
 
 
-def test_names_ask_for_formats() -> None:
+def test_the_file_name_chooses_the_format() -> None:
     for name, ending in (("a.ply", ".ply"), ("A.SPZ", ".spz"), ("x/b.splat", ".splat")):
         assert output_format(name, alone=True).ending == ending
     for name in ("a", "a.ksplat", "ply", "a.ply.gz", "spz/a"):
@@ -139,7 +141,7 @@ def test_names_ask_for_formats() -> None:
 
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
-def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: Path) -> None:
+def test_failures_leave_only_existing_files(ending: str, tmp_path: Path) -> None:
     bad, path = replace(corners(), opacities=np.array([0.0, float("nan"), 0.5], np.float32)), tmp_path / f"a{ending}"
     with refuses(ValueError, "", "finite", 1):
         write_gaussians(path, bad)
@@ -154,14 +156,17 @@ def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: P
     assert [one.read_text() for one in tmp_path.iterdir()] == ["precious"]
 
 
-def test_comments_reach_the_headers(tmp_path: Path) -> None:
+def test_comments_are_written_into_the_header(tmp_path: Path) -> None:
     write_gaussians(tmp_path / "a.ply", corners(), comments=["SplatRenderMode: mip"])
     assert "SplatRenderMode: mip" in read_ply(tmp_path / "a.ply").info.comments
+
+
+def test_a_comment_of_two_lines_is_refused(tmp_path: Path) -> None:
     with refuses(ValueError, "comments", "ASCII"):
         write_gaussians(tmp_path / "b.spz", corners(), comments=["two\nlines"])
 
 
-def test_comments_that_no_reader_takes(tmp_path: Path) -> None:
+def test_more_comments_than_readers_take_are_refused(tmp_path: Path) -> None:
     lines = ["gsmerge cameras: " + "A" * 900] * 500
     write_gaussians(tmp_path / "a.ply", corners(), comments=lines)
     assert len(read_ply(tmp_path / "a.ply").gaussians) == len(corners())
@@ -169,7 +174,7 @@ def test_comments_that_no_reader_takes(tmp_path: Path) -> None:
         write_gaussians(tmp_path / "b.ply", corners(), comments=2 * lines)
 
 
-def test_no_normals_is_the_same_without_twelve_bytes(scene: Scene, tmp_path: Path) -> None:
+def test_a_ply_without_normals_saves_twelve_bytes_a_gaussian(scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, 1)
     for name, normals in {"with": True, "without": False}.items():
         write_gaussians(tmp_path / f"{name}.ply", gaussians, normals=normals)
@@ -187,7 +192,7 @@ def with_harmonics(gaussians: Gaussians, degree: int) -> Gaussians:
     return replace(gaussians, shN=shN.astype(np.float32))
 
 
-def test_the_layout_is_inrias(tmp_path: Path, tiny: Tiny) -> None:
+def test_the_layout_of_a_ply_is_that_of_inria(tmp_path: Path, tiny: Tiny) -> None:
     gaussians = with_harmonics(tiny.gaussians, 1)
     write_ply(tmp_path / "a.ply", gaussians)
     data = PlyData.read(str(tmp_path / "a.ply"))
@@ -206,7 +211,7 @@ def test_the_layout_is_inrias(tmp_path: Path, tiny: Tiny) -> None:
     assert not vertex["nx"].any()
 
 
-def test_tensors_are_written_alike(tmp_path: Path, tiny: Tiny, torch: object) -> None:
+def test_tensors_are_written_as_arrays_are(tmp_path: Path, tiny: Tiny, torch: object) -> None:
     write_ply(tmp_path / "a.ply", tiny.gaussians)
     tensors = tiny.gaussians.to("cpu")
     write_ply(tmp_path / "b.ply", replace(tensors, means=tensors.means.clone().requires_grad_()))
@@ -219,11 +224,14 @@ def test_harmonics_are_dropped_on_demand(tmp_path: Path, tiny: Tiny) -> None:
     assert np.array_equal(read_ply(tmp_path / "a.ply").gaussians.shN, gaussians.shN[:, :3])
     write_ply(tmp_path / "b.ply", gaussians, sh_degree=0)
     assert read_ply(tmp_path / "b.ply").info.layout == "17-column export"
+
+
+def test_a_degree_above_that_of_the_gaussians_is_refused(tmp_path: Path, tiny: Tiny) -> None:
     with refuses(ValueError, "sh_degree", "0 to 3", 4):
-        write_ply(tmp_path / "c.ply", gaussians, sh_degree=4)
+        write_ply(tmp_path / "c.ply", with_harmonics(tiny.gaussians, 3), sh_degree=4)
 
 
-def test_extremes_are_written_as_finite_numbers(tmp_path: Path, tiny: Tiny) -> None:
+def test_extremes_are_stored_as_finite_numbers(tmp_path: Path, tiny: Tiny) -> None:
     few = tiny.gaussians[:3]
     extreme = replace(
         few,
@@ -242,7 +250,7 @@ def test_extremes_are_written_as_finite_numbers(tmp_path: Path, tiny: Tiny) -> N
     assert back.quats[2].tolist() == pytest.approx([0, 0, -0.6, 0.8], abs=1e-6)
 
 
-def test_impossible_values_are_refused(tmp_path: Path, tiny: Tiny) -> None:
+def test_values_that_are_impossible_are_not_written(tmp_path: Path, tiny: Tiny) -> None:
     odd = dict.fromkeys(("means", "scales", "opacities", "sh0", "quats"), np.nan)
     for field, value in [*odd.items(), ("opacities", 1.5), ("scales", -1.0)]:
         values = getattr(tiny.gaussians, field).copy()
