@@ -57,7 +57,10 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
 
 
 def explain_misalignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> str | None:
-    """Describe another order, in which the rows would be the pixels of the cameras; None if there is none."""
+    """Describe another order, in which the rows would be the pixels of the cameras; None if there is none.
+
+    ``valid [n]`` is True for rows that are visible Gaussians.
+    """
     views, width, height = len(cameras), cameras.width, cameras.height
     rows = np.arange(len(gaussians))
     orders = {

@@ -406,8 +406,8 @@ def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
 def robust_weights(errors: np.ndarray, multiple: float, least: float, units: np.ndarray | float = 1.0) -> np.ndarray:
     """Return Cauchy's weights ``[n]`` for reweighted least squares, which are small for errors far above the median.
 
-    The weights are ``1 / (units^2 (1 + (errors / limit)^2))`` with ``limit = multiple * median + least``. ``units`` are
-    the units of the residuals to which the weights apply.
+    The weights are ``1 / (units^2 (1 + (errors / limit)^2))`` with ``limit = multiple * median + least``. The
+    weights are for residuals in ``units``.
     """
     return np.asarray(1 / (units**2 * (1 + (errors / (multiple * median(errors) + least)) ** 2)))
 

@@ -322,6 +322,7 @@ def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Pa
     Files of a neighbouring scene do not count. Masks count only if they have the names of the scene's photos. Returns
     the paths, each with its option.
     """
+    # Of the roots that contain the scene, the least is the uppermost: a path sorts before the paths inside it
     folder = min(filter(Path(os.path.realpath(files.ply)).is_relative_to, roots), default=roots[0]).parent
     places = dict[str, Path | None]()
     with suppress(SceneError, OSError):

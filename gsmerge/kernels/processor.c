@@ -2,7 +2,7 @@
 #include "native.h"
 
 // Hash of the sources that the library was made of.
-API const char *sources_hash = SOURCES_HASH;
+API const char *const sources_hash = SOURCES_HASH;
 
 #ifdef __x86_64__
 static inline void ask(uint32_t leaf, uint32_t *a, uint32_t *b, uint32_t *c, uint32_t *d) {

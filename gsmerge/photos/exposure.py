@@ -200,7 +200,8 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
 def choose_partners(distances: np.ndarray) -> np.ndarray:
     """Choose the views ``[v,p]``, ascending, with which each view is compared: all others, or p of them.
 
-    The nearest ones share the most surfaces. Farther ones, at equal steps of rank, connect groups of cameras.
+    ``distances [v,v]`` are those between the cameras. The nearest views share the most surfaces. Farther views, at
+    equal steps of rank, connect groups of cameras.
     """
     order = order_others(distances)
     if order.shape[1] > NEAREST_VIEWS + FARTHER_VIEWS:

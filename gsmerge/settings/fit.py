@@ -21,7 +21,7 @@ GROW_ROUNDS = 2
 
 @dataclass(frozen=True)
 class Tuning:
-    """Constants of the fit, which were chosen on training scenes. Only tests and research change them."""
+    """Constants of the fit, which were chosen on training scenes. They are no options: runs change a few themselves."""
 
     means_lr: float = 0.1  # Step size of a mean, in units of the Gaussian's size
     scales_lr: float = 0.2  # Step size of a log scale

@@ -32,10 +32,10 @@ def decode(
     """Decode each Feature Gaussian into K Gaussians, which are its children.
 
     The members are halved repeatedly across their widest direction in colour and position, and each part becomes a
-    child. So the children for K = 2 are unions of those for K = 4, and equal members give fewer children. Networks with
-    absolute outputs do not halve, but make exactly K children of every group. ``counts [g]`` has a K of at least 1 for
-    each group. Without it, K is ``options.max_k``. The children of a group are adjacent. Children that are fainter than
-    ``options.min_opacity`` are left out.
+    child. So the children for K = 2 are unions of those for K = 4. Members with the same position and colour cannot be
+    halved, so their group has fewer children. Networks with absolute outputs do not halve, but make exactly K children
+    of every group. ``counts [g]`` has a K of at least 1 for each group. Without it, K is ``options.max_k``. The
+    children of a group are adjacent. Children that are fainter than ``options.min_opacity`` are left out.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)

@@ -39,10 +39,11 @@ merge_costs = declare(
 
 
 def _first_ceiling(pairs, rows, share):
-    """Estimate the cost above which edges are put aside, slightly above that of the last merge.
+    """Estimate the cost of the last merge, slightly too high; edges that cost more are put aside at first.
 
-    Merges remove the ``share`` of the regions. In photos with 1.5 to 3 times as many regions as wanted, about the same
-    share of the edges costs less at the start than the last merge does.
+    ``pairs [e,2]`` are the edges between regions, ``rows`` the sums of each region, and ``share`` is the part of the
+    regions that merging removes. The estimate is the quantile ``share`` of the costs of all edges. That is near the
+    cost of the last merge in photos with 1.5 to 3 times as many regions as wanted.
     """
     sample_edges = 4096  # the ceiling is estimated from the costs of about this many edges
     step = max(1, len(pairs) // sample_edges)

@@ -96,7 +96,7 @@ def differentiate_base(features: FeatureGaussians) -> Gaussians:
 
 
 def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
-    """Compute the networks' inputs for Feature Gaussians as tensors with a gradient.
+    """Compute the networks' inputs for Feature Gaussians as tensors, so that a loss can be differentiated by them.
 
     ``inputs`` are the arrays that the kernels made: views, footprints and statistics are taken from them.
     """
