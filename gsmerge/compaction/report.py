@@ -36,13 +36,16 @@ class Covered:
 def compared_psnr(
     covered: Covered | None, before: float | None, after: float | None
 ) -> tuple[float | None, float | None]:
-    """Return the PSNR (dB) of input and result to compare: over covered pixels, if the input lacks some."""
+    """Return the PSNR (dB) of input and result that are compared with each other.
+
+    They are those over the pixels that the input covers, if it does not cover all.
+    """
     return (before, after) if covered is None else (covered.before, covered.after)
 
 
 @dataclass(frozen=True)
 class PhotoFiles:
-    """PSNR on the photos as their files have them, if a run changed their colours or what covers them.
+    """PSNR on the photos as they are in their files, if a run changed the colours of photos or removed objects.
 
     Args:
         before: Mean PSNR (dB) of the input views rendered from the input.
@@ -124,7 +127,7 @@ class CompactReport:
         return asdict(self) | {"doubts": self.doubts}
 
     def _facts(self) -> list[tuple[str, str]]:
-        """List the main facts, each with its name."""
+        """Return the main facts for ``repr``, each with its name."""
         share = human_share(self.num_output / max(1, self.num_input))
         facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share})")]
         if new := self.new_views:
@@ -211,13 +214,16 @@ def report_document(
 
 
 def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Sequence[Path]]) -> dict[str, Any]:
-    """Return path, bytes and number of Gaussians of an output, whose temporary files are in ``at`` if it has some."""
+    """Return path, bytes and number of Gaussians of an output.
+
+    ``at`` has the temporary files of outputs that are not renamed yet.
+    """
     num_bytes = sum(file.stat().st_size for file in at.get(path, [path]))
     return {"path": os.fspath(path), "bytes": num_bytes, "num_gaussians": report.num_output}
 
 
 def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """List the figures of a result: for each its name, the values before and after, and a short explanation."""
+    """Return the rows of the table of a result: a name, the value before and after, and a short explanation."""
     files, psnr, choices = (document["input"], document["output"]), document["psnr_input_views"], document["choices"]
     counts, sizes = [f"{file['num_gaussians']:,}" for file in files], [human_bytes(file["bytes"]) for file in files]
     rows = [("Gaussians", counts[0], counts[1], human_share(document["ratio"])), ("file", sizes[0], sizes[1], "")]
@@ -245,23 +251,24 @@ def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]
 
 
 def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
-    """Return the closing table of ``compact`` in a terminal of ``columns`` characters, with a ``next_step`` if any.
+    """Return the lines that ``compact`` prints at its end: the path, a table, and the command to run next, if any.
 
-    Paths and the next step are never broken into lines, because people copy them.
+    Lines are broken at ``columns`` characters, except for paths and ``next_step``, which people copy.
     """
     rows = result_facts(document)
     figures = text_table([row[:3] for row in rows], "  ")
-    hang = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
-    lines = [(f"{left}  {row[3]}".rstrip(), hang) for left, row in zip(figures, rows, strict=True)]
+    # a line that is broken continues below its explanation, or below its first value in a narrow terminal
+    indent = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
+    lines = [(f"{left}  {row[3]}".rstrip(), indent) for left, row in zip(figures, rows, strict=True)]
     lines += [(line, 2) for line in (*level_lines(document), *curve_lines(document))]
-    wrapped = [part for line, hang in lines for part in wrap_line(line, columns, hang)]
-    last = {"cameras": document.get("viewer_cameras"), "next": next_step}
-    shown = [f"  {name:9}  {text}" for name, text in last.items() if text is not None]
-    return [document["output"]["path"], *wrapped, *shown]
+    wrapped = [part for line, indent in lines for part in wrap_line(line, columns, indent)]
+    last_texts = {"cameras": document.get("viewer_cameras"), "next": next_step}
+    last_lines = [f"  {name:9}  {text}" for name, text in last_texts.items() if text is not None]
+    return [document["output"]["path"], *wrapped, *last_lines]
 
 
 def _describe_fidelity_views(fidelity: Mapping[str, Any]) -> str:
-    """Say in which views the PSNR against the input was measured."""
+    """Return words for the views in which the PSNR against the input was measured."""
     return f"from the input in {fidelity['views']} {'held-out' if fidelity['held_out'] else 'of its'} views"
 
 
@@ -269,17 +276,21 @@ def level_lines(document: Mapping[str, Any]) -> list[str]:
     """Return one line of text for each coarser level of detail."""
     return [
         f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
-        + (f"; {_name_pictures(document)} {psnr_figure(psnr, level['choices'])}" if psnr is not None else "")
+        + (
+            f"; {_name_pictures(document)} {psnr_figure(level['psnr_input_views'], level['choices'])}"
+            if level["psnr_input_views"] is not None
+            else ""
+        )
         + f"; {level['seconds']:.1f} s"
-        for level, psnr in ((level, level["psnr_input_views"]) for level in document["levels"])
+        for level in document["levels"]
     ]
 
 
 def curve_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return the scene's curve as a small table: by the number of Gaussians, PSNR and SSIM of a short fit.
+    """Return the scene's curve as a table: a row for each number of Gaussians, with PSNR and SSIM of a short fit.
 
-    They are measured on photos, or patches of photos, that the fit left out. The row nearest to the number of Gaussians
-    in the result is marked; the result may lie between two rows.
+    The scores are measured on photos, or patches of photos, that the fits left out. The row nearest to the number of
+    Gaussians in the result is marked. Empty if no curve was measured.
     """
     points, count = document["choices"].get("curve"), document["output"]["num_gaussians"]
     if not points:
@@ -299,17 +310,17 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:
-    """Return the PSNR on the photos as their files have them; None if both figures equal those on changed photos.
+    """Return the PSNR on the photos as they are in their files, before and after.
 
-    They are compared as printed.
+    None if that would print the same numbers as the PSNR on the photos that the run changed.
     """
-    files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
-    if files is None or own["after"] is None or any(f"{files[name]:.2f}" != f"{own[name]:.2f}" for name in own):
-        return files
+    on_files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
+    if on_files is None or own["after"] is None or any(f"{on_files[name]:.2f}" != f"{own[name]:.2f}" for name in own):
+        return on_files
     return None
 
 
 def _name_pictures(document: Mapping[str, Any]) -> str:
-    """Name the pictures that a result was fitted to, such as its own photos."""
+    """Return words for the pictures that a result was fitted to, such as "its own photos"."""
     reference = document.get("psnr_reference")
     return "its own photos" if reference in (None, "photos") else str(reference)
