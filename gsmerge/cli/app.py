@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 DEBUG = "--debug"
 
-# Panel of the help -> commands. A command NAME is the function NAME of the module NAME_command; others are plugins
+# Panel of the help -> commands. The command NAME is the function NAME of the module NAME_command
 COMMAND_GROUPS = {
     "Compact": ("compact", "convert"),
     "Many scenes, and views in batches": ("batch", "extend"),
@@ -51,7 +51,7 @@ PLUGIN_PANEL = "Added by other packages"
 
 
 def make_app(only: str | None = None) -> typer.Typer:
-    """Make the application with all commands, or with the command ``only``; other commands are then not imported."""
+    """Make the application with all commands, or with one command alone, so that no other one is imported."""
     app = typer.Typer(
         name=PROGRAM, cls=Group, pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -89,9 +89,9 @@ def make_app(only: str | None = None) -> typer.Typer:
 
 @lru_cache
 def make_command(only: str | None = None) -> Any:
-    """Make the Click command that parses the words and calls a command: any command, or ``only`` one.
+    """Make the Click command that parses the words of the command line and runs a command; ``only``: see `make_app`.
 
-    Typer's option that installs completion is removed, since it writes into the files of the shell. Its option that
+    Typer's option that installs completion is removed, because it changes files of the user's shell. The option that
     prints the completion stays.
     """
     command = typer.main.get_command(make_app(only))
@@ -106,12 +106,12 @@ def print_help(context: typer.Context) -> None:
 
 
 def _is_research(entry: EntryPoint) -> bool:
-    """Return True if a command is part of this package, False if it comes from another package."""
+    """Return whether a plugin is a research command of this package, and not a command of another package."""
     return entry.module.startswith("gsmerge.")
 
 
 def _command_of(words: list[str]) -> str | None:
-    """Return the name of the command to import; None: import all commands, to show the help or an error."""
+    """Return the name of the only command to import; None if all are needed, to show the help or an error."""
     name = words[0] if words else ""
     if name in (*OWN_COMMANDS, LAB, LOOK):
         return name
@@ -120,7 +120,7 @@ def _command_of(words: list[str]) -> str | None:
 
 
 def _is_scene(word: str) -> bool:
-    """Return whether the first word names a scene instead of a command: an existing path, or a file of Gaussians."""
+    """Return whether the first word is a scene instead of a command: an existing path, or the name of a scene file."""
     if word.startswith("-") or _command_of([word]) is not None:
         return False
     if os.path.lexists(word) or os.path.dirname(word):

@@ -42,7 +42,7 @@ class JsonLines:
             print(json.dumps({**event, **numbers}), file=sys.stderr, flush=True)
 
     def move(self, share: float | None) -> None:
-        """Set the share that is done, unless it is not known; it never decreases."""
+        """Set the share that is done, if it is known and not smaller than before."""
         if share is not None:
             self.share = max(self.share or 0.0, share)
             self.first = self.first or (self.seconds, self.share)
@@ -226,7 +226,7 @@ def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
 
 
 class RunEnd(NamedTuple):
-    """The end of one of many runs."""
+    """Facts about one of many runs, when it ends."""
 
     name: str
     status: str
@@ -238,7 +238,7 @@ class RunEnd(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Description, with the number of failures so far."""
+        """Name and status of the run, and the number of failures so far."""
         ending = {"skipped": "skipped, since it was done before"}.get(self.status, self.status)
         ending += ", doubtful" if list_doubts(self.notes) else ""
         return f"{self.name} {ending}{f', {self.num_failed} failed' if self.num_failed and not self.failure else ''}"

@@ -73,6 +73,6 @@ def _print_checks(args: opt.Args) -> None:
     lines = [check.line for check in checks if several or not check.problems]
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if wrong:
-        is_line_printed = several and not args.silent
-        problem = "refused, for the reason above" if is_line_printed else "; ".join(wrong[0].problems)
+        # the lines of several files have told their problems
+        problem = "refused, for the reason above" if several and not args.silent else "; ".join(wrong[0].problems)
         raise SceneError(wrong[0].path, problem, f"wrong files: {len(wrong)} of {len(checks)}" if several else "")

@@ -155,8 +155,9 @@ class Args(SimpleNamespace):
         from gsmerge.scene.read import load_files
 
         loaded: Loaded | None = vars(self).get("loaded")
-        is_loaded = loaded is not None and loaded.files == files
-        return loaded if is_loaded else load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
+        if loaded is None or loaded.files != files:
+            loaded = load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
+        return loaded
 
 
 def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]) -> dict[str, Any]:

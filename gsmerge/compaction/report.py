@@ -22,10 +22,10 @@ class Covered:
     """PSNR over the pixels of the input views that the input covers, if it does not cover all.
 
     Args:
-        share: Share of the scored pixels that the input covers. If a file lacks the rows of some pixels, it covers the
-            pixels that have a row; otherwise it covers the pixels in which its opacity is at least a half.
-        before: Mean PSNR (dB) of these pixels rendered from the input.
-        after: The same, rendered from the result.
+        share: Share of the scored pixels that the input covers. If a file has rows for some pixels only, it covers
+            these; otherwise it covers the pixels in which its opacity is at least a half.
+        before: Mean PSNR (dB) of the covered pixels, rendered from the input.
+        after: Mean PSNR (dB) of the covered pixels, rendered from the result.
     """
 
     share: float
@@ -45,11 +45,11 @@ def compared_psnr(
 
 @dataclass(frozen=True)
 class PhotoFiles:
-    """PSNR on the photos as they are in their files, if a run changed the colours of photos or removed objects.
+    """PSNR on the photos as they are in their files, if a run changed any photo.
 
     Args:
-        before: Mean PSNR (dB) of the input views rendered from the input.
-        after: The same, rendered from the result.
+        before: Mean PSNR (dB) of the input views, rendered from the input.
+        after: Mean PSNR (dB) of the input views, rendered from the result.
     """
 
     before: float
@@ -64,31 +64,33 @@ class CompactReport:
         num_input: Gaussians in the scene.
         num_output: Gaussians in the result.
         seconds: Wall time of each stage.
-        psnr_before: Mean PSNR (dB) of the input views rendered from the input; None if neither photos nor pixels are
-            known. Unless a quality was asked for, or the result may be worse, it is measured on a sample: a tenth of
-            the pixels of at most eight views. Then the gain is off by .3 dB (rms); :func:`gsmerge.evaluate` is exact.
+        psnr_before: Mean PSNR (dB) of the input views, rendered from the input; None if neither photos nor pixels are
+            known. It is measured on a tenth of the pixels of at most eight views, unless a quality was asked for, or
+            the result may be worse. The gain by such a sample is off by .3 dB (rms); :func:`gsmerge.evaluate` is exact.
         new_views: Expected PSNR of new views, estimated on photos that a short fit left out; None with fewer than four
             photos, in drafts, and in blocks.
-        psnr_after: Like ``psnr_before``, rendered from the result; if a file is written that rounds positions visibly,
-            rendered from the rounded values.
-        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit), and ``pruned``, by
-            how many Gaussians the result is below its limit, because no view shows more. Without photos and pixels,
-            ``fidelity`` has the ``psnr`` (dB) against renders of the input and the number of ``views`` for it; these
-            are ``held_out`` if they were placed because the scene has no cameras.
-        notes: Warnings about the input and adaptations to it, one sentence each.
+        psnr_after: Like ``psnr_before``, but rendered from the result. If the format of the output rounds positions
+            visibly, the rounded Gaussians are rendered.
+        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). ``pruned`` is the number
+            of Gaussians that the result has less than allowed, because no view shows more. Without photos and pixels,
+            ``fidelity`` has the ``psnr`` (dB) against renders of the input, and the number of ``views`` of these
+            renders. ``held_out`` is true if the views were placed because the scene has no cameras.
+        notes: Warnings about the input and notes about what was adapted to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how near the result came; None if it is met.
-        worse: A warning, also among the notes: the result shows the scene's own photos more than .5 dB worse than the
-            input does, or lies far from the input between the views; or, if ``fidelity`` is measured, its PSNR against
-            the input is below 30 dB. None if neither is the case, or if it cannot be measured, as with a crop.
+        worse: A warning that the result is worse than the input, which is also among the notes; None if it is not, or
+            if that cannot be measured. The result is worse if it shows the scene's own photos more than .5 dB worse
+            than the input, or if ``is_far`` is true. If ``fidelity`` is measured, it is worse below 30 dB.
+            docs/reference/report.md lists all cases.
         psnr_reference: What the PSNR of the input views is measured against: "photos" or "the model's own pixels"; None
             if it is not measured.
-        covered: PSNR over the pixels that the input covers; None if it lacks at most 2 % of them.
-        is_far: The result is clearly worse than the input: its pictures differ more than twice as much from the photos
-            as the input's do, or else, between the views, from the input's pictures.
-        photo_files: PSNR on the photos as their files have them; None if the run changed no photo.
-        protected: PSNR over the pixels that ``protect`` names, and their share of all; None without such pixels.
+        covered: PSNR over the pixels that the input covers; None if it covers at least 98 % of them.
+        is_far: The result is clearly worse than the input. Its pictures differ from the photos more than twice as much
+            as those of the input. Or, between the views, they differ from those of the input more than twice as much as
+            these differ from the photos.
+        photo_files: PSNR on the photos as they are in their files; None if the run changed no photo.
+        protected: PSNR over the pixels that ``protect`` marks, and their share of all pixels; None without such pixels.
 
     Example:
         >>> report = gsmerge.compact("demo", effort="draft", budget=300).report
@@ -162,19 +164,13 @@ def report_document(
         seconds_after: Wall time by name after these stages, such as writing.
         coarser: File and report of each coarser level of detail.
         notes: Notes from reading and writing, which come before those of the report.
-        written_at: The temporary files of each output, if they are not renamed yet; they have its bytes.
+        written_at: The temporary files of each output, whose bytes are counted if they are not renamed yet.
         cameras_path: The file of cameras for viewers, if any.
 
     Returns:
-        ``schema_version``; within a version keys are only added. ``unmet``: why a target is not met, or null.
-        ``new_views``: the expected PSNR of new views ``before`` and ``after``, estimated on so many ``views`` that a
-        short fit left out; null with fewer than four photos, or if it was not asked for. ``psnr_reference``: what
-        ``psnr_input_views`` are measured against: "photos", or other pictures. ``psnr_covered``: ``share``,
-        ``before``, ``after`` over the pixels that the input covers, if it lacks some. ``psnr_photo_files``: ``before``,
-        ``after`` on the photos as their files have them, if the run changed some. ``psnr_protected``: ``share``,
-        ``before``, ``after`` over the pixels that ``protect`` names. ``worse``: a warning that the result, or else a
-        level, shows the photos worse than the input or, without photos, has a PSNR below 30 dB against the input; or
-        null.
+        The keys of the document, which docs/reference/report.md describes. They are those of :class:`CompactReport`,
+        partly under other names, and facts about the files. ``worse`` is the warning of the result or, if it has none,
+        of a level. Within a ``schema_version`` keys are only added.
     """
     numbers, at = asdict(report), written_at or {}
     return {
