@@ -27,7 +27,7 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     Args:
         prediction: Has ``gaussians`` (``means``, ``scales``, ``rotations``, ``harmonics``, ``opacities``),
             ``extrinsics`` world to camera, ``intrinsics`` in pixels, ``processed_images`` and ``scale_factor``.
-        sh_degree: Harmonics above this degree are left out, as in its files.
+        sh_degree: Harmonics above this degree are left out, as in the files that the model writes.
 
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
@@ -60,7 +60,7 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
             ``opacities``.
         poses: ``extrinsic [1,V,4,4]`` camera to world, ``intrinsic [1,V,3,3]`` divided by the image's size.
         images: ``[1,V,3,H,W]`` as the model got them, in [0, 1].
-        sh_degree: Harmonics above this degree are left out, as in its files.
+        sh_degree: Harmonics above this degree are left out, as in the files that the model writes.
 
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
@@ -77,16 +77,16 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
 def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0) -> dict[str, Any]:
     """Convert the output of DepthSplat's encoder, with one Gaussian per pixel.
 
-    Outputs of MVSplat, and of pixelSplat with one Gaussian per pixel, have the same form. The files of the model lack
-    the pixels at borders. Scales and rotations are computed from the covariances, because the rotations in the output
-    are relative to the cameras.
+    Outputs of MVSplat, and of pixelSplat with one Gaussian per pixel, have the same form. The files that the model
+    writes lack the Gaussians of pixels at borders. Scales and rotations are computed from the covariances, because the
+    rotations in the output are relative to the cameras.
 
     Args:
         output: Output of the encoder: Gaussians with ``means``, ``covariances``, ``harmonics [1,n,3,k]`` and
             ``opacities``, or a dictionary with these Gaussians under ``gaussians``.
         context: Context of the batch: ``extrinsics [1,V,4,4]`` camera to world, ``intrinsics [1,V,3,3]`` divided by the
             image's size, ``image [1,V,3,H,W]`` in [0, 1].
-        sh_degree: Harmonics above this degree are left out, as in its files.
+        sh_degree: Harmonics above this degree are left out, as in the files that the model writes.
 
     Raises:
         SceneError: If a field is missing, or it holds several scenes.

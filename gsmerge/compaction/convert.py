@@ -76,15 +76,15 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
             problem = f"expected Gaussians that are kept, found none of {count:,}"
             raise SceneError(options.inputs[0], problem, "find the extent of the scene with gsmerge inspect")
         frame = find_placement(options.placement, cameras, upward_axis(files[0].info.comments))
-        gaussians, moved = move_to_frame(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
+        gaussians, moved_cameras = move_to_frame(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
         largest = max(float(np.abs(gaussians.means).max()), float(gaussians.scales.max()))
         if options.placement.moves and not 1e-30 < largest < 1e30:  # numbers in files have 32 bits
             problem = f"expected coordinates of 1e-30 to 1e30, the largest would be {largest:.0e}"
             raise UsageError(f"--scale, --translate: {problem}")
     gaussians = pad_harmonics(gaussians, NUM_FULL) if outputs.options.columns == "full" else gaussians
     infos = [file.info for file in files]
-    columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
-    columns = columns[rows]
+    all_columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
+    columns = all_columns[rows]
     named_notes = [name_notes(path.name, file_notes(info)) for path, info in zip(options.inputs, infos, strict=True)]
     notes = [*file_notes(infos[0])] if len(files) == 1 else [*chain(*named_notes)]
     notes += [*camera_notes, *describe_extra_columns(columns, missing, format_, moves=options.placement.moves)]
@@ -100,9 +100,9 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     levels = [gaussians]
     for level_count in level_counts(len(gaussians), STREAMED_LEVELS) if format_.levels == "inside" else ():
         levels.append(merge_neighbors(levels[-1], level_count))
-    notes += frame_notes(outputs, moved)
-    contents = Contents(levels, comments, moved, names, scene_title(options.inputs[0]), extra_columns=columns)
-    num_bytes, camera_path = write_outputs(outputs, contents), outputs.viewer_cameras if len(moved) else None
+    notes += frame_notes(outputs, moved_cameras)
+    contents = Contents(levels, comments, moved_cameras, names, scene_title(options.inputs[0]), extra_columns=columns)
+    num_bytes, camera_path = write_outputs(outputs, contents), outputs.viewer_cameras if len(moved_cameras) else None
     facts = {"path": str(outputs.result), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
     inputs = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     input_cameras = None if stored is None else str(stored.path)

@@ -71,13 +71,17 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     all_pixels, budget = at_once * num_blocks, options.budget  # a view that is in two blocks is built twice
     inside = 1.0 if no_views else mean_inside(scene)
     costs = RunCosts(
-        settings, all_pixels, all_pixels / max(1, len(scene)), inside, steps, merges_pairs=no_views, is_placed=no_views,
-        choice=CountChoice(has_target, budget.auto or budget.max_drop is not None, budget.max_drop, size.rendered),
+        settings=settings, num_pixels=all_pixels, view_pixels=all_pixels / max(1, len(scene)), inside=inside,
+        steps=steps, merges_pairs=no_views, is_placed=no_views,
+        choice=CountChoice(
+            has_target=has_target, has_curve=budget.auto or budget.max_drop is not None, max_drop=budget.max_drop,
+            rendered=size.rendered,
+        ),
         has_trial=steps > 0 and scene.has_own_pixels and options.new_views is not False,
     )  # fmt: skip
     seconds = costs.seconds(costs.all_parts(limits, num_drawn), len(scene), options.threads or available_threads())
     memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=num_pixels - at_once)
-    is_distributed = limits.count is not None or options.budget.auto
+    is_distributed = limits.count is not None or budget.auto
     return {
         "num_gaussians": count,
         "exact": options.budget.is_filled or found_count is not None,
