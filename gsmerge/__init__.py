@@ -75,6 +75,7 @@ __all__ = ["__version__", *sorted(_EXPORTS)]  # noqa: PLE0604 - strings all, fro
 
 
 def __getattr__(name: str) -> Any:
+    """Import a public name at its first use."""
     if name == "integrations":
         return import_module(f"{__name__}.{name}")
     if name not in _EXPORTS:

@@ -46,13 +46,13 @@ class SceneError(GsmergeError):
     exit_code = 3
 
     def __init__(self, path: str | PathLike[str], problem: str, remedy: str = "") -> None:
-        # Messages of libraries may have several lines, and views without names are called "view 0"
+        # Messages of libraries may have several lines. Views without names are called "view 0", which may double "view"
         problem = " ".join(problem.split()).replace("view view ", "view ")
         self.path, self.problem, self.remedy = str(path), problem, remedy
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
 
     def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str]]:
-        """Pickle the arguments, since processes of a cluster send this error."""
+        """Pickle the arguments, so that processes can send this error to each other."""
         return type(self), (self.path, self.problem, self.remedy)
 
 
@@ -73,12 +73,12 @@ class Doubt(str):
 
 
 def list_doubts(notes: Iterable[str]) -> list[str]:
-    """Return those of the notes that make the result doubtful."""
+    """Return the notes that are doubts."""
     return [note for note in notes if isinstance(note, Doubt)]
 
 
 def name_notes(name: object, notes: Iterable[str]) -> list[str]:
-    """Return notes that begin with the name of what they are about; doubts stay doubts."""
+    """Put a name before each note, such as that of the file that the note is about; doubts stay doubts."""
     return [type(note)(f"{name}: {note}") for note in notes]
 
 
@@ -101,7 +101,7 @@ DAMAGED_OPENCV = (
 
 
 def is_opencv_damaged(error: BaseException) -> bool:
-    """Return whether an error says that ``cv2``, a folder shared by several packages, is incomplete."""
+    """Return whether an error says that the folder ``cv2``, into which several packages install, is incomplete."""
     return isinstance(error, AttributeError | ImportError) and "cv2" in f"{error} {getattr(error, 'path', '')}"
 
 
@@ -157,7 +157,10 @@ def file_problem(error: BaseException, unnamed: str = "a file") -> str | None:
 
 
 def error_line(error: BaseException, unnamed: str = "a file") -> str:
-    """Describe an error in one line; ``unnamed`` is used as in :func:`file_problem`."""
+    """Describe an error in one line.
+
+    ``unnamed``: words for the file of an error that does not name it, see :func:`file_problem`.
+    """
     if is_out_of_memory(error):
         return OUT_OF_MEMORY
     if is_opencv_damaged(error):

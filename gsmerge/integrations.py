@@ -19,15 +19,15 @@ from gsmerge.values.arrays import Array, as_array, like
 
 
 def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
-    """Convert a ``Prediction`` of Depth Anything 3 with ``infer_gs=True``: all Gaussians, one per pixel, and the views.
+    """Convert a ``Prediction`` of Depth Anything 3 with ``infer_gs=True``: one Gaussian per pixel, and the views.
 
-    The files that the model writes lack Gaussians at borders and far away. Poses of nested models are scaled to fit the
-    Gaussians.
+    The files that the model writes lack Gaussians at borders and far away. Nested models give poses in metres, which
+    are scaled to the units of the Gaussians.
 
     Args:
         prediction: Has ``gaussians`` (``means``, ``scales``, ``rotations``, ``harmonics``, ``opacities``),
             ``extrinsics`` world to camera, ``intrinsics`` in pixels, ``processed_images`` and ``scale_factor``.
-        sh_degree: Harmonics above this degree are left out, as in its files.
+        sh_degree: Harmonics above this degree are left out, as in the files that the model writes.
 
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
@@ -42,7 +42,7 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     return {
         **_convert_gaussians(gaussians, sh_degree),
         "scales": _unbatch("scales", gaussians.scales, 2),
-        # The same rotations with other signs. The model writes z >= 0, as if the last number were w
+        # The model makes z positive, as if it were w. These are the same rotations with positive w
         "quats": rotations * (1 - 2 * (rotations[:, :1] < 0)),
         "images": _as_floats(photos),
         "viewmats": viewmats,
@@ -60,7 +60,7 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
             ``opacities``.
         poses: ``extrinsic [1,V,4,4]`` camera to world, ``intrinsic [1,V,3,3]`` divided by the image's size.
         images: ``[1,V,3,H,W]`` as the model got them, in [0, 1].
-        sh_degree: Harmonics above this degree are left out, as in its files.
+        sh_degree: Harmonics above this degree are left out, as in the files that the model writes.
 
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
@@ -77,16 +77,16 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
 def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0) -> dict[str, Any]:
     """Convert the output of DepthSplat's encoder, with one Gaussian per pixel.
 
-    Outputs of MVSplat, and of pixelSplat with one Gaussian per pixel, have the same form. The files of the model lack
-    the pixels at borders. Scales and rotations are computed from the covariances, because the rotations in the output
-    are relative to the cameras.
+    Outputs of MVSplat, and of pixelSplat with one Gaussian per pixel, have the same form. The files that the model
+    writes lack the Gaussians of pixels at borders. Scales and rotations are computed from the covariances, because the
+    rotations in the output are relative to the cameras.
 
     Args:
         output: Output of the encoder: Gaussians with ``means``, ``covariances``, ``harmonics [1,n,3,k]`` and
             ``opacities``, or a dictionary with these Gaussians under ``gaussians``.
         context: Context of the batch: ``extrinsics [1,V,4,4]`` camera to world, ``intrinsics [1,V,3,3]`` divided by the
             image's size, ``image [1,V,3,H,W]`` in [0, 1].
-        sh_degree: Harmonics above this degree are left out, as in its files.
+        sh_degree: Harmonics above this degree are left out, as in the files that the model writes.
 
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
@@ -165,7 +165,7 @@ def _unwrap(name: str, values: Any) -> Any:
 
 
 def _get(owner_name: str, owner: Any, name: str) -> Any:
-    """Return a field of an object, or an entry of a mapping; SceneError if it is missing or None."""
+    """Return a field of an object, or an entry of a mapping, by its name; SceneError if it is missing or None."""
     value = owner.get(name) if isinstance(owner, Mapping) else getattr(owner, name, None)
     if value is None:
         remedy = "run the model with infer_gs=True" if name == "gaussians" else ""
@@ -174,7 +174,7 @@ def _get(owner_name: str, owner: Any, name: str) -> Any:
 
 
 def _unbatch(name: str, values: Array, num_axes: int) -> Array:
-    """Return an array without the axis of its batch, with ``num_axes`` axes; SceneError for several scenes."""
+    """Return an array with ``num_axes`` axes, without that of its batch; SceneError for a batch of several scenes."""
     if values.ndim == num_axes:
         return values
     if values.ndim != num_axes + 1 or values.shape[0] != 1:
@@ -183,7 +183,7 @@ def _unbatch(name: str, values: Array, num_axes: int) -> Array:
 
 
 def _convert_gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
-    """Return the arguments for means, opacities and harmonics; these models store harmonics channel-major."""
+    """Return the arguments for means, opacities and harmonics of models that store harmonics as ``[1,n,3,k]``."""
     harmonics = _unbatch("harmonics", _get("gaussians", gaussians, "harmonics"), 3)
     rows = harmonics.swapaxes(1, 2)[:, : (sh_degree + 1) ** 2]
     opacities = _get("gaussians", gaussians, "opacities")
@@ -213,22 +213,22 @@ def _as_floats(photos: np.ndarray) -> np.ndarray:
 
 
 def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
-    """Scale intrinsics to the size of the photos.
+    """Return intrinsics for the size of the photos.
 
-    After Depth Anything 3 has written COLMAP files, its intrinsics belong to the original size of the photos. The
-    principal point is in the middle at both sizes, so it tells the size that intrinsics belong to.
+    When Depth Anything 3 writes COLMAP files, it changes its intrinsics to those of the original photos. The principal
+    point is in the middle of a photo at both sizes, so it shows to which size the intrinsics belong.
     """
     factors = np.array([photos.shape[-2], photos.shape[-3]]) / (2 * Ks[:, (0, 1), 2])
-    min_difference = 0.1  # sizes differ if they do in all views and along both axes, by more than this share
+    min_difference = 0.1  # the sizes are different if they differ by more than this share in all views, on both axes
     is_other_size = np.abs(factors - 1).min() > min_difference
     return Ks * np.concatenate([factors, np.ones((len(Ks), 1))], 1)[:, :, None] if is_other_size else Ks
 
 
 def _split_covariances(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split covariances ``[n,3,3]`` into standard deviations ``[n,3]`` and rotations ``[n,4]`` wxyz."""
-    finite = np.isfinite(covariances).all((1, 2))  # the others get NaN as standard deviations
+    finite = np.isfinite(covariances).all((1, 2))  # all other rows get NaN as standard deviations
     squares, axes = eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
-    axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])  # a rotation, not a reflection
+    axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])  # so that the axes are a rotation, and no reflection
     scales = np.sqrt(np.maximum(squares, 0))
     scales[~finite] = np.nan
     return scales.astype(np.float32), rotmat_to_quat(axes).astype(np.float32)

@@ -1,8 +1,8 @@
 """The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
 
-Every choice is a function here. :func:`make_plan` makes all of them for a prepared scene or block.
-:func:`choose_for_scene` makes those that need no computation, also for estimates and for a scene in blocks. Each stage
-gets its own part of the plan, and no stage knows the options of another.
+Every choice is a function here. :func:`make_plan` makes all choices for a prepared scene or block.
+:func:`choose_for_scene` makes those that need no computation. Estimates and scenes in blocks need only these. Each
+stage gets its own part of the plan, and no stage knows the options of another.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ if TYPE_CHECKING:
     from gsmerge.networks.weights import NetworkWeights
     from gsmerge.raster.photos import PhotoScore
 
-AUTO_STEPS = 2  # steps with budget auto, relative to the usual: fewer Gaussians cost less, and need them for detail
-SHORT_STEPS = 60  # up to so many steps, a fit still gains from a better start
+AUTO_STEPS = 2  # steps with budget auto, relative to the usual; its fewer Gaussians need them for detail, and cost less
+SHORT_STEPS = 60  # a fit with at most this many steps still gains from a better start
 MOST_STEPS = 2.0  # most steps for more than the usual share of Gaussians per pixel, relative to the usual steps
 USUAL_VIEWS = 12  # views up to which the steps of an effort are enough
-# By default, results without photos and pixels have at least this PSNR (dB) against the input in its views
+# If a scene has neither photos nor pixels, its result has by default at least this PSNR (dB) against the input
 FIDELITY_PSNR = 32.5
-# By default, results with photos but without pixels show the photos at most so many dB worse than the input
+# If a scene has photos but no pixels, its result by default loses at most this PSNR (dB) on the photos
 FIDELITY_LOSS = 0.3
 NO_FIT = "without cameras a draft has no fit: --effort fast has one"
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
 WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
-BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same two limits in views, if blocks see little of each other
-LONE_K = 4  # K if all views have one camera, because no other view adds Gaussians of its own to a surface
+BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same two limits as numbers of views, if blocks see little of each other
+LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians of its own to a surface
 
 
 @dataclass(frozen=True)
@@ -107,12 +107,12 @@ class Plan:
     settings: dict[str, Any]  # All settings by flat name, for reports
     power: float = POWERS[0]  # Power of the masses by which pairs are merged
     free_poses: bool = False  # The options ask for moved cameras, even where the scene does not need it
-    samples: bool = False  # Only the report needs the scores, so a sample of the pixels is scored
+    samples: bool = False  # A sample of the pixels is scored, because only the report needs the scores
     new_views: bool = False  # Estimate the quality of new views
-    is_trial: bool = False  # Only a score of the fit counts, in which filled gaps do not show
-    before: PhotoScore | None = None  # Score of the input, if photos and not pixels decide the count
-    # [h,w] bool for each scored view, if renders of the input stand for photos: the pixels that the input covers; None:
-    # nearly all
+    is_trial: bool = False  # The result is only scored on left-out photos, so gaps need not be filled
+    before: PhotoScore | None = None  # Score of the input, if the result has to keep its quality on photos
+    # [h,w] bool for each scored view: the pixels that the input covers, if it leaves gaps and its renders stand for
+    # photos
     covered: tuple[np.ndarray, ...] | None = None
 
     @property
@@ -122,19 +122,19 @@ class Plan:
 
     @property
     def network_facts(self) -> dict[str, Any]:
-        """Facts about the networks, for reports, by name; empty without networks."""
+        """Facts about the networks that a report has, by name; empty without networks."""
         return {} if self.checkpoint is None else {"networks": self.checkpoint.facts()}
 
     @property
     def by_contribution(self) -> bool:
-        """Return whether Gaussians are given to superpixels by their blending weights, as in the paper."""
+        """Return whether blending weights decide to which superpixel a Gaussian belongs, as in the paper."""
         return self.networks is not None and self.networks.options.makes_children
 
     @property
     def weakens(self) -> bool:
-        """Return whether groups that other views see through start with less opacity.
+        """Return whether a group starts with less opacity if other views see surfaces behind it.
 
-        A long fit follows then, and closes the holes.
+        This may leave holes, which a long fit closes.
         """
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
@@ -159,10 +159,10 @@ class Plan:
 
 @dataclass(frozen=True)
 class FilledOptions:
-    """Options whose open settings were filled in from facts about the scene."""
+    """Options in which settings such as "auto" are replaced by what the scene needs."""
 
     original: CompactOptions  # The options of the caller
-    options: CompactOptions  # With K, and a budget that the scene can make use of
+    options: CompactOptions  # With K, and with a budget that the scene can use
     segment: SegmentOptions  # With numbers that depend on effort and scene
     clean: CleanOptions  # Without the sky, if no photo shows where it is
 
@@ -174,10 +174,10 @@ class FilledOptions:
 
 
 def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
-    """Make all decisions that the options leave open.
+    """Make all decisions about a run that the options leave open.
 
-    This also loads the networks, because decisions need them. ``checkpoint``: networks to use instead of those that the
-    options name. Raises UsageError if the scene or the networks do not allow what the options ask for.
+    The networks are also loaded, because some decisions depend on them. ``checkpoint``: networks to use instead of
+    those that the options name. Raises UsageError if the scene or the networks do not allow what the options ask for.
     """
     check_pictures(prepared, options)
     with stage("prepare"):
@@ -190,7 +190,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
 
 def _fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
-    """Fill in the settings that the options leave open and the scene decides; notes give the reasons."""
+    """Fill in the settings that the options leave to the scene; notes say why they have their values."""
     size, agreement = prepared.size, prepared.agreement
     filled = resolve_budget(size, options, agreement)
     segment = _resolve_superpixels(filled.segment, agreement, EFFORTS[options.effort])
@@ -202,30 +202,31 @@ def _fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
 
 
 def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | None) -> Plan:
-    """Make all decisions about a run."""
+    """Make the plan of a run, after open settings were filled in and networks loaded."""
     size, original, options, segment = prepared.size, filled.original, filled.options, filled.segment
     keeps = keeps_fidelity(size, original)
     target = FIDELITY_PSNR if keeps and size.rendered else original.budget.target_psnr
     has_repeats = len(prepared.scene) < len(prepared.input_scene)
-    num_input = prepared.input_scene.num_gaussians if has_repeats else None  # to which shares of a budget refer
+    num_input = prepared.input_scene.num_gaussians if has_repeats else None  # a budget may be a share of this number
     choices = choose_for_scene(size, filled.counted, num_input=num_input, keeps=keeps)
-    limits, pairs = choices.limits, checkpoint is None and choices.may_merge_pairs
+    limits, merges_pairs = choices.limits, checkpoint is None and choices.may_merge_pairs
     fit = _fit_photos(prepared, options, choices.fit)
-    fit = _fit_renders(prepared, options, fit) if pairs else fit
+    fit = _fit_renders(prepared, options, fit) if merges_pairs else fit
     if keeps and has_few_rows(size):
         few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
         note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
     budget, cameras = options.budget, prepared.scene.cameras
-    # a quality is measured on all pixels, and so are small views
+    # a quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample
     samples = not (keeps or target is not None) and scored_tiles(0, cameras.width, cameras.height, 2) is not None
-    searches = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
-    shares_tree = cuts_views(options, size) and not pairs and (searches or limits.count is not None)
+    builds_several = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
+    # all builds cut the views by one tree of regions
+    shares_tree = cuts_views(options, size) and not merges_pairs and (builds_several or limits.count is not None)
     return Plan(
         superpixels=SuperpixelChoices(segment, limits, start_share(fit), SharedTree() if shares_tree else None),
         match=replace(options.match, match=choices.match),
         decode=options.decode,
         fit=fit,
-        merges_pairs=pairs,
+        merges_pairs=merges_pairs,
         clean=filled.clean,
         target_psnr=target,
         keeps_fidelity=keeps,
@@ -240,7 +241,7 @@ def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | 
         checkpoint=checkpoint,
         settings=replace(options, budget=original.budget).to_dict() | {"fit_steps": fit.steps},
         free_poses=options.prepare.poses == "free",
-        # without a fit no photo has been seen, so the score on own photos holds for new views, too
+        # Without a fit, new views look as good as own photos, so they need no estimate
         new_views=fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views,
     )
 
@@ -252,7 +253,10 @@ def cuts_views(options: CompactOptions, size: SceneSize) -> bool:
 
 @dataclass(frozen=True)
 class SceneChoices:
-    """Decisions about a whole scene that need no computation; a run, its estimate and its blocks share them."""
+    """Decisions about a whole scene that follow from its size and the options, without computation.
+
+    A run, its estimate and its blocks use the same ones.
+    """
 
     decode: DecodeOptions  # Gaussians per group
     limits: CountLimits  # Limits of the number of Gaussians
@@ -272,14 +276,14 @@ def choose_for_scene(
 ) -> SceneChoices:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-    ``num_input``: see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: the result of :func:`keeps_fidelity` for
-    the options as they were given; None: for these options.
+    ``num_input``: see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned
+    for the options of the caller; None: it is called for these ``options``.
     """
     keeps = keeps_fidelity(scene, options) if keeps is None else keeps
     if scene.num_views == 0 and options.fit.fit_steps is None and not EFFORTS[options.effort].fits_alone:
         options = replace(options, fit=replace(options.fit, fit="none"))
     segment, decode = options.segment, resolve_decode(options, scene)
-    if segment.superpixels == AUTO:  # only computation on the scene could decide it
+    if segment.superpixels == AUTO:  # deciding it would need computation
         segment = replace(segment, superpixels=SHARE)
     limits = count_limits(scene, segment, decode, options.budget, num_input=num_input)
     fit = resolve_fit(options)
@@ -289,18 +293,18 @@ def choose_for_scene(
     fit = replace(fit, fit_steps=steps, share=share, grow_steps=grow_steps)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
-    # Neighbours are merged pair by pair, instead of superpixels, without views, or with no pictures other than renders.
-    # Settings of superpixels ask for superpixels, except for their number, which only says how many Gaussians there are
-    is_shown = scene.num_views > 0 and (not scene.rendered or options.changes_superpixels)
-    pairs = options.method == OURS and networks == "none" and not is_shown
-    return SceneChoices(decode, limits, match, networks, fit, keeps, pairs)
+    # Views are cut into superpixels if they have pictures other than renders, or if a setting changes superpixels. A
+    # setting of their number does not count, because it only says how many Gaussians there are. Otherwise neighbouring
+    # Gaussians are merged pair by pair
+    cuts = scene.num_views > 0 and (not scene.rendered or options.changes_superpixels)
+    may_merge_pairs = options.method == OURS and networks == "none" and not cuts
+    return SceneChoices(decode, limits, match, networks, fit, keeps, may_merge_pairs)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     """Return the number of blocks for a scene; UsageError if it cannot be cut into the number that was asked for."""
-    problems = options.uncut
-    if not scene.has_own_pixels:
-        problems.append("a scene whose views have no Gaussians of their own")
+    shared = [] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]
+    problems = [*options.uncut, *shared]
     count = wanted_blocks(options, scene.num_gaussians, scene.num_views)
     if options.blocks.blocks == "auto":
         count = 1 if problems else min(scene.num_views, count)
@@ -314,16 +318,16 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 
 
 def usual_blocks(num_gaussians: int, num_views: int) -> int:
-    """Return the usual number of blocks for a scene, or an upper bound if the number of views decides."""
+    """Return the number of blocks that a scene has by default; if only its views are many, at most this number."""
     if num_gaussians > WHOLE_GAUSSIANS:
         return -(-num_gaussians // BLOCK_GAUSSIANS)
     return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
 
 
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
-    """Return the largest number of blocks that the options ask for; 1: one piece.
+    """Return the largest number of blocks that a run may have by its options; 1 for a run in one piece.
 
-    ``num_views``: 0 if there are few views.
+    ``num_views`` only matters if there are many.
     """
     blocks = options.blocks.blocks
     if blocks == "auto":
@@ -334,16 +338,17 @@ def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 
 def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     """Return whether the run searches for the fewest Gaussians that keep the quality of the input.
 
-    It does if neither the options nor the scene's density decide the number. Without photos the PSNR of the result
-    against the input has to be ``FIDELITY_PSNR``. With photos the result may show them ``FIDELITY_LOSS`` worse. A share
-    of the Gaussians would say little if there are fewer Gaussians than pixels: a scene that is compact already needs
-    most of them, a scene of many small ones only a few. Measurements are in docs/internals/notebook.md.
+    It does if the options do not decide the number, and the scene has no photos or few Gaussians per pixel. With few
+    Gaussians per pixel, no usual share of them is right: a scene that is compact already needs most of them, and a
+    scene of many small ones only a few. Without photos the PSNR of the result against the input has to be
+    ``FIDELITY_PSNR``. With photos the result may show them ``FIDELITY_LOSS`` worse than the input. Measurements are in
+    docs/internals/notebook.md.
     """
     if not options.scene_decides:
         return False
-    # Gaussians per pixel, from which on a share of them is enough to show the photos
-    dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
-    return scene.rendered or options.budget.keep or not (dense or options.budget.auto)
+    # with half a Gaussian per pixel or more, the usual share of them is enough to show the photos
+    is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
+    return scene.rendered or options.budget.keep or not (is_dense or options.budget.auto)
 
 
 def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
@@ -358,10 +363,10 @@ def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
 
 
 def choose_networks(options: CompactOptions, size: SceneSize) -> str:
-    """Return the name of the checkpoint to load: the one that was asked for, or the shipped one if it improves results.
+    """Return the name of the checkpoint to load: that of the options or, if it is "auto", "shipped" or "none".
 
     The shipped networks improve the result if no fit follows, and if the views have photos or pixels. A fit gains more
-    by further steps in the same time (docs/internals/networks.md).
+    if it takes further steps in the time of the networks (docs/internals/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -370,9 +375,9 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
 
 
 def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
-    """Load the networks that a run uses; None: the run uses closed formulas alone.
+    """Load the networks that a run uses; None if it uses none.
 
-    Raises SceneError if networks are required and cannot be used, UsageError if they do not fit the options.
+    Raises SceneError if networks are required and cannot be used, and UsageError if they do not fit the options.
     """
     if not cuts_views(options, size):
         if options.checkpoint not in CHECKPOINTS:  # refuse a damaged file, although nothing would use it
@@ -410,10 +415,10 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
 
 
 def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
-    """Fill in the number of Gaussians that is useful for the scene, with a note.
+    """Fill in the number of Gaussians beyond which new views gain nothing, with a note.
 
-    It depends on how far views confirm each other's depth: beyond it, new views gain nothing. It is the automatic
-    budget, and an upper limit for a budget that is a share, a size or a device.
+    This number is larger the more the views confirm each other's depth. It is the budget if the options say "auto", and
+    an upper limit for a budget that is a share, a size or a device.
     """
     budget = options.budget
     is_limit = budget.is_limit and options.method == OURS
@@ -429,20 +434,20 @@ def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreemen
         reason = f"more would not show new views better, because {why}; --set fill=true takes the whole budget"
         note(f"budget {budget.budget}: {limit}; {reason}")
         is_only_count = options.changed_counts == ["budget"]
-        if is_only_count and agreement.share <= FEWEST:  # as without a budget
+        if is_only_count and agreement.share <= FEWEST:  # the limit is then the number without a budget
             budget = replace(budget, budget=None)
     return replace(options, budget=replace(budget, most=most))
 
 
 def describe_share(agreement: Agreement | None) -> tuple[str, str]:
-    """Return the useful number of Gaussians as a share of the pixels, a text such as "10%", and the reason for it."""
+    """Return the useful number of Gaussians as a share of the pixels, such as "10%", and the reason for a note."""
     if agreement is None:
         return SHARE, "depths of several views cannot be compared"
     return f"{100 * agreement.share:.3g}%", f"other views confirm {100 * agreement.confirmed:.0f} % of the pixels"
 
 
 def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, effort: Effort) -> SegmentOptions:
-    """Fill in the settings of superpixels that depend on effort and scene; a note gives the reason."""
+    """Fill in the settings of superpixels that depend on effort and scene; a note says why."""
     if options.superpixels == AUTO:
         text, why = describe_share(agreement)
         note(f"superpixels: {text} of the pixels, because {why}")
@@ -453,7 +458,7 @@ def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, e
 
 
 def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
-    """Keep the sky, with a note, if no photo is used that shows where it is."""
+    """Drop no sky if no photo shows where it is, and add a note."""
     if "sky" not in options.drops or prepared.reference.name != RENDERS:
         return options
     note("drop sky: no photo that is used shows where the sky is, so it is kept")
@@ -462,10 +467,10 @@ def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
 
 
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
-    """Choose K if it is "auto": 4 if a single camera sees the scene and no fit, or only a short one, follows; else 1.
+    """Choose K if it is "auto": 4 if all views have the same camera and no long fit follows, otherwise 1.
 
-    With K = 1 and 4.4 % of the pixels, Gaussians are too few to show one photo. With more views each view adds
-    Gaussians of its own.
+    A single view has too few Gaussians with K = 1, because superpixels are only 4.4 % of its pixels. With several
+    cameras, each surface gets Gaussians from several views.
     """
     decode = options.decode
     if decode.k != AUTO:
@@ -479,7 +484,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:
-    """Fill in the number of fit steps by effort, and whether Gaussians that no photo shows are dropped."""
+    """Fill in the number of steps by effort, and keep Gaussians that no photo shows in a draft without a fit."""
     fit, effort = options.fit, EFFORTS[options.effort]
     steps = effort.steps if fit.fit_steps is None else fit.fit_steps
     prunes = fit.fit != "none" or effort.prunes
@@ -487,10 +492,10 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 
 
 def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHARE) -> int:
-    """Return the number of steps of the full fit: as set, or by effort, number of views and ``share``.
+    """Return the number of steps of the full fit.
 
-    ``share``: Gaussians of the result for each pixel. A step draws one view. Measurements are in
-    docs/internals/large-scenes.md.
+    It follows from effort, number of views and ``share``, unless the options have it. ``share``: Gaussians of the
+    result for each pixel. A step draws one view. Measurements are in docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
@@ -501,7 +506,11 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
 
 
 def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
-    """Fill in the photo scale of the fit, whether it moves cameras, and whether it fills the budget and goes beyond."""
+    """Fill in the settings of the fit that depend on other options and on the scene.
+
+    They are the scale of the photos, and whether the fit moves cameras, fills the budget, and keeps Gaussians beyond
+    all views.
+    """
     scene = prepared.scene
     fit = replace(fit, beyond=options.prepare.extent == "beyond", fills=options.budget.is_filled)
     if fit.fit == "none":
@@ -518,18 +527,19 @@ def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -
     """Fill in the settings of a fit to renders of the input.
 
     Long thin Gaussians are allowed, because the input may have them. The fit is not scored on held-out patches.
-    Gaussians beyond all views, and those that show little, are kept, because they belong to the scene.
+    Gaussians beyond all views, and those that hardly show in any view, are kept, because they belong to the scene.
     """
-    if prepared.reference.placed and fit.fit == "none" != options.fit.fit:
+    if prepared.reference.placed and fit.fit == "none" and options.fit.fit != "none":
         note(NO_FIT)
     tuning = replace(fit.tuning, max_ratio=math.inf)
     return replace(fit, scored=False, beyond=True, fills=True, min_contribution=0.0, tuning=tuning)
 
 
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:
-    """Choose the views for scoring, among those whose pictures show the scene.
+    """Choose the views that score input and result, among those whose pictures show the scene.
 
-    ``effort``: choose as many as its report needs; None: as many as a decision about the count needs.
+    ``effort`` decides how many views the report needs. None: the views decide the number of Gaussians, which takes
+    more of them.
     """
     own = own_views(prepared)
     if prepared.reference.placed:
@@ -539,7 +549,10 @@ def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int
 
 
 def own_views(prepared: Prepared) -> tuple[int, ...]:
-    """Return the views whose pictures show the scene: placed ones, or of the input, where one may stand for several."""
+    """Return the views whose pictures show the scene: views that were placed, or views of the input.
+
+    The latter are numbered as in the input, where a view may be repeated.
+    """
     if not prepared.reference.of_views:
         return prepared.reference.score_views
     return tuple(view for view, place in enumerate(prepared.repeated) if place in prepared.reference.score_views)

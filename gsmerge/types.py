@@ -201,7 +201,7 @@ class LargePhotos(ArrayFields):
     width: int
     height: int
     ids: tuple[int, ...]  # Number of each view's photo, for `read`
-    # Number -> [height,width,3] uint8 sRGB; several threads may call it. Each reading of a scene has another function
+    # Number -> [height,width,3] uint8 sRGB; several threads may call it. Each scene that is read gets a new function
     read: Callable[[int], np.ndarray] = field(compare=False)
 
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
@@ -268,38 +268,43 @@ class Pixels(ArrayFields):
 
     @staticmethod
     def of_grid(has_gaussian: np.ndarray) -> Pixels:
-        """Return the pixels of Gaussians in the order of the pixels that are set in the mask ``[v,h,w]``."""
+        """Return the pixels of Gaussians that are stored one per pixel, in the order of the pixels.
+
+        ``has_gaussian [v,h,w]`` is true where a pixel has one.
+        """
         mask = np.asarray(has_gaussian, bool)
-        count, small = mask.size, mask.size <= np.iinfo(np.int32).max
-        homes = np.arange(count, dtype=np.int32 if small else np.int64)
+        homes = np.arange(mask.size, dtype=np.int32 if mask.size <= np.iinfo(np.int32).max else np.int64)
         if mask.all():
             return Pixels(homes, homes.astype(np.int32, copy=False).reshape(mask.shape), own=True)
-        homes, fronts = homes[mask.reshape(-1)], np.full(count, -1, np.int32)
+        homes, fronts = homes[mask.reshape(-1)], np.full(mask.size, -1, np.int32)
         fronts[homes] = np.arange(len(homes), dtype=np.int32)
         return Pixels(homes, fronts.reshape(mask.shape), own=True)
 
     @property
     def shown(self) -> np.ndarray:
-        """Mask ``[v,h,w]`` of the pixels that show a Gaussian."""
+        """Mask ``[v,h,w]`` of the pixels that have a front Gaussian."""
         return np.asarray(self.fronts >= 0)
 
     @cached_property
     def rows_of_views(self) -> list[np.ndarray]:
-        """Rows ``[m]`` of the Gaussians that belong to each view, ascending."""
+        """For each view, the ascending rows ``[m]`` of its Gaussians."""
         views = self.homes // max(1, int(np.prod(self.fronts.shape[1:])))
-        order = np.arange(len(views))
+        rows = np.arange(len(views))
         if (views[1:] < views[:-1]).any():
-            order = np.argsort(views, kind="stable")
-            views = views[order]
+            rows = np.argsort(views, kind="stable")
+            views = views[rows]
         starts = np.searchsorted(views, np.arange(len(self.fronts) + 1))
-        return [order[start:end] for start, end in pairwise(starts.tolist())]
+        return [rows[start:end] for start, end in pairwise(starts.tolist())]
 
     def select(self, views: Sequence[int]) -> tuple[np.ndarray, Pixels]:
-        """Return the rows ``[m]`` of the Gaussians of some views, view by view, and their pixels in these views."""
-        size, view_rows = int(np.prod(self.fronts.shape[1:])), [self.rows_of_views[view] for view in views]
+        """Return the rows ``[m]`` of the Gaussians of some views, view by view, and the pixels of these Gaussians.
+
+        The pixels are numbered over the selected views.
+        """
+        view_pixels, view_rows = int(np.prod(self.fronts.shape[1:])), [self.rows_of_views[view] for view in views]
         homes, fronts, num_selected = [self.homes[:0]], list[np.ndarray](), 0
         for new_view, (view, rows) in enumerate(zip(views, view_rows, strict=True)):
-            homes.append(self.homes[rows] + self.homes.dtype.type((new_view - view) * size))
+            homes.append(self.homes[rows] + self.homes.dtype.type((new_view - view) * view_pixels))
             view_fronts, positions = self.fronts[view], np.searchsorted(rows, self.fronts[view])
             fronts.append(np.where(view_fronts >= 0, num_selected + positions, -1).astype(np.int32))
             num_selected += len(rows)
@@ -310,13 +315,13 @@ class Pixels(ArrayFields):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Region(ArrayFields):
-    """A box, which may be rotated, or a sphere; both are convex, so the mean of points inside is inside."""
+    """A box, which may be rotated, or a sphere. Both are convex, so the mean of points inside them is also inside."""
 
     middle: np.ndarray  # [3]
     half: np.ndarray  # [3] half of each side of a box; three times the same radius for a sphere
     axes: np.ndarray  # [3,3] rotation into the directions of the sides
     is_sphere: bool
-    rounding: float = 0.0  # Rounding of stored positions; clamped positions stay inside the border by this distance
+    rounding: float = 0.0  # Error of rounded positions in files; moved positions stay this far inside the border
 
 
 def number_views(count: int) -> tuple[str, ...]:
@@ -325,7 +330,7 @@ def number_views(count: int) -> tuple[str, ...]:
 
 
 def _check_count(what: str, values: Sequence[Any], count: int) -> None:
-    """Raise ValueError unless there are ``count`` values."""
+    """Raise ValueError unless there are ``count`` values; ``what`` names them in the message."""
     if len(values) != count:
         raise ValueError(f"expected {count} {what}, got {len(values)}")
 
@@ -340,16 +345,15 @@ class Scene(ArrayFields):
     Args:
         gaussians: n Gaussians, in the frame of the cameras.
         cameras: The v views; None, or no cameras, if none are known.
-        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None. A run also accepts uint8.
+        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None: no photos. A run also accepts uint8.
         pixels: The pixel of each Gaussian, and the Gaussian in front of each pixel; None: not known yet.
         names: The views' names, which are the image file names if these are known; None: numbers.
-        large_photos: The photos with more pixels than the views, or None.
-        masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. It is False everywhere in a view without a
-            photo.
-        importance: ``[v,h,w]`` float32, weight of each pixel in a fit, as a number of pixels; None: one everywhere.
-        filled: ``[n]`` bool, Gaussians that are not in the file and fill holes; None: none.
-        region: Region outside of which the scene has nothing, as after a crop; None: everywhere.
-        notes: What reading its files had to say, for the report of a run; some are doubts.
+        large_photos: The photos at a size with more pixels than the views; None: they have no more pixels.
+        masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. All False for a view without a photo.
+        importance: ``[v,h,w]`` float32, how many pixels each pixel counts for in a fit; None: one each.
+        filled: ``[n]`` bool, True for Gaussians that are not in the file, and were added to fill holes; None: no such.
+        region: The scene has no Gaussians outside of this region, as after a crop; None: no limit.
+        notes: Notes from reading the files, for the report of a run; some are doubts.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -386,7 +390,8 @@ class Scene(ArrayFields):
             if getattr(self, name) is not None:
                 check_shape(name, getattr(self, name), (v, h, w, 3) if name == "images" else (v, h, w))
         _check_count("view names", self.names, v)
-        _check_count("large photos", self.names if self.large_photos is None else self.large_photos.ids, v)
+        if self.large_photos is not None:
+            _check_count("large photos", self.large_photos.ids, v)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -411,15 +416,15 @@ class Scene(ArrayFields):
         return self.pixels is not None and self.pixels.own
 
     def get_pixels(self) -> Pixels:
-        """Return the pixels of a scene; AssertionError if they are not known. Every prepared scene has them."""
+        """Return the pixels of a scene that has them, as every prepared scene does; AssertionError for another one."""
         assert self.pixels is not None, "pixels are known"
         return self.pixels
 
     @property
     def covered(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of the pixels with a Gaussian of their view in the file; None if all pixels have one.
+        """Mask ``[v,h,w]`` of the pixels for which the file has a Gaussian; None if it has one for all pixels.
 
-        It is also None if views have no Gaussians of their own.
+        None also if views have no Gaussians of their own.
         """
         if self.pixels is None or not self.pixels.own or (self.filled is None and self.pixels.shown.all()):
             return None
@@ -428,7 +433,7 @@ class Scene(ArrayFields):
 
     @property
     def is_shown(self) -> bool:
-        """Return whether there are pictures of the views: photos, or the colours of the views' own Gaussians."""
+        """Return whether the views have pictures, which are photos or the colours of the views' own Gaussians."""
         return self.has_own_pixels or self.images is not None
 
     @property
@@ -440,7 +445,7 @@ class Scene(ArrayFields):
 
     @property
     def protected(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of the pixels with at least half the importance of a protected pixel; None for none."""
+        """Mask ``[v,h,w]`` of the protected pixels, by their importance; None if no pixel is protected."""
         if self.images is None or self.importance is None:
             return None
         mask = self.importance >= PROTECTED / 2
@@ -453,11 +458,12 @@ class Scene(ArrayFields):
 
     @property
     def file_gaussians(self) -> Gaussians:
-        """Gaussians of the file, without Gaussians that fill holes."""
+        """The Gaussians of the file, without those that were added to fill holes."""
         if self.filled is None:
             return self.gaussians
-        count = self.num_gaussians  # rows that fill holes are usually the last, and then nothing is copied
-        return self.gaussians[~self.filled if self.filled[:count].any() else slice(count)]
+        count = self.num_gaussians
+        are_last = not self.filled[:count].any()  # usually the added rows are the last ones, and a slice copies nothing
+        return self.gaussians[slice(count) if are_last else ~self.filled]
 
     @property
     def pixels_per_view(self) -> int:
@@ -466,16 +472,19 @@ class Scene(ArrayFields):
 
 
 def make_scene(gaussians: Gaussians, cameras: Cameras) -> Scene:
-    """Make a scene of Gaussians and cameras alone, whose views have numbers for names."""
+    """Make a scene of Gaussians and cameras, without photos and pixels; the views are named by their numbers."""
     return Scene(gaussians, cameras, None, None, number_views(len(cameras)))
 
 
-def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:
-    """Add Gaussians to a scene, each in an empty pixel of ``places [n]``; pixels are numbered over all views."""
+def fill_pixels(scene: SceneT, added: Gaussians, empty_pixels: np.ndarray) -> SceneT:
+    """Add Gaussians to a scene that fill holes, each in an empty pixel.
+
+    ``empty_pixels [n]`` has the pixel of each, numbered over all views.
+    """
     count, old_pixels = len(scene.gaussians), scene.get_pixels()
     homes, fronts = old_pixels.homes, old_pixels.fronts.copy()
-    fronts.reshape(-1)[places] = np.arange(count, count + len(added), dtype=np.int32)
-    pixels = replace(old_pixels, homes=np.concatenate([homes, places.astype(homes.dtype)]), fronts=fronts)
+    fronts.reshape(-1)[empty_pixels] = np.arange(count, count + len(added), dtype=np.int32)
+    pixels = replace(old_pixels, homes=np.concatenate([homes, empty_pixels.astype(homes.dtype)]), fronts=fronts)
     filled = np.zeros(count, bool) if scene.filled is None else scene.filled
     filled = np.concatenate([filled, np.ones(len(added), bool)])
     return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]), pixels=pixels, filled=filled)
@@ -483,10 +492,10 @@ def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PicturedScene(Scene):
-    """A scene with a picture of every view: its photo, or a replacement.
+    """A scene in which every view has a picture: its photo or, without photos, colours or renders of its Gaussians.
 
-    ``empty [v,h,w]`` is a mask, or a share, of pixels in which the scene may show nothing. Pictures are black there,
-    and these pixels do not count for scores. None: no pixel.
+    ``empty [v,h,w]`` marks the pixels in which the scene may show nothing, by a mask or a share of each pixel. Pictures
+    are black there, and these pixels do not count for scores. None: no pixel.
     """
 
     images: np.ndarray
@@ -505,7 +514,7 @@ class PicturedScene(Scene):
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """Superpixels of every view: a label for each pixel, and the number of superpixels of each view."""
+    """The superpixels of all views, as a label for each pixel."""
 
     labels: np.ndarray  # [v,h,w] int32, the superpixel of each pixel, 0 to `counts[v] - 1` within its view
     counts: tuple[int, ...]  # Superpixels of each view
@@ -519,7 +528,7 @@ class Groups:
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """Superpixels of a scene and the number of Gaussians to make of them."""
+    """The superpixels of a scene, and the number of Gaussians that the result may have."""
 
     groups: Groups  # Superpixels of every view
     count: int  # Largest number of Gaussians in the result
@@ -538,8 +547,8 @@ class Matches:
 class FeatureGaussians:
     """g Gaussians that each represent a group of members, with facts about the group for later stages.
 
-    Columns that describe a group are sums over its members (weights, masses, extinctions), or means with these weights,
-    so merging Feature Gaussians is pooling again. The opacity is computed when they are decoded, as
+    Columns that describe a group are sums over its members (weights, masses, extinctions), or means with these weights.
+    Feature Gaussians are merged by the same sums and means. The opacity is computed when they are decoded, as
     ``1 - exp(-gain * extinction / disc area)``, because blending conserves the integrated optical depth. In training,
     columns that networks change are tensors.
     """

@@ -20,7 +20,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
     Args:
-        args: Arguments without the program's name; those of the process when None.
+        args: Arguments without the program's name; None: those of the process.
 
     Returns:
         0 done, 1 unexpected error, 2 wrong usage, 3 bad input, 4 target not met, 5 part of a batch failed,
@@ -48,8 +48,8 @@ def main(args: Sequence[str] | None = None) -> int:
 def _open_streams() -> None:
     """Make sure that stdout and stderr exist and accept any character, since file names may contain any.
 
-    A descriptor from 0 to 2 that the caller closed becomes the null device. Otherwise the next opened file would get
-    its number, and a process of a batch would write to it.
+    If the caller closed descriptor 0, 1 or 2, it becomes the null device. Otherwise the next file to be opened would
+    get its number, and what a process of a batch prints would go into that file.
     """
     for descriptor in range(3):
         try:
@@ -65,7 +65,7 @@ def _open_streams() -> None:
 
 
 def stop_at_once(*_: object) -> NoReturn:
-    """Handle SIGINT while there is nothing to clean up, such as during imports: print a line and end the process."""
+    """Print a line and end the process: the handler of SIGINT while there is nothing to clean up, as during imports."""
     with suppress(OSError):
         os.write(2, b"gsmerge: error: interrupted\n")
     os._exit(INTERRUPTED)
@@ -74,13 +74,13 @@ def stop_at_once(*_: object) -> NoReturn:
 def program() -> NoReturn:
     """Run :func:`main` as the installed program, and end the process.
 
-    Exit handlers run and output is flushed. The interpreter is not shut down, since that takes time with gigabytes of
-    arrays.
+    Exit handlers run, and output is flushed. The interpreter is not shut down, because freeing gigabytes of arrays
+    takes time.
     """
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         signal.signal(signal.SIGINT, stop_at_once)
     if os.name != "nt" and os.environ.get("TERM", "") in ("dumb", "unknown", "") and not os.environ.get("FORCE_COLOR"):
-        # Rich assumes that these have 80 by 25 letters, and that the last one knows escape sequences
+        # Rich assumes that such a terminal has 80 by 25 letters, and that one without a name knows escape sequences
         os.environ |= dict(zip(("COLUMNS", "LINES"), map(str, shutil.get_terminal_size()), strict=True), TERM="dumb")
     code = main()
     atexit._run_exitfuncs()

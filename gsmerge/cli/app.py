@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 DEBUG = "--debug"
 
-# Panel of the help -> commands. A command NAME is the function NAME of the module NAME_command; others are plugins
+# Panel of the help -> commands. The command NAME is the function NAME of the module NAME_command
 COMMAND_GROUPS = {
     "Compact": ("compact", "convert"),
     "Many scenes, and views in batches": ("batch", "extend"),
@@ -51,7 +51,7 @@ PLUGIN_PANEL = "Added by other packages"
 
 
 def make_app(only: str | None = None) -> typer.Typer:
-    """Make the application with all commands, or with the command ``only``; other commands are then not imported."""
+    """Make the application with all commands, or with one command alone, so that no other one is imported."""
     app = typer.Typer(
         name=PROGRAM, cls=Group, pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -89,9 +89,9 @@ def make_app(only: str | None = None) -> typer.Typer:
 
 @lru_cache
 def make_command(only: str | None = None) -> Any:
-    """Make the Click command that parses the words and calls a command: any command, or ``only`` one.
+    """Make the Click command that parses the words of the command line and runs a command; ``only``: see `make_app`.
 
-    Typer's option that installs completion is removed, since it writes into the files of the shell. Its option that
+    Typer's option that installs completion is removed, because it changes files of the user's shell. The option that
     prints the completion stays.
     """
     command = typer.main.get_command(make_app(only))
@@ -106,12 +106,12 @@ def print_help(context: typer.Context) -> None:
 
 
 def _is_research(entry: EntryPoint) -> bool:
-    """Return True if a command is part of this package, False if it comes from another package."""
+    """Return whether a plugin is a research command of this package, and not a command of another package."""
     return entry.module.startswith("gsmerge.")
 
 
 def _command_of(words: list[str]) -> str | None:
-    """Return the name of the command to import; None: import all commands, to show the help or an error."""
+    """Return the name of the only command to import; None if all are needed, to show the help or an error."""
     name = words[0] if words else ""
     if name in (*OWN_COMMANDS, LAB, LOOK):
         return name
@@ -120,7 +120,7 @@ def _command_of(words: list[str]) -> str | None:
 
 
 def _is_scene(word: str) -> bool:
-    """Return whether the first word names a scene instead of a command: an existing path, or a file of Gaussians."""
+    """Return whether the first word is a scene instead of a command: an existing path, or the name of a scene file."""
     if word.startswith("-") or _command_of([word]) is not None:
         return False
     if os.path.lexists(word) or os.path.dirname(word):
@@ -162,38 +162,42 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     Each such signal is added to ``signals``. Signals that the caller handles or ignores, as under nohup, keep their
     handlers.
     """
-
-    def raise_later(number: int) -> None:
-        retry_seconds = 0.02  # delay before a signal is raised again, if no caller could handle it
-        timer = threading.Timer(retry_seconds, signal.raise_signal, (number,))
-        timer.daemon = True
-        timer.start()
+    default_handlers = {signal.SIGINT: signal.default_int_handler}
+    default_handlers |= {  # Windows has no SIGHUP
+        getattr(signal, name): signal.SIG_DFL for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)
+    }
+    if threading.current_thread() is not threading.main_thread():
+        default_handlers = {}  # only the main thread may set handlers
+    replaced_handlers = {
+        number: handler for number, default in default_handlers.items()
+        if (handler := signal.getsignal(number)) in (default, stop_at_once)
+    }  # fmt: skip
+    replaced_hook = sys.unraisablehook
 
     def stop(number: int, _: object) -> None:
+        """Handle a signal: end the block."""
         if number != signal.SIGINT:
             signals.append(signal.Signals(number))
         raise KeyboardInterrupt
 
-    def retry(unraisable: sys.UnraisableHookArgs) -> None:
-        if unraisable.exc_type is KeyboardInterrupt:  # raised in a library's callback, where no caller can catch it
-            raise_later(signals[-1] if signals else signal.SIGINT)
+    def raise_again(unraisable: sys.UnraisableHookArgs) -> None:
+        """Raise a signal again if it arrived in a library's callback, where no caller can catch KeyboardInterrupt."""
+        if unraisable.exc_type is KeyboardInterrupt:
+            retry_seconds = 0.02  # delay, after which the callback has ended
+            timer = threading.Timer(retry_seconds, signal.raise_signal, (signals[-1] if signals else signal.SIGINT,))
+            timer.daemon = True
+            timer.start()
         else:
-            usual_hook(unraisable)
+            replaced_hook(unraisable)
 
-    usual = {signal.SIGINT: signal.default_int_handler}
-    usual |= {getattr(signal, name): signal.SIG_DFL for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)}
-    if threading.current_thread() is not threading.main_thread():
-        usual = {}
-    handlers = {number: signal.getsignal(number) for number in usual}
-    handlers = {number: handler for number, handler in handlers.items() if handler in (usual[number], stop_at_once)}
-    for number in handlers:
+    for number in replaced_handlers:
         signal.signal(number, stop)
-    usual_hook, sys.unraisablehook = sys.unraisablehook, retry
+    sys.unraisablehook = raise_again
     try:
         yield
     finally:
-        sys.unraisablehook = usual_hook
-        for number, handler in handlers.items():
+        sys.unraisablehook = replaced_hook
+        for number, handler in replaced_handlers.items():
             signal.signal(number, handler)
 
 
@@ -211,29 +215,31 @@ def run(args: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if args is None else args)
     words = [word for word in arguments if word != DEBUG]
     as_json = "--progress=json" in words or ("--progress", "json") in pairwise(words)
+    json_lines = JsonLines()
+    signals: list[signal.Signals] = []  # SIGTERM or SIGHUP, if one arrives
 
-    def fail(message: str, code: int) -> int:
-        cause = getattr(sys.exc_info()[1], "__cause__", None)
-        if code < 128 and (signals or isinstance(cause, KeyboardInterrupt)):
-            return stopped()  # a library has turned the interruption into an error of its own
+    def print_style() -> AbstractContextManager[None]:
+        """Return a block that prints on stderr as JSON with ``--progress json``, otherwise as text."""
+        return json_progress(json_lines) if as_json else nullcontext()
+
+    def end_with(message: str, code: int) -> int:
+        """Print an error, and return the exit code."""
         if DEBUG in arguments:
             traceback.print_exc()
-        with in_style():
+        with print_style():
             say(message, kind="error")
         return code
 
-    lines = JsonLines()
-
-    def in_style() -> AbstractContextManager[None]:
-        return json_progress(lines) if as_json else nullcontext()
-
-    signals: list[signal.Signals] = []
-
-    def stopped() -> int:
-        return fail(f"ended by {signals[0].name}", 128 + signals[0]) if signals else fail("interrupted", INTERRUPTED)
+    def end_by_signal() -> int:
+        """Print that the run was ended, by Ctrl-C if by no other signal, and return the exit code."""
+        return (
+            end_with(f"ended by {signals[0].name}", 128 + signals[0])
+            if signals
+            else end_with("interrupted", INTERRUPTED)
+        )
 
     try:
-        with plain_warnings(), _orderly_stop(signals), in_style():
+        with plain_warnings(), _orderly_stop(signals), print_style():
             _check_working_directory()
             words = [LOOK, *words] if words and _is_scene(words[0]) else words
             words = [*words[1:], "--help"] if words[:1] == ["help"] else words
@@ -241,23 +247,31 @@ def run(args: Sequence[str] | None = None) -> int:
             code = command(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
             with suppress(BrokenPipeError):  # the reader of a pipe has closed it
                 sys.stdout.flush()
-        return stopped() if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
-    except GsmergeError as error:
-        return fail(str(error), error.exit_code)
+        return end_by_signal() if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
     except (KeyboardInterrupt, typer.Abort) as error:
-        if isinstance(error.__cause__, EOFError):  # Typer takes it for the end of user input, which no command reads
-            return fail("unexpected error: EOFError; run again with --debug", 1)
-        return stopped()
+        if isinstance(error.__cause__, EOFError) and not signals:
+            # Typer takes it for the end of user input, which no command reads
+            return end_with("unexpected error: EOFError; run again with --debug", 1)
+        return end_by_signal()
     except BrokenPipeError:
         return 1
     except Exception as error:
-        if isinstance(error, UsageErrors):
-            return fail(usage_message(error), UsageError.exit_code)
-        if is_out_of_memory(error) or file_problem(error) is not None:
-            return fail(error_line(error, "what was printed"), SceneError.exit_code)
-        if is_opencv_damaged(error):
-            return fail(DAMAGED_OPENCV, 1)
-        if is_torch_missing(error):
-            return fail(NO_TORCH, UsageError.exit_code)
-        first = f"{type(error).__name__}: {error}".splitlines()[0]
-        return fail(f"unexpected error: {first}; run again with --debug", 1)
+        if signals or isinstance(error.__cause__, KeyboardInterrupt):  # a library has made an error of the interruption
+            return end_by_signal()
+        return end_with(*_explain(error))
+
+
+def _explain(error: Exception) -> tuple[str, int]:
+    """Return the message and the exit code for an exception that ends a command."""
+    if isinstance(error, GsmergeError):
+        return str(error), error.exit_code
+    if isinstance(error, UsageErrors):
+        return usage_message(error), UsageError.exit_code
+    if is_out_of_memory(error) or file_problem(error) is not None:
+        return error_line(error, "what was printed"), SceneError.exit_code
+    if is_opencv_damaged(error):
+        return DAMAGED_OPENCV, 1
+    if is_torch_missing(error):
+        return NO_TORCH, UsageError.exit_code
+    first_line = f"{type(error).__name__}: {error}".splitlines()[0]
+    return f"unexpected error: {first_line}; run again with --debug", 1

@@ -27,7 +27,7 @@ JOBS = Setting("", kind=int | Literal["auto"], least=1)
 MAX_LISTED = 20  # rows of the table, failures, and doubtful results
 TABLE_HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
-# Key of a reason -> word before it, and noun
+# Kinds of reasons that are listed for scenes -> word before each line, and noun with which the others are counted
 REASONS = {
     "doubt": ("warning", "warning"), "unmet": ("missed target", "missed target"), "lacking": ("note", "note"),
     "error": ("failed", "failure"),
@@ -102,7 +102,7 @@ def batch(args: opt.Args) -> None:
 
 
 def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, notes: Sequence[str]) -> None:
-    """Compact all scenes, report each one, and print a summary."""
+    """Compact all scenes, print a summary, and raise an error if some failed or missed their target."""
     from gsmerge.batch.run import choose_concurrency
 
     totals = Totals(len(jobs))
@@ -130,7 +130,7 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, notes: Sequ
 
 
 def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals: Totals) -> None:
-    """Run jobs, show progress, count each record, and print it with ``--json``."""
+    """Compact the scenes of all jobs, add each record to the totals, and print it with ``--json``."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.records import FAILED, SKIPPED
 
@@ -145,6 +145,7 @@ def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals
             if args.json:
                 print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
             failure, num_skipped = record["error"] or "", totals.counts[SKIPPED]
+            # scenes that are skipped take no time, so they do not count
             share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
             report = record["report"] or {"notes": record["doubts"]}  # a result that was done before has no report
             notes = [Doubt(note) if note in record["doubts"] else note for note in report["notes"]]
@@ -152,35 +153,41 @@ def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
-    """Raise BatchError if jobs ``failed`` (name, reason); give the first reason unless all were ``listed``."""
+    """Raise BatchError if jobs ``failed`` (name, reason).
+
+    The message has the first reason, unless all reasons have been ``listed`` already.
+    """
     if failed:
         raise BatchError(f"{len(failed)} of {count_words(total, unit)} failed{_first_reason(failed, listed=listed)}")
 
 
 def _first_reason(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
-    """Return the first scene and its reason, for the end of a message; "" if none, or all were ``listed`` before."""
+    """Return the end of a message: the first scene and its reason.
+
+    Empty if there is none, or if all reasons have been ``listed`` already.
+    """
     return "" if listed or not reasons else "; the first: {}: {}".format(*reasons[0])
 
 
 @dataclass
 class Totals:
-    """Results of a run, for the lines at its end."""
+    """Results of a batch, for the lines that are printed at its end."""
 
     total: int  # scenes
-    counts: Counter[str] = field(default_factory=Counter)  # scenes by status; Gaussians in and out
-    rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results
-    # Scenes and reasons: doubts and missed targets, also of skipped results; lacking files; failures
+    counts: Counter[str] = field(default_factory=Counter)  # scenes by status; "in" and "out": Gaussians
+    rows: list[tuple[str, ...]] = field(default_factory=list)  # rows of the table, for the first results
+    # Kind of reason -> scenes with their reasons. Skipped results also count, with their doubts and missed targets
     reasons: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: {name: [] for name in REASONS})
 
     def add(self, record: Mapping[str, Any]) -> None:
-        """Count the record of one scene."""
+        """Add the record of one scene to the totals."""
         report = record["report"]
-        reasons = {"doubt": "; also ".join(record["doubts"]), "lacking": "", **record}
+        reasons = {"doubt": "; also ".join(record["doubts"]), "unmet": record["unmet"], "error": record["error"]}
         if report and not report["input"]["num_photos"] and {*record["doubts"]} <= {report["worse"]}:
             reasons["lacking"] = _describe_lack(report)
-        for name, reason in reasons.items():
-            if reason and name in REASONS:
-                self.reasons[name].append((record["scene"], reason))
+        for kind, reason in reasons.items():
+            if reason:
+                self.reasons[kind].append((record["scene"], reason))
         self.counts[record["status"]] += 1
         if report:
             self.counts["in"] += report["input"]["num_gaussians"]
@@ -189,7 +196,10 @@ class Totals:
                 self.rows.append(_row(record["output"], report))
 
     def lines(self, columns: int | None = None) -> list[str]:
-        """Format the end of a run: a table, ``columns`` wide, of the results, notes, failures, and a line of totals."""
+        """Return the last lines of a batch: a table of results, reasons of each kind, and a line of totals.
+
+        The table is at most ``columns`` wide.
+        """
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.io.image_names import natural_key
         from gsmerge.measure.documents import text_table
@@ -206,32 +216,35 @@ class Totals:
             grouped = _list_reasons(self.reasons[name])
             lines += [f"{word}: {line}" for line in grouped[:MAX_LISTED]]
             lines += [f"... and {count_words(len(grouped) - MAX_LISTED, f'more {noun}')}"] * (len(grouped) > MAX_LISTED)
-        ends = {status: self.counts[status] for status in (DONE, SKIPPED, FAILED)}
-        parts = [f"{count:,} {status}" for status, count in ends.items() if count or status == DONE]
-        num_left = self.total - sum(ends.values())
-        line = f"{count_words(self.total, 'scene')}: {', '.join([*parts, *[f'{num_left:,} left'] * (num_left > 0)])}"
+        counts = {status: self.counts[status] for status in (DONE, SKIPPED, FAILED)}
+        counts["left"] = self.total - sum(counts.values())
+        parts = [f"{count:,} {status}" for status, count in counts.items() if count > 0 or status == DONE]
+        total_line = f"{count_words(self.total, 'scene')}: {', '.join(parts)}"
         if num_input := self.counts["in"]:
             share = human_share(self.counts["out"] / num_input)
-            line += f"; {num_input:,} -> {self.counts['out']:,} Gaussians ({share})"
+            total_line += f"; {num_input:,} -> {self.counts['out']:,} Gaussians ({share})"
         for name, words in (("unmet", "missed the target"), ("doubt", "doubtful")):
-            line += f"; {len(self.reasons[name]):,} {words}" if self.reasons[name] else ""
-        return [*lines, line]
+            total_line += f"; {len(self.reasons[name]):,} {words}" if self.reasons[name] else ""
+        return [*lines, total_line]
 
 
 def _list_reasons(reasons: Sequence[tuple[str, str]]) -> list[str]:
-    """Describe scenes with their reasons: each reason once, and the scene before it unless the reason begins so."""
-    scenes: dict[str, list[str]] = {}
+    """Return a line for each reason, such as "first and 3 others: no cameras found".
+
+    A reason that begins with the scene's name is a line by itself.
+    """
+    scenes_by_reason: dict[str, list[str]] = {}
     for scene, reason in reasons:
-        scenes.setdefault(reason, []).append(scene)
+        scenes_by_reason.setdefault(reason, []).append(scene)
     lines = []
-    for reason, (first, *more) in scenes.items():
+    for reason, (first, *more) in scenes_by_reason.items():
         others = f" and {count_words(len(more), 'other')}" if more else ""
         lines.append(reason if reason.startswith(first) else f"{first}{others}: {reason}")
     return lines
 
 
 def _describe_lack(report: Mapping[str, Any]) -> str:
-    """Describe what is missing for a scene that no photo shows, and what its numbers are measured on."""
+    """Describe which files are missing for a scene without photos, and what its scores are measured on instead."""
     from gsmerge.photos.row_colors import ROW_COLORS
 
     if not report["input"]["num_views"]:
@@ -241,7 +254,7 @@ def _describe_lack(report: Mapping[str, Any]) -> str:
 
 
 def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the row of the table for a result and its report."""
+    """Return the row of the table for a result, by its report."""
     from gsmerge.raster.metrics import MAX_PSNR, psnr_figure
     from gsmerge.runtime.memory import human_share
 
@@ -259,14 +272,14 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, notes: Sequence[str]) -> None:
-    """Print which scenes a run would do."""
+    """Print which scenes a batch would compact, for ``--dry-run``; BatchError if some would fail."""
     from gsmerge.batch.run import choose_concurrency, pending_jobs
     from gsmerge.measure.documents import document_head, note_entries
 
     out, pending = args.output, pending_jobs(jobs, args.output, options)
     concurrency = choose_concurrency(jobs, options)
-    refusals = {job.scene: refusal for job, refusal in pending}
-    num_refused = sum(refusal is not None for refusal in refusals.values())
+    pending_scenes = {job.scene: refusal for job, refusal in pending}  # a refusal of None: would be compacted
+    num_refused = sum(refusal is not None for refusal in pending_scenes.values())
     num_pending = len(pending) - num_refused
     document = {
         **document_head(),
@@ -281,8 +294,8 @@ def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, note
                 "scene": job.scene,
                 "output": job.output,
                 "num_gaussians": job.num_gaussians,
-                "done": job.scene not in refusals,
-                "error": refusals.get(job.scene),
+                "done": job.scene not in pending_scenes,
+                "error": pending_scenes.get(job.scene),
             }
             for job in jobs
         ],

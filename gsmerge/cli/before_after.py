@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 def lpips_networks(
     choice: str | None, usual: Sequence[str] = EvaluateOptions().lpips
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Choose LPIPS networks by ``--lpips``, by default the installed ones of ``usual``; note if there is none."""
+    """Return the LPIPS networks to measure with, by ``--lpips``, and a note if there is none.
+
+    By default they are those of the ``usual`` networks that are installed.
+    """
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
     if choice is None:
@@ -39,11 +42,10 @@ class BeforeAfter:
     """A scene and its compact versions, as commands compare them."""
 
     load: Loaded  # the scene as it was read
-    scene: Scene  # the scene with views; placed views if it has none
+    scene: Scene  # the scene with the views to measure; if it has no views, some are placed
     held_out: Views | None  # views that were not part of the input
     plys: dict[str, GaussianFile]  # the compact versions by name
-    # Cameras of the input views, by name of a version, for versions whose cameras differ from those of the scene
-    cameras: dict[str, Cameras]
+    cameras: dict[str, Cameras]  # version -> cameras of the input views, if that version moved them
     notes: list[str]  # one sentence for each adaptation
 
     @property
@@ -60,7 +62,10 @@ class BeforeAfter:
 
 
 def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
-    """Read the scenes BEFORE (``files``) and AFTER, and the views of ``--targets``; place views if there are none."""
+    """Read a scene, its compact versions, and the held-out views of ``--targets``.
+
+    ``files`` are those of the scene. If it has no views, some are placed.
+    """
     from gsmerge.facts.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.io import read_gaussians
     from gsmerge.io.scene_files import result_cameras
@@ -87,7 +92,10 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
-    """Read the cameras that ``compact`` wrote into or beside results, if the fit has moved them; add notes."""
+    """Return the cameras of results whose fit moved the cameras of the scene, by name of the result, and notes.
+
+    They are read from the result, or from the file beside it.
+    """
     import numpy as np
 
     from gsmerge.geometry.frame import scene_depth
@@ -97,11 +105,11 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
 
     cameras: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
-    tolerance = 1e-5  # largest difference, absolute and relative, of equal poses after writing and reading
+    tolerance = 1e-5  # difference, absolute and relative, that writing and reading a pose may cause
     for name, path in zip(file_names(paths), paths, strict=True):
         camera_path, camera_file = result_cameras(path), None
         if camera_path is not None and scene.is_shown:
-            with suppress(SceneError):  # the results can be measured without this file, whoever wrote it
+            with suppress(SceneError):  # a damaged camera file does not prevent measuring
                 camera_file = read_cameras(camera_path)
         if camera_file is None or camera_path is None or camera_file.names != scene.names:
             continue
@@ -117,7 +125,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
 
 
 def require_views(load: Loaded) -> None:
-    """Raise SceneError if a scene has no cameras."""
+    """Raise SceneError if a scene has no views."""
     if len(load.scene) == 0:
         problem = "expected cameras to measure from, found none beside the scene"
         raise SceneError(load.files.ply, problem, "name them with --cameras")
@@ -126,7 +134,10 @@ def require_views(load: Loaded) -> None:
 def held_out_views(
     load: Loaded, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
-    """Choose the context views by ``--views``, and the held-out views; return scene, held-out views and notes."""
+    """Return the scene with as many ``views`` as ``--views`` asks for, the held-out views of ``targets``, and notes.
+
+    With ``views``, only the held-out views between the chosen ones are returned.
+    """
     from gsmerge.photos.views import even_views, midpoint_views, subset
     from gsmerge.scene.held_out import read_held_out
 
@@ -149,7 +160,10 @@ def held_out_views(
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:
-    """Name each file uniquely: by file name if all names differ, otherwise by path; UsageError for a repeated file."""
+    """Return a unique name of each file; UsageError for a repeated file.
+
+    It is the file name if all file names differ, otherwise the path.
+    """
     if len(set(paths)) < len(paths):
         raise UsageError(f"expected every result once, got {max(paths, key=paths.count)} twice")
     short = [path.name for path in paths]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gsmerge.scene.read import Loaded
 
 REMEDY = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
-# Arguments and options that apply to Feature Gaussians too
+# Arguments and options that also apply if the input is a .gsm of Feature Gaussians
 FEATURE_OPTIONS = ("scenes", "k", "set", "output", "overwrite", "dry_run", "open", "json", "quiet", "threads")
 
 
@@ -43,6 +43,12 @@ PARAMETERS = (
 )  # fmt: skip
 
 
+class FeatureFile(NamedTuple):
+    """An input of Feature Gaussians, in place of a scene."""
+
+    base: Path  # The .gsm, after which the output is named
+
+
 @opt.command(*PARAMETERS)
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -53,12 +59,12 @@ def compact(args: opt.Args) -> None:
 def look(args: opt.Args) -> None:
     """Compact a scene, and open a page that compares it with the result: ``gsmerge SCENE``."""
     source, out = _find_input(args)
-    # The page cannot show joined files or Feature Gaussians, so it shows the result alone
-    shown = [out] if isinstance(source, Path) or len(args.scenes) > 1 else [args.scenes[0], out]
+    # A page cannot show joined scenes or Feature Gaussians, so it shows their result alone
+    on_page = [out] if isinstance(source, FeatureFile) or len(args.scenes) > 1 else [args.scenes[0], out]
     if os.path.exists(out) and not (args.overwrite or args.dry_run):
-        words = shlex.join(["gsmerge", "view", *map(str, shown)])
-        raise UsageError(f"{out}: exists already; {words} shows it, --overwrite makes it again")
-    loads = list["Loaded"]()
+        view_command = shlex.join(["gsmerge", "view", *map(str, on_page)])
+        raise UsageError(f"{out}: exists already; {view_command} shows it, --overwrite makes it again")
+    loads: list[Loaded] = []
     _compact(args, source, out, loads.append)
     from gsmerge.io.formats.table import VIEWED
 
@@ -66,29 +72,32 @@ def look(args: opt.Args) -> None:
         return
     from gsmerge.cli.view_command import view
 
-    before, *after = shown
-    cameras = {} if len(shown) == 1 else args.get_given(("cameras", "images", "masks", "protect", "hint"))
+    before, *after = on_page
+    cameras = args.get_given(("cameras", "images", "masks", "protect", "hint")) if after else {}
     loaded = replace(loads[0], notes=()) if after else None  # its notes have been printed already
     opens = args.open and not args.json
     opt.call(view, before=before, after=after, **cameras, open=opens, quiet=args.silent, loaded=loaded)
 
 
-def _find_input(args: opt.Args) -> tuple[SceneFiles | Path, Path]:
-    """Return the files of the scene, or the path of Feature Gaussians; and the path of the output."""
-    features = _find_features(args.scenes)
-    if features is None:
+def _find_input(args: opt.Args) -> tuple[SceneFiles | FeatureFile, Path]:
+    """Return what the command reads, which is a scene or a file of Feature Gaussians, and the path of the output."""
+    source: SceneFiles | FeatureFile | None = _find_features(args.scenes)
+    if source is None:
         _check_scenes(args)
-        files = args.files(*args.scenes)
-    default = default_output(files.base if features is None else features)
-    return files if features is None else features, output_file(args.output or default, default.name)
+        source = args.files(*args.scenes)
+    default = default_output(source.base)
+    return source, output_file(args.output or default, default.name)
 
 
 def _compact(
-    args: opt.Args, source: SceneFiles | Path, out: Path, on_read: Callable[[Loaded], None] | None = None
+    args: opt.Args, source: SceneFiles | FeatureFile, out: Path, on_read: Callable[[Loaded], None] | None = None
 ) -> None:
-    """Run ``compact`` on a scene, or decode Feature Gaussians; ``on_read`` is called with the scene after reading."""
-    if isinstance(source, Path):
-        _decode(args, source, out)
+    """Compact a scene, or decode Feature Gaussians; ``on_read`` is called with the scene that was read, if any.
+
+    With ``on_read`` the caller shows the result on a page.
+    """
+    if isinstance(source, FeatureFile):
+        _decode(args, source.base, out)
         return
     hints = args.hints()
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
@@ -118,7 +127,10 @@ def _compact(
 
 
 def _choose_levels(args: opt.Args, settings: CompactOptions, outputs: Outputs) -> CompactOptions:
-    """Choose the number of levels by the format of the output; UsageError if levels or budget do not fit it."""
+    """Choose the number of levels by the format of the output; UsageError if the format does not allow the settings.
+
+    A format may have no levels, or no budget in bytes.
+    """
     from gsmerge.facts.counts import STREAMED_LEVELS
 
     out, format_ = outputs.result, outputs.format
@@ -139,7 +151,7 @@ def _check_outputs(args: opt.Args, files: SceneFiles, settings: CompactOptions, 
     num_files = settings.budget.levels if outputs.format.levels == "apart" else 1
     levels = [level_output(outputs.result, level) for level in range(1, num_files)]
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
-    # Without --overwrite the camera file may exist, from a result in another format
+    # Results in several formats share a camera file, so it may exist unless it is to be replaced
     replaced_cameras = outputs.viewer_cameras if args.overwrite else None
     paths = (*outputs.paths, *levels, replaced_cameras)
     check_outputs(paths, (*input_files(files), *networks), overwrite=args.overwrite or args.dry_run)
@@ -148,24 +160,24 @@ def _check_outputs(args: opt.Args, files: SceneFiles, settings: CompactOptions, 
 
 
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
-    """Print the report of a run and, unless a page is ``shown``, how to view the result.
+    """Print the report of a run and, unless a page will show the result (``shown``), how to view it.
 
-    TargetError if a target is missed.
+    Raises TargetError if a target is missed and, with ``--strict``, if the result is doubtful.
     """
     from gsmerge.compaction.report import result_table
     from gsmerge.io.formats.table import VIEWED
 
-    said_last = document["doubts"] if args.strict else [document["worse"]]
-    say_notes([note for note in document["notes"] if note not in said_last], quiet=args.silent)
+    printed_last = document["doubts"] if args.strict else [document["worse"]]
+    say_notes([note for note in document["notes"] if note not in printed_last], quiet=args.silent)
     columns, next_step = terminal_columns(sys.stdout), None
     if columns is not None:
         words = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
-        # A file name that begins with a dash would be taken for an option
+        # With ./ before it, a file name that begins with a dash is not taken for an option
         next_step = shlex.join([f"./{word}" if word.endswith(out.name) and word[0] == "-" else word for word in words])
     lines = result_table(document, next_step or None, columns=columns)
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
-    unchecked = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]
-    if args.strict and unchecked and not document["worse"]:
+    has_no_score = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]
+    if args.strict and has_no_score and not document["worse"]:
         say_notes(["--strict: nothing was checked, since there is no photo to compare with"], quiet=args.silent)
     problems = [document["unmet"], *(document["doubts"] if args.strict else [])]
     if document["worse"] and not args.strict:
@@ -180,7 +192,7 @@ def _decode(args: opt.Args, path: Path, out: Path) -> None:
     """Decode the Feature Gaussians of a ``.gsm``, and write the result."""
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected Feature Gaussians as the only input, got {len(args.scenes)} inputs")
-    args.require_scene(FEATURE_OPTIONS, path)
+    args.refuse_options(FEATURE_OPTIONS, path)
     from gsmerge.compaction.outputs import plan_outputs
     from gsmerge.settings.stages import DecodeOptions
     from gsmerge.states.files import decode_file, decoding_line
@@ -194,8 +206,8 @@ def _decode(args: opt.Args, path: Path, out: Path) -> None:
     print_document(document, decoding_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)
 
 
-def _find_features(scenes: Sequence[Path]) -> Path | None:
-    """Return the first path that is a ``.gsm`` of Feature Gaussians; None if there is none."""
+def _find_features(scenes: Sequence[Path]) -> FeatureFile | None:
+    """Return the first input that is a ``.gsm`` of Feature Gaussians; None if there is none."""
     from gsmerge.io.formats.table import STATE_ENDING
 
     states = [path for path in scenes if path.suffix.lower() == STATE_ENDING and path.is_file()]
@@ -203,11 +215,14 @@ def _find_features(scenes: Sequence[Path]) -> Path | None:
         return None
     from gsmerge.states.state_file import holds_features
 
-    return next((path for path in states if holds_features(path)), None)
+    return next((FeatureFile(path) for path in states if holds_features(path)), None)
 
 
 def _check_scenes(args: opt.Args) -> None:
-    """Raise UsageError for several scenes with one ``--cameras``, a missing or a repeated scene, or a result."""
+    """Raise UsageError if several scenes cannot be joined.
+
+    They cannot if ``--cameras`` names one file for all, or if a scene is missing, given twice, or a result.
+    """
     if len(args.scenes) == 1:
         return
     if args.cameras not in (None, NONE):

@@ -31,7 +31,7 @@ class JsonLines:
 
     start: float = field(default_factory=time.monotonic)
     share: float | None = None  # of the run that is done; None: unknown
-    begun: tuple[float, float] | None = None  # seconds since the start, and share, when the share was first known
+    first: tuple[float, float] | None = None  # seconds since the start, and share, when the share was first known
 
     def print(self, event: Mapping[str, Any]) -> None:
         """Print an event with the seconds since the start, the share that is done and the seconds left."""
@@ -42,19 +42,23 @@ class JsonLines:
             print(json.dumps({**event, **numbers}), file=sys.stderr, flush=True)
 
     def move(self, share: float | None) -> None:
-        """Set the share that is done, unless it is not known; it never decreases."""
+        """Set the share that is done, if it is known and not smaller than before."""
         if share is not None:
             self.share = max(self.share or 0.0, share)
-            self.begun = self.begun or (self.seconds, self.share)
+            self.first = self.first or (self.seconds, self.share)
 
     @property
     def seconds_left(self) -> float | None:
-        """Seconds until the run ends, at the rate since the share was first known; None if it has not grown since."""
+        """Seconds until the run ends, if it goes on as fast as since the share was first known.
+
+        None if the share is not known, or has not grown since.
+        """
         if self.share == 1:
             return 0.0
-        if self.share is None or self.begun is None or self.share <= self.begun[1]:
+        first_seconds, first_share = self.first or (0.0, 1.0)
+        if self.share is None or self.share <= first_share:
             return None
-        return (self.seconds - self.begun[0]) * (1 - self.share) / (self.share - self.begun[1])
+        return (self.seconds - first_seconds) * (1 - self.share) / (self.share - first_share)
 
     @property
     def seconds(self) -> float:
@@ -62,32 +66,31 @@ class JsonLines:
         return time.monotonic() - self.start
 
 
-_stream: ContextVar[JsonLines | None] = ContextVar("stream", default=None)  # None: progress is not shown as JSON
+_json_lines: ContextVar[JsonLines | None] = ContextVar("json_lines", default=None)  # None: progress is not JSON
 
 
 def one_line(text: str) -> str:
-    """Escape text from files or names for a terminal, and shorten it to one line."""
+    """Escape the characters of a text that no terminal prints, such as line breaks, and shorten it if it is long."""
     clean = text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
     max_line = 5000  # characters
     return clean if len(clean) <= max_line else f"{clean[: max_line // 2]} ... {clean[-max_line // 2 :]}"
 
 
 def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
-    """Print one line on stderr unless ``quiet``; wrap it on a terminal, and ignore a closed stderr.
+    """Print a message as one line on stderr unless ``quiet``; a closed stderr is ignored.
 
-    Notes, warnings and errors begin with their kind. With progress as JSON, a line is an object whose key is the kind,
-    and is printed even if ``quiet``.
+    Notes, warnings and errors begin with their kind. A terminal wraps the line between words. With ``--progress json``
+    the line is a JSON object, whose key is the kind. It is printed even if ``quiet``.
     """
-    stream = _stream.get()
-    if stream is not None:
-        stream.print({kind: one_line(message)})
-    if quiet or stream is not None:
-        return
-    from gsmerge.measure.documents import wrap_line
+    json_lines = _json_lines.get()
+    if json_lines is not None:
+        json_lines.print({kind: one_line(message)})
+    elif not quiet:
+        from gsmerge.measure.documents import wrap_line
 
-    text = one_line(PREFIXES[kind] + message)
-    with suppress(OSError):
-        print("\n".join(wrap_line(text, terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
+        text = one_line(PREFIXES[kind] + message)
+        with suppress(OSError):
+            print("\n".join(wrap_line(text, terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
 
 
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
@@ -104,7 +107,10 @@ def terminal_columns(stream: Any) -> int | None:
 def print_document(
     document: Mapping[str, Any], lines: Sequence[str] | str, *, as_json: bool, quiet: bool = False, wrap: bool = True
 ) -> None:
-    """Print a result on stdout as JSON or, unless ``quiet``, as lines; ``wrap``: break long lines in a terminal."""
+    """Print a result on stdout: the document as JSON or, unless ``quiet``, the lines of text.
+
+    ``wrap``: lines that are longer than the terminal is wide are broken between words.
+    """
     from gsmerge.measure.documents import to_json, wrap_line
 
     if as_json:
@@ -117,16 +123,19 @@ def print_document(
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Print each warning in the block on one line, without file and line number; NumPy's warnings give one note."""
-    numeric_warnings: list[str] = []
+    """Print each warning in the block on one line, without file and line number.
+
+    NumPy's warnings about numbers give one note together.
+    """
+    has_numeric_note = False
 
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        nonlocal has_numeric_note
         if not issubclass(category, RuntimeWarning):
             say(str(message), kind="warning")
-            return
-        if not numeric_warnings:
+        elif not has_numeric_note:
             say(f"some numbers are too large or undefined ({message})", kind="note")
-        numeric_warnings.append(str(message))
+            has_numeric_note = True
 
     with warnings.catch_warnings():
         warnings.showwarning = show
@@ -134,13 +143,13 @@ def plain_warnings() -> Iterator[None]:
 
 
 def _terminal(*, quiet: bool) -> Any:
-    """Open Rich's console on stderr; None if quiet, or if stderr is not a terminal."""
+    """Open Rich's console on stderr; return None if ``quiet``, or if stderr is not a terminal."""
     if quiet:
         return None
     from rich.console import Console
 
     console = Console(stderr=True)
-    # The terminal prints ^C after the bar on Ctrl-C, which must not wrap to a new line
+    # On Ctrl-C the terminal prints ^C after the bar. Without room for it, ^C would wrap to a new line
     console.width = max(20, console.width - len("^C") - 1)
     return console if console.is_terminal else None
 
@@ -148,17 +157,17 @@ def _terminal(*, quiet: bool) -> Any:
 @contextmanager
 def json_progress(lines: JsonLines | None = None) -> Iterator[None]:
     """Print progress in the block as lines of JSON on stderr, even with ``--quiet``; continue ``lines`` if given."""
-    token = _stream.set(lines or JsonLines())
+    token = _json_lines.set(lines or JsonLines())
     try:
         yield
     finally:
-        _stream.reset(token)
+        _json_lines.reset(token)
 
 
-def _share(text: str, done: int, total: int) -> float | None:
-    """Return the share of a run that is done at an event of progress; None if it is not known.
+def _share_done(text: str, done: int, total: int) -> float | None:
+    """Return the share of a run that is done when it reports progress; None if the share is not known.
 
-    It follows from the parts that the run expects; without any, from the steps of a stage that counts them.
+    The record of the run forecasts the share. Without a forecast, the steps of a stage give it, if they are counted.
     """
     from gsmerge.runtime.record import STAGES, current_record
 
@@ -172,53 +181,52 @@ def _share(text: str, done: int, total: int) -> float | None:
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     """Show a progress bar of a run on stderr, if it is a terminal (or ``FORCE_COLOR`` is set) and not ``quiet``.
 
-    Yields ``(stage, done, total) -> None``, which shows the stage, and the time left at the rate so far.
+    Yields a function of ``(stage, done, total)``. It shows the stage, and the time left if the run goes on as fast.
     """
-    stream, console = _stream.get(), _terminal(quiet=quiet)
-    if stream is not None:
+    json_lines, console = _json_lines.get(), _terminal(quiet=quiet)
+    if json_lines is not None:
 
-        def print_event(text: str, done: int, total: int) -> None:
+        def print_json(text: str, done: int, total: int) -> None:
             stage, _, detail = one_line(text).partition(": ")
-            stream.move(_share(text, done, total))
-            stream.print({"stage": stage, "detail": detail, "done": done, "total": total})
+            json_lines.move(_share_done(text, done, total))
+            json_lines.print({"stage": stage, "detail": detail, "done": done, "total": total})
 
-        yield print_event
-        return
-    if console is None:
+        yield print_json
+    elif console is None:
         yield lambda stage, done, total: None
-        return
-    from rich import progress as rich
-    from rich.table import Column
+    else:
+        from rich import progress as rich
+        from rich.table import Column
 
-    text_column = Column(no_wrap=True, overflow="ellipsis")
-    narrow_columns = 60  # columns; narrower terminals get shorter bars with less text
-    is_wide = console.width >= narrow_columns
-    columns = [rich.BarColumn(16 if is_wide else 8), rich.TimeRemainingColumn(compact=True)]
-    columns += [rich.TimeElapsedColumn()] if is_wide else []
-    columns += [rich.TextColumn("{task.description}", markup=False, table_column=text_column)]
-    with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
-        task = bars.add_task("", total=None)
+        text_column = Column(no_wrap=True, overflow="ellipsis")
+        least_columns = 60  # narrower terminals get shorter bars with less text
+        is_wide = console.width >= least_columns
+        columns = [rich.BarColumn(16 if is_wide else 8), rich.TimeRemainingColumn(compact=True)]
+        columns += [rich.TimeElapsedColumn()] if is_wide else []
+        columns += [rich.TextColumn("{task.description}", markup=False, table_column=text_column)]
+        with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
+            task = bars.add_task("", total=None)
 
-        def move(text: str, done: int, total: int) -> None:
-            share, is_stage = _share(text, done, total), ": " not in text
-            total_share = None if share is None else 1.0
-            bars.update(task, description=one_line(text), completed=share, total=total_share, refresh=is_stage)
+            def move_bar(text: str, done: int, total: int) -> None:
+                share, is_stage = _share_done(text, done, total), ": " not in text
+                total_share = None if share is None else 1.0
+                bars.update(task, description=one_line(text), completed=share, total=total_share, refresh=is_stage)
 
-        yield move
+            yield move_bar
 
 
 @contextmanager
 def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
-    """Redirect Ray's messages about lost processes in the block from stdout to stderr, or discard them if ``quiet``."""
+    """Keep stdout free for data: in the block, Ray's messages go to stderr, or nowhere if ``quiet``."""
     if engine != "ray":
         yield
         return
-    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere if quiet else sys.stderr):
+    with open(os.devnull, "w", encoding="utf-8") as null_device, redirect_stdout(null_device if quiet else sys.stderr):
         yield
 
 
 class RunEnd(NamedTuple):
-    """The end of one of many runs."""
+    """Facts about one of many runs, when it ends."""
 
     name: str
     status: str
@@ -230,7 +238,7 @@ class RunEnd(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Description, with the number of failures so far."""
+        """Name and status of the run, and the number of failures so far."""
         ending = {"skipped": "skipped, since it was done before"}.get(self.status, self.status)
         ending += ", doubtful" if list_doubts(self.notes) else ""
         return f"{self.name} {ending}{f', {self.num_failed} failed' if self.num_failed and not self.failure else ''}"
@@ -241,44 +249,43 @@ RunProgress = Callable[[RunEnd], None]
 
 @contextmanager
 def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
-    """Show one bar for many runs on stderr, with the time left, and the last failure below it.
+    """Show one bar for many runs on stderr, with the time left, and print each failure.
 
-    Without a terminal it prints a line for each run. Yields a function that is called at the end of each run.
+    Without a terminal a line is printed for each run. Yields a function to call at the end of each run.
     """
-    stream = _stream.get()
-    if stream is not None:
-        stream.move(0.0)
+    json_lines = _json_lines.get()
+    console = _terminal(quiet=quiet or json_lines is not None)
+    if json_lines is not None:
+        json_lines.move(0.0)
 
-        def print_event(end: RunEnd) -> None:
+        def print_json(end: RunEnd) -> None:
             say_notes(name_notes(end.name, end.notes))
-            stream.move(end.share)
+            json_lines.move(end.share)
             event = {"scene": end.name, "status": end.status, "done": end.done, "total": total}
             event |= {"failed": end.num_failed, "doubts": list_doubts(end.notes), "error": end.failure or None}
-            stream.print(event)
+            json_lines.print(event)
 
-        yield print_event
-        return
-    console = _terminal(quiet=quiet)
-    if console is None:
+        yield print_json
+    elif console is None:
 
-        def print_run(end: RunEnd) -> None:
+        def print_line(end: RunEnd) -> None:
             text = end.status if end.failure.startswith(end.name) else end.text
             say(f"{end.done}/{total} {text}{f': {end.failure}' if end.failure else ''}", quiet=quiet)
 
-        yield print_run
-        return
-    from rich import progress as rich
+        yield print_line
+    else:
+        from rich import progress as rich
 
-    columns = (
-        rich.BarColumn(16), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
-        rich.TimeRemainingColumn(), rich.TextColumn("{task.description}", markup=False),
-    )  # fmt: skip
-    with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
-        task = bars.add_task("", total=total)
+        columns = (
+            rich.BarColumn(16), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
+            rich.TimeRemainingColumn(), rich.TextColumn("{task.description}", markup=False),
+        )  # fmt: skip
+        with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
+            task = bars.add_task("", total=total)
 
-        def move(end: RunEnd) -> None:
-            bars.update(task, completed=end.done, description=one_line(end.text))
-            if end.failure:
-                bars.console.print(one_line(f"{end.name}: {end.failure}"), markup=False, highlight=False)
+            def move_bar(end: RunEnd) -> None:
+                bars.update(task, completed=end.done, description=one_line(end.text))
+                if end.failure:
+                    bars.console.print(one_line(f"{end.name}: {end.failure}"), markup=False, highlight=False)
 
-        yield move
+            yield move_bar

@@ -87,7 +87,7 @@ def _check_output_files(args: opt.Args, outputs: Sequence[Path], inputs: Sequenc
 
 
 def _describe_files(pair: BeforeAfter) -> dict[str, dict[str, Any]]:
-    """Collect facts about each file by name."""
+    """Return path and bytes of the scene and of each compact version, by name."""
     from gsmerge.measure.evaluate import INPUT
 
     infos = {INPUT: pair.load.info, **{name: ply.info for name, ply in pair.plys.items()}}

@@ -41,7 +41,7 @@ def extend(args: opt.Args) -> None:
     for files in batches:
         if any(path.resolve() == args.state.resolve() for path in input_files(files)):
             raise UsageError(f"{args.state}: expected a state other than the input; name another file")
-    documents, trial_state = list[dict[str, Any]](), None  # a dry run passes the state on, since it writes nothing
+    documents, trial_state = list[dict[str, Any]](), None  # in a dry run, the state that no file holds
     for files in batches:
         before = {"import": perf_counter() - args.start} if not documents else {}
         with stage_progress(quiet=args.silent) as progress:

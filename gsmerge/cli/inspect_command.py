@@ -72,8 +72,7 @@ def _print_checks(args: opt.Args) -> None:
     }
     lines = [check.line for check in checks if several or not check.problems]
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
-    count = f"wrong files: {len(wrong)} of {len(checks)}" if several else ""
-    if wrong and several and not args.silent:
-        raise SceneError(wrong[0].path, "refused, for the reason above", count)
     if wrong:
-        raise SceneError(wrong[0].path, "; ".join(wrong[0].problems), count)
+        # the lines of several files have told their problems
+        problem = "refused, for the reason above" if several and not args.silent else "; ".join(wrong[0].problems)
+        raise SceneError(wrong[0].path, problem, f"wrong files: {len(wrong)} of {len(checks)}" if several else "")

@@ -1,8 +1,9 @@
 """Declare the options of the command line, each once, and turn their values into settings.
 
-A command is a function of one :class:`Args`. The decorator :func:`command` lists its parameters for Typer, by the names
-of options that are declared here, and with parameters of its own. An option for a setting of the library has the
-setting's name and no default. Its help, values and shown default come from the setting (:func:`setting_option`).
+A command is a function of one :class:`Args`. The decorator :func:`command` lists its parameters for Typer: names of
+options that are declared here, and declarations that only this command has. An option for a setting of the library has
+the setting's name and no default. The setting gives its help, its values and the default that the help shows
+(:func:`setting_option`).
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ SETTINGS = {
 
 
 class Args(SimpleNamespace):
-    """Arguments and options of a command, by name; values of choices are plain strings."""
+    """Values of the arguments and options of a command, by name."""
 
     def __init__(self, **values: Any) -> None:
         super().__init__(**values)
@@ -63,26 +64,29 @@ class Args(SimpleNamespace):
 
     @property
     def silent(self) -> bool:
-        """True if only data is printed, or nothing."""
+        """True if no text is printed, but JSON or nothing."""
         return bool(self.quiet or self.json)
 
     def get_given(self, names: Iterable[str]) -> dict[str, Any]:
-        """Return the subset of the named options that the user gave."""
+        """Return the values of those of the named options that the user gave."""
         values = vars(self)
         return {name: values[name] for name in names if values.get(name) is not None}
 
-    def require_scene(self, names: Collection[str], path: Path) -> None:
-        """Raise UsageError for a given option outside ``names``, since the input ``path`` holds Feature Gaussians."""
+    def refuse_options(self, allowed: Collection[str], path: Path) -> None:
+        """Raise UsageError if the user gave an option that is not ``allowed`` for Feature Gaussians, as in ``path``."""
         for name, value in self.get_given(OPTIONS).items():
-            if value and name not in names and value != OPTIONS[name].default:
+            if value and name not in allowed and value != OPTIONS[name].default:
                 flag = f"--{name.replace('_', '-')}"
                 raise UsageError(
                     f"{flag}: expected a scene with it, but {path} holds Feature Gaussians; their number is set by --k"
                 )
 
     def make(self, *kinds: type, **changes: Any) -> list[Any]:
-        """Make settings of classes ``kinds`` from options, ``--set`` and ``changes``; UsageError if one is wrong."""
-        values = self.values(*kinds, but=changes) | changes
+        """Make an object of each class of settings in ``kinds``; UsageError if a value is wrong.
+
+        The values are those of :meth:`values`, replaced by ``changes``.
+        """
+        values = self.values(*kinds, without=changes) | changes
         settings = [{name: values[name] for name in flat_settings(kind) if name in values} for kind in kinds]
         with usage_errors():
             return [
@@ -90,9 +94,12 @@ class Args(SimpleNamespace):
                 for kind, arguments in zip(kinds, settings, strict=True)
             ]
 
-    def values(self, *kinds: type, but: Collection[str] = ()) -> dict[str, Any]:
-        """Collect the settings of the classes ``kinds`` that the user gave, by flat name, except those in ``but``."""
-        settings = {name: setting for kind in kinds for name, setting in flat_settings(kind).items() if name not in but}
+    def values(self, *kinds: type, without: Collection[str] = ()) -> dict[str, Any]:
+        """Return the values that the user gave for settings of the classes ``kinds``, by flat name.
+
+        Options, ``--set`` and the environment give them. The settings ``without`` are left out.
+        """
+        settings = {name: declared for name, declared in listed_settings(kinds).items() if name not in without}
         options = self.get_given(settings)
         pairs = parse_pairs("--set", vars(self).get("set") or (), settings)
         for name in options.keys() & pairs.keys():
@@ -110,12 +117,15 @@ class Args(SimpleNamespace):
 
     @property
     def opacity(self) -> OpacityChoice:
-        """Encoding of opacities in the file, from ``--hint``."""
+        """How the file stores opacities, by ``--hint``; "auto" if no hint says it."""
         choice: OpacityChoice = self._parse_hints().get("opacity", "auto")
         return choice
 
     def hints(self, **defaults: Any) -> ReadHints:
-        """Make the hints for reading the scene, on top of ``defaults``; UsageError for an unknown name or value."""
+        """Make the hints for reading the scene; UsageError for an unknown name or value in ``--hint``.
+
+        ``defaults``: hints that apply where the user gave none.
+        """
         from gsmerge.scene.exporters import find_exporter
 
         values = {name: value for name, value in self._parse_hints().items() if name != "opacity"}
@@ -129,7 +139,7 @@ class Args(SimpleNamespace):
     def files(self, scene: Path, *more: Path) -> SceneFiles:
         """Find the .ply, cameras and photos of a scene, and of further scenes to join with it.
 
-        Cameras and photos that the user named are used; otherwise cameras and photos beside each scene.
+        Files that the user named are used, otherwise those beside each scene.
         """
         from gsmerge.io.scene_files import find_scene_files
 
@@ -138,18 +148,16 @@ class Args(SimpleNamespace):
         return replace(files, more=tuple(more_files))
 
     def load(self, files: SceneFiles, **defaults: Any) -> Loaded:
-        """Read the scene of ``files``, unless the command that called this one has already ``loaded`` it.
+        """Read the scene of ``files``, or return the ``loaded`` scene that another command has passed on.
 
         ``defaults``: hints that apply where the user gave none.
         """
         from gsmerge.scene.read import load_files
 
         loaded: Loaded | None = vars(self).get("loaded")
-        return (
-            loaded
-            if loaded and loaded.files == files
-            else load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
-        )
+        if loaded is None or loaded.files != files:
+            loaded = load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
+        return loaded
 
 
 def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]) -> dict[str, Any]:
@@ -170,7 +178,10 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
 
 
 def parse_value(label: str, text: str, declared: Setting) -> Any:
-    """Parse the value of a setting or an option; UsageError that begins with ``label`` if it is not allowed."""
+    """Parse the value of a setting or an option; UsageError if the value is not allowed.
+
+    The error begins with ``label``. A text may have several meanings, and the first that fits the setting is taken.
+    """
     candidates = _list_meanings(text)
     if declared.is_list:
         candidates.append([_list_meanings(element.strip())[0] for element in text.split(",")])
@@ -217,7 +228,10 @@ class Declaration:
         )
 
     def read(self, typed: Any, flags: Collection[str]) -> Any:
-        """Parse the words that were typed; UsageError for a wrong one, or for one of the command's ``flags``."""
+        """Parse the words that the user typed for this parameter.
+
+        UsageError for a wrong word, or for one of the command's ``flags``, before which a value was forgotten.
+        """
         if not isinstance(typed, str | list | tuple):  # a switch, or a default
             return typed
         label, values = self.flags[0] if self.flags else self.info.metavar.strip("[]."), list[Any]()
@@ -236,12 +250,13 @@ class Declaration:
 def _declare(
     name: str, kind: Any, info: Any, parse: Callable[[str], Any] | None, default: Any, flags: tuple[str, ...] = ()
 ) -> Declaration:
-    """Declare an argument or option; ``kind`` is the type of its values, ``list[...]`` if it takes several."""
-    kinds = [one for one in get_args(kind) if one is not NoneType] if isinstance(kind, UnionType) else [kind]
-    single = get_args(kinds[0])[0] if get_origin(kinds[0]) is list else kinds[0]
-    shape = single if single is bool else list[str] if single is not kinds[0] else str
-    parse = parse or (parse_path if single is Path else str)
-    return Declaration(name, shape, info, parse, default, flags)
+    """Declare an argument or option; ``kind`` is the type of its value: ``list[...]`` for several, or with None."""
+    kind = next(part for part in get_args(kind) if part is not NoneType) if isinstance(kind, UnionType) else kind
+    is_list = get_origin(kind) is list
+    element_kind = get_args(kind)[0] if is_list else kind
+    typer_kind = list[str] if is_list else bool if kind is bool else str
+    parse = parse or (parse_path if element_kind is Path else str)
+    return Declaration(name, typer_kind, info, parse, default, flags)
 
 
 def argument(name: str, kind: Any, metavar: str, help: str, default: Any = REQUIRED) -> Declaration:
@@ -254,10 +269,10 @@ def option(
     metavar: str | None = None, parser: Callable[[str], Any] | None = None, min: float | None = None,
     max: float | None = None, **more: Any,
 ) -> Declaration:  # fmt: skip
-    """Declare an option of a command; ``kind`` bool makes a switch, a tuple lists the possible values.
+    """Declare an option of a command.
 
-    By default ``flags`` are derived from the name. ``wording`` is the default in words, if the library decides it.
-    ``more`` is passed to Typer.
+    ``kind``: the type of the value; bool for a switch, or a tuple of the possible values. ``flags`` are derived from
+    the name if none are given. ``wording``: words for the default that the help shows. ``more`` is passed to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
     if isinstance(kind, tuple):
@@ -276,7 +291,10 @@ def option(
 def setting_option(
     name: str, *flags: str, metavar: str | None = None, wording: str | None = None, **more: Any
 ) -> Declaration:
-    """Declare an option for a setting of the library, with its help and values; ``more`` goes to :func:`option`."""
+    """Declare an option for a setting of the library, which has its help and its possible values.
+
+    ``more`` is passed to :func:`option`.
+    """
     declared = SETTINGS[name]
     flags = flags or (f"--{name.replace('_', '-')}",)
     kinds = [kind for kind in declared.kinds if kind is not NoneType]
@@ -299,7 +317,7 @@ def panel(title: str, *parameters: Declaration) -> tuple[Declaration, ...]:
 
 
 def change_option(name: str, default: Any = None, **changes: Any) -> Declaration:
-    """Copy a declared option and change it for one command: its default, ``help``, ``show_default``, ..."""
+    """Copy a declared option for one command, with another default and other ``changes`` of Typer's description."""
     info = copy(OPTIONS[name].info)
     vars(info).update(changes)
     return replace(OPTIONS[name], info=info, default=default)
@@ -311,7 +329,10 @@ def _escape(help: str) -> str:
 
 
 def command(*parameters: str | Declaration) -> Callable[[Callable[[Args], None]], Callable[..., None]]:
-    """Decorate a command with its parameters, in the order of the help; a text lists names of declared options."""
+    """Make a decorator that turns a function of one :class:`Args` into a command that Typer can call.
+
+    ``parameters`` are in the order of the help. A text lists the names of options that are declared here.
+    """
     listed: dict[str, Declaration] = {}
     for parameter in (*parameters, "progress json quiet"):
         for name in parameter.split() if isinstance(parameter, str) else [parameter.name]:
@@ -321,12 +342,14 @@ def command(*parameters: str | Declaration) -> Callable[[Callable[[Args], None]]
     def decorate(function: Callable[[Args], None]) -> Callable[..., None]:
         @wraps(function)
         def run(**typed: Any) -> None:
+            """Parse what was typed for each parameter, and call the function."""
             args = Args(**{name: listed[name].read(value, flags) for name, value in typed.items()})
             from gsmerge.runtime.memory import keep_memory
 
             keep_memory()
             function(args)
 
+        # Typer reads the parameters from the signature
         run.__signature__ = Signature([declared.parameter for declared in listed.values()])  # type: ignore[attr-defined]
         run.__annotations__ = {}
         run.kinds = getattr(listed["set"].info, "kinds", ()) if "set" in listed else ()  # type: ignore[attr-defined]
@@ -336,7 +359,7 @@ def command(*parameters: str | Declaration) -> Callable[[Callable[[Args], None]]
 
 
 def call(function: Callable[..., None], **values: Any) -> None:
-    """Run another command with parameters ``values``; its other parameters have their defaults."""
+    """Run a command from another one, with ``values`` for some of its parameters and defaults for the others."""
     parameters = function.__signature__.parameters.items()  # type: ignore[attr-defined]
     function.__wrapped__(Args(**{name: one.default for name, one in parameters} | values))  # type: ignore[attr-defined]
 
@@ -392,7 +415,7 @@ AFTER = argument(
 )
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder that holds it.")
 
-# Shared by commands: a text, and names of options
+# Shared by commands: a text of the help, and names of options
 COMPACT_SCENE = "The compact scene; the ending sets the format, such as .ply, .spz or .sog."
 READING = "cameras images hint"
 TARGETS = "targets target_images"
@@ -418,7 +441,7 @@ _TABLE = (
     panel(
         COUNT_GROUP,
         setting_option("k", metavar="1-8|mixed|auto"),
-        # A text, as reports and finished batches have it
+        # Kept as a text, because reports and the records of batches store it so
         setting_option("budget", metavar="40000|2%|5MB|DEVICE|auto", parser=str),
         setting_option("quality", metavar="30dB|-0.2dB"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),

@@ -19,9 +19,9 @@ def default_output(ply: Path) -> Path:
 
 
 def output_file(output: Path, name: str) -> Path:
-    """Return the file that an output names; for a folder, return a file in it.
+    """Return the file to write: ``output`` itself or, if it is a folder, the file ``name`` in it.
 
-    A name without an ending is a folder unless a file of this name exists. The file in a folder is ``name``.
+    An output without an ending is a folder, unless a file of this name exists.
     """
     is_folder = output.is_dir() or not (output.suffix or os.path.lexists(output))
     return output / name if is_folder else output
@@ -30,11 +30,11 @@ def output_file(output: Path, name: str) -> Path:
 def check_outputs(
     outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool = False, reports: bool = False
 ) -> None:
-    """Raise UsageError for an output that is an input, exists without ``overwrite``, or is given twice.
+    """Raise UsageError for an output that is an input, is given twice, or exists and may not be replaced.
 
-    ``reports``: reports that gsmerge made are replaced, and no other files. ``inputs`` are the files that are read, and
-    folders of photos or cameras; no file in them is replaced. SceneError if the output cannot be written. Missing
-    folders are made together with their first file, so a run that fails earlier makes no folders.
+    ``inputs``: files that are read, and folders of photos or cameras, whose photos and camera files are not replaced.
+    ``reports``: the outputs are reports. These replace reports of gsmerge, and no other files, whatever ``overwrite``
+    is. Raises SceneError if an output cannot be written. Missing folders are not made here.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -51,7 +51,7 @@ def check_outputs(
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool, reports: bool) -> None:
-    """Check one output as :func:`check_outputs` does; ``inputs``: real paths."""
+    """Check one output as :func:`check_outputs` does; ``inputs`` are paths without symbolic links."""
     from gsmerge.io.atomic import describe_existing
     from gsmerge.io.first_bytes import may_be_replaced
     from gsmerge.io.image_names import IMAGE_SUFFIXES
@@ -69,8 +69,8 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool, reports: b
             f" {'a folder; name a file in it' if output.is_dir() else 'a pipe or a device; name a file'}"
         )
     target = Path(os.path.realpath(output))
-    is_read = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
-    if str(target) in inputs or (is_read and str(target.parent) in inputs):
+    is_image = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
+    if str(target) in inputs or (is_image and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another output")
     if os.path.lexists(output) and not (may_be_replaced(output) if reports else overwrite):
         problem = f"{output}: {describe_existing(output)}"
@@ -96,14 +96,14 @@ def _check_writable(folder: Path, output: Path, expected: str) -> None:
 
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
-    """List the files of Gaussians, cameras and photos that reading the scene uses."""
+    """List the files of Gaussians and cameras, and the folders of photos, that are read for a scene."""
     return (*files.paths, *(path for scene_files in files.more for path in input_files(scene_files)))
 
 
 def write_texts(texts: Mapping[Path, str | bytes], mode: int = 0o666) -> None:
-    """Write text files, of text or of its bytes, in place of existing ones: either all of them or none.
+    """Write texts to files, all of them or none; existing files are replaced.
 
-    ``mode``: the most rights of new files.
+    ``mode``: permissions of new files, of which the user's mask may take some away.
     """
     from gsmerge.io import atomic_outputs
 
@@ -113,9 +113,9 @@ def write_texts(texts: Mapping[Path, str | bytes], mode: int = 0o666) -> None:
 
 
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
-    """Raise UsageError for an output folder with files (unless ``overwrite``) or photos, or without write access.
+    """Raise UsageError for an output folder that is an input, or that has files without ``overwrite``.
 
-    The folder is made together with its first file, so a run that fails earlier makes no folder.
+    Raises SceneError if it cannot be written to. A missing folder is not made here.
     """
     _check_writable(folder, folder, "a folder to write pictures to")
     try:

@@ -29,7 +29,7 @@ def parse_views(text: str) -> int | str:
     """Parse ``--views``: a number or the name of a view. Digits that begin with 0 are a name."""
     if not re.fullmatch(r"[+-]?[\d.]+", text) or re.fullmatch(r"0\d+", text):
         return text
-    max_digits = 9  # only so many digits of a number of views are read
+    max_digits = 9  # of a longer number only the first digits are read, which are more than enough views
     count = int(text[:max_digits]) if text.isdecimal() else 0
     if count < 1:
         raise ValueError(f"expected a number from 1 or the name of a view, got {text}")
@@ -75,7 +75,7 @@ def render(args: opt.Args) -> None:
     if args.path is not None and parse_camera_path(args.path) is None:  # the path is a file
         inputs = (*inputs, Path(args.path))
     if args.output.suffix.lower() in (*PICTURES, *CLIPS):
-        # A picture in a scene's folder may be replaced, unless it is a photo
+        # A picture in the folder of a scene may be replaced, unless it is one of its photos
         read = [path for path in inputs if path not in args.scenes or not path.is_dir()]
         check_outputs((args.output,), (*read, files.images), overwrite=args.overwrite)
     else:
@@ -95,7 +95,10 @@ def render(args: opt.Args) -> None:
 
 
 def _choose_kind(args: opt.Args) -> str:
-    """Choose the kind of drawing by the name of the output and the options; UsageError if they do not fit."""
+    """Return the kind of drawing, by the name of the output and the options; UsageError if these do not fit.
+
+    A clip without ``--path`` gets the path "orbit".
+    """
     suffix = args.output.suffix.lower()
     is_clip, is_picture = suffix in CLIPS, suffix in PICTURES
     if suffix and not is_clip and not is_picture and not args.output.is_dir():

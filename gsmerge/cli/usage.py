@@ -1,4 +1,4 @@
-"""Explain wrong usage in one line, and take the words of the command line as they are typed."""
+"""Explain wrong usage in one line, and keep Typer from converting the words of the command line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsmerge.settings.setting import flat_settings
 PROGRAM = "gsmerge"
 LAB = "lab"  # group of research commands
 LOOK = "look"  # compact with a page; runs if the first word is a scene instead of a command
-# Names in other programs of options whose names here resemble them too little to be found by that
+# Names that other programs give to options, and the names of these options here, which do not resemble them
 SYNONYMS = {
     **dict.fromkeys(("force", "clobber", "yes"), "overwrite"),
     **dict.fromkeys(("ratio", "percent", "keep", "count", "num-gaussians"), "budget"),
@@ -29,38 +29,39 @@ UsageErrors: Any = typer.BadParameter.__mro__[2]
 
 
 class _Words:
-    """Values of a parameter, as they were typed.
+    """Replacement of Typer's conversion, which leaves the words of a parameter as they were typed.
 
-    Our commands turn words into values themselves, by the declarations of the settings. Typer's own conversion imports
-    Pydantic, which takes 50 ms of each run.
+    Commands convert the words themselves, by the declarations of the settings. Typer's conversion imports Pydantic,
+    which takes 50 ms of each run.
     """
 
     @staticmethod
     def coerce(value: Any, param: Any, ctx: Any) -> Any:
-        """Return the words of a parameter; as Typer's converters, empty for a missing list."""
+        """Return the words of a parameter unchanged; for a list that is missing, return an empty one as Typer does."""
         return () if value is None and (param.multiple or param.nargs == -1) else value
 
 
 class _OneLine:
-    """Mixin of commands and groups whose wrong usage is explained in one line."""
+    """Base of our commands and groups, which explain wrong usage in one line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words after a command's name; UsageError for an option with one dash, or given again."""
+        """Parse the words after a command's name; UsageError for an option with one dash, or for a repeated option."""
         params = self.get_params(ctx)  # type: ignore[attr-defined]
-        names = {name for param in params for name in param.opts}
+        flags = {flag for param in params for flag in param.opts}
         words = args[: args.index("--") if "--" in args else None]
-        typed = [word.partition("=")[0] for word in words]
+        typed_flags = [word.partition("=")[0] for word in words]
         for param in params:
-            if not (param.multiple or getattr(param, "is_flag", True)) and sum(map(typed.count, param.opts)) > 1:
+            is_single = not (param.multiple or getattr(param, "is_flag", True))
+            if is_single and sum(map(typed_flags.count, param.opts)) > 1:
                 raise UsageError(f"{param.opts[0]}: expected it once, got it again")
-            if isinstance(getattr(param, "show_default", None), str):  # Typer would put brackets into its brackets
-                param._get_default_string = lambda words=param.show_default, **_: words
-        for word in words:
-            if re.match("-[^-]", word) and f"-{word.partition('=')[0]}" in names:
+            if isinstance(getattr(param, "show_default", None), str):  # Typer would put this text into brackets twice
+                param._get_default_string = lambda text=param.show_default, **_: text
+        for word, flag in zip(words, typed_flags, strict=True):
+            if re.match("-[^-]", word) and f"-{flag}" in flags:
                 raise UsageError(f"{word}: expected two dashes, -{word}")
-        if isinstance(self, TyperGroup) or hasattr(self.callback, "kinds"):  # type: ignore[attr-defined]
-            for param in params:
-                param.get_runtime_param = _Words
+        is_own = isinstance(self, TyperGroup) or hasattr(self.callback, "kinds")  # type: ignore[attr-defined]
+        for param in params if is_own else ():  # commands of other packages may need Typer's conversion
+            param.get_runtime_param = _Words
         try:
             return super().parse_args(ctx, args)  # type: ignore[misc]
         except UsageErrors as error:
@@ -73,7 +74,7 @@ class Group(_OneLine, TyperGroup):
 
 
 class Command(_OneLine, TyperCommand):
-    """A command whose usage line has its arguments under the names that its help uses."""
+    """A command whose usage line names the arguments as its help does."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """List the parts of the usage line after the name of the command."""
@@ -92,7 +93,7 @@ def usage_message(error: Any) -> str:
 
 
 def _suggest(option: str, command: Any) -> str:
-    """Say how to give what an unknown option means, if it is a setting or a hint, or has another name here."""
+    """Return the end of a message: what to type instead of an unknown ``option``; empty if nothing is known."""
     from gsmerge.cli.parameters import listed_settings
 
     name, known = option.lstrip("-").replace("-", "_"), {param.name for param in command.params}

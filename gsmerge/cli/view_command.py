@@ -67,7 +67,10 @@ def view(args: opt.Args) -> None:
 
 
 def _open(page: Path) -> bool:
-    """Open a page in the browser. Return False without a screen, where a text browser would take over the terminal."""
+    """Open a page in the browser, and return whether that worked.
+
+    Nothing is opened without a screen, because a text browser would take over the terminal.
+    """
     if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
         return False
     import webbrowser

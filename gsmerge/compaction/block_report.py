@@ -26,15 +26,15 @@ def join_reports(
     psnrs: Sequence[float | None],
     options: CompactOptions,
 ) -> CompactReport:
-    """Make the report of the whole scene: its PSNR is the mean of the blocks, weighted by their views.
+    """Make the report of the whole scene, whose PSNR is the mean of the blocks' PSNR, weighted by their views.
 
-    ``psnrs`` has the PSNR (dB) of the result on the photos of each block, None without photos. Seconds and notes are
+    ``psnrs`` has the PSNR (dB) of the result on the photos of each block, or None without photos. Seconds and notes are
     those of the current record. If the result may be worse than the input, both are scored again on all photos.
     """
     run, num_views = current_record(), [len(start.block.own) for start in starts]
 
     def mean(values: Sequence[float | None]) -> float | None:
-        """Return the mean of the blocks' values, weighted by their views; None if a block has none."""
+        """Return the mean of a value of each block, weighted by the blocks' views; None if a block has no value."""
         numbers = [value for value in values if value is not None]
         return None if len(numbers) < len(values) else float(np.average(numbers, weights=num_views))
 

@@ -17,7 +17,7 @@ from gsmerge.runtime.record import begin_part
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene, SceneT
 
-IN_FILE = 1 << 24  # bytes from which on the photos of a block are kept in a file
+IN_FILE = 1 << 24  # photos of a block with at least this many bytes are kept in a file
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ def start_block(
 ) -> BlockStart:
     """Merge the views of a block, and keep the merged Gaussians that belong to the block.
 
-    ``piece`` is the scene of the block's views, ``frame`` the canonical frame of all blocks.
+    ``piece`` is the scene of the block's views. ``frame`` is the canonical frame of all blocks.
     """
     begin_part()
     prepared = prepare(piece, options.prepare, frame)
@@ -45,14 +45,20 @@ def start_block(
     decoded = decode_views(prepared, plan, plan.limits.count)
     keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
     before = measure_input(prepared, plan)
-    count, prepared = round(keep.sum() / max(1, len(keep)) * decoded.count), without_gaussians(prepared)
-    return BlockStart(block, decoded.gaussians[keep], count, prepared, plan, None if before is None else before.psnr)
+    return BlockStart(
+        block=block,
+        gaussians=decoded.gaussians[keep],
+        count=round(keep.sum() / max(1, len(keep)) * decoded.count),
+        prepared=without_gaussians(prepared),
+        plan=plan,
+        psnr_before=None if before is None else before.psnr,
+    )
 
 
 def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
     """Return a mask ``[n]`` of the means ``[n,3]`` whose owner is one of the block's own views.
 
-    Only views that share surfaces with the block can be owners here, since the others do not see these means.
+    The owner is searched among the views that share surfaces with the block, because the others do not see these means.
     """
     is_candidate = covisibility.weights[list(block.own)].sum(0) > 0
     is_candidate[list(block.own)] = True
@@ -61,21 +67,17 @@ def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility
 
 
 def without_gaussians(prepared: Prepared) -> Prepared:
-    """Return a prepared scene without Gaussians, and with its photos in a file if they are large, to free memory."""
-    copies: dict[int, np.ndarray] = {}  # by the id of the photos, since both scenes may have the same
-
-    def copy_photos(images: np.ndarray) -> np.ndarray:
-        """Copy photos into a file if they are large, once."""
-        if id(images) not in copies:
-            copies[id(images)] = make_array(images.shape, images.dtype.type, IN_FILE)
-            copies[id(images)][:] = images
-            free_pages([copies[id(images)]])
-        return copies[id(images)]
+    """Return a prepared scene without Gaussians, to free memory; large photos are copied into a file."""
+    copies: dict[int, np.ndarray] = {}  # by the id of the photos, because both scenes may have the same photos
 
     def empty(scene: SceneT) -> SceneT:
-        """Return a scene without its Gaussians and their pixels."""
-        images = copy_photos(np.asarray(scene.images))  # views with Gaussians of their own always have pictures
-        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixels=None)
+        """Return a scene without its Gaussians and their pixels, and with a copy of its photos."""
+        images = np.asarray(scene.images)  # views with Gaussians of their own always have pictures
+        if id(images) not in copies:
+            copies[id(images)] = photos = make_array(images.shape, images.dtype.type, IN_FILE)
+            photos[:] = images
+            free_pages([photos])
+        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=copies[id(images)], pixels=None)
 
     reference = replace(prepared.reference, photo_files=None)
     scene, input_scene = empty(prepared.scene), empty(prepared.input_scene)

@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.compaction.block_report import join_reports
 from gsmerge.compaction.block_start import BlockStart, start_block
 from gsmerge.compaction.costs import RunCosts
-from gsmerge.compaction.file_size import drop_to_bytes, measure_base
+from gsmerge.compaction.file_size import drop_to_bytes, measure_least_bytes
 from gsmerge.compaction.partition import (
     Block,
     Covisibility,
@@ -50,8 +50,8 @@ from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene
 
 T = TypeVar("T")
-# Most superpixels of a block, relative to compaction in one piece. A block takes more superpixels than one piece if
-# views of other blocks see its surfaces
+# A block may have more superpixels than its views would have in one piece, if views of other blocks also see its
+# surfaces (see count_factors). It has at most this many times as many
 MOST_DENSITY = 2.0
 BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to the requested number; the faintest are dropped at the end
 
@@ -59,7 +59,8 @@ BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to the requested numbe
 def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
     """Cut the views of a scene into ``count`` blocks; also return what each view sees of the others.
 
-    If only the number of views, not the user or the memory, asks for blocks, there may be fewer, down to one.
+    If the user asks for blocks, or the memory is too small for one piece, there are ``count`` blocks. If only the views
+    are many, there may be fewer, down to one.
     """
     with stage("partition"):
         covisibility = measure_covisibility(scene.numpy())
@@ -73,10 +74,9 @@ def compact_in_blocks(
 ) -> CompactResult:
     """Compact a scene in blocks of views.
 
-    First the views of each block are merged, and each block keeps the Gaussians that belong to it. So all blocks
-    together start from one set of Gaussians. Then each block fits all Gaussians that its views see, including Gaussians
-    of its neighbours, and keeps its own Gaussians. At the border of two blocks, both fit the same Gaussians to the same
-    photos.
+    First the views of each block are merged, and each block keeps the Gaussians that belong to it. All blocks together
+    then have one set of Gaussians. Each block fits those that its views see, including Gaussians of its neighbours, and
+    keeps its own. At the border of two blocks, both fit the same Gaussians to the same photos.
     """
     device, scene = scene.gaussians.device, scene.numpy()
     count, limit = len(blocks), choices.limits.count
@@ -105,7 +105,7 @@ def compact_in_blocks(
             joined, owners = join_parts([start.gaussians for start in starts])
             growth = sum(start.count for start in starts) / max(1, len(joined))
             if limit is not None and options.budget.is_filled:
-                # blocks drop new Gaussians that belong to other blocks, so each needs a surplus to reach the number
+                # Blocks drop new Gaussians that belong to other blocks, so all need a surplus to reach the number
                 growth = max(growth, BLOCK_SURPLUS * limit / max(1, len(joined)))
         shared_start = work.share((joined, owners))
         fitted = list(adopt_records(work.run("fit", fit_block, count, list_calls(starts, shared_start, growth))))
@@ -131,19 +131,27 @@ def join_parts(parts: Sequence[Gaussians]) -> tuple[Gaussians, np.ndarray]:
 
 
 def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, count: int) -> list[RunPart]:
-    """Return the parts of a run in ``count`` blocks, as if all cost the same: merge all, fit all, seams, score all."""
+    """Return the parts of a run in ``count`` blocks: merge each block, fit each, fit the seams, score each block.
+
+    All blocks are assumed to cost the same.
+    """
     steps, num_gaussians = 0 if choices.fit.fit == "none" else choices.fit.steps, choices.limits.default
-    settings, view_pixels = choices.settings(options), scene.pixels_per_view
-    costs = RunCosts(settings, view_pixels * len(scene), view_pixels, 1 / count, steps)
+    costs = RunCosts(
+        settings=choices.settings(options), num_pixels=scene.pixels_per_view * len(scene),
+        view_pixels=scene.pixels_per_view, inside=1 / count, steps=steps,
+    )  # fmt: skip
     build, [scores] = costs.build_part(num_gaussians), costs.end_parts(num_gaussians, [])
-    merged, fitted = RunPart(build.stages / count), RunPart(0.0, build.fits / count)
-    seam_cost = 0.5  # of the fit of seams, as a share of the fits of all blocks
+    merge_part, fit_part = RunPart(build.stages / count), RunPart(0.0, build.fits / count)
+    seam_cost = 0.5  # cost of the fit of seams, relative to the fits of all blocks
     seams = [RunPart(0.0, seam_cost * build.fits)] * (steps > 0)
-    return [merged] * count + [fitted] * count + seams + [RunPart(scores.stages / count)] * count
+    return [merge_part] * count + [fit_part] * count + seams + [RunPart(scores.stages / count)] * count
 
 
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
-    """Yield each value with the choices of its record; add seconds, notes and left-out photos to the current record."""
+    """Yield what each block returned, with the choices of the block's record.
+
+    Seconds, notes and left-out photos of that record are added to the current record.
+    """
     for value, record in outcomes:
         add_seconds(record.seconds)
         for text in record.notes:
@@ -156,7 +164,7 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
 def list_calls(starts: Sequence[BlockStart], *values: Any) -> Iterator[tuple[Any, ...]]:
     """Yield the arguments of a call for each block: its start, the ``values``, and its number.
 
-    When the next call is asked for, the memory of the block before is released, since its arguments have been sent.
+    The caller sends the arguments of one block before it asks for the next. Then the memory of the first is released.
     """
     for number, start in enumerate(starts):
         yield start, *values, number
@@ -167,8 +175,8 @@ def list_calls(starts: Sequence[BlockStart], *values: Any) -> Iterator[tuple[Any
 def fit_block(start: BlockStart, shared_start: tuple[Gaussians, np.ndarray], growth: float, number: int) -> Gaussians:
     """Fit all Gaussians that the views of a block may see; return the fitted Gaussians that the block owns.
 
-    ``shared_start`` has the canonical Gaussians of all blocks, and the number of the block that owns each. ``growth``
-    is the final number of Gaussians divided by the number at the start. ``number`` is the number of the block.
+    ``shared_start`` has the canonical Gaussians of all blocks, and for each the number of the block that owns it.
+    ``growth`` is the final number of Gaussians divided by the number at the start. ``number`` is that of the block.
     """
     begin_part()
     (joined, owners), scene, plan = shared_start, start.prepared.scene, start.plan
@@ -185,7 +193,7 @@ def fit_block(start: BlockStart, shared_start: tuple[Gaussians, np.ndarray], gro
 
 
 def score_block(start: BlockStart, gaussians: Gaussians, _: int) -> float | None:
-    """Return the PSNR (dB) of the whole result on the photos of a block; None without photos."""
+    """Return the PSNR (dB) of the result of all blocks on the photos of one block; None without photos."""
     begin_part()
     measured = measure_result(gaussians, start.prepared, start.plan)
     return None if measured is None else measured.psnr
@@ -195,7 +203,7 @@ def finish_joined(
     joined: Gaussians, cameras: Cameras, names: Sequence[str], frame: Frame, options: CompactOptions,
     choices: SceneChoices,
 ) -> Gaussians:  # fmt: skip
-    """Return the result: prune the canonical Gaussians of all blocks, move them into the world, and meet the budget."""
+    """Prune the canonical Gaussians of all blocks, move them into the world, meet the budget, and return them."""
     limit = choices.limits.count
     if choices.fit.min_contribution > 0:
         joined = prune_joined(joined, frame.enter_cameras(cameras), options, limit)
@@ -206,26 +214,29 @@ def finish_joined(
         note(f"budget: {limit:,} Gaussians were asked for, {len(result):,} remain of those of all blocks")
     if (size := file_size(options.budget)) and size.packed:
         content = size.num_bytes, size.file, cameras, names
-        result = drop_to_bytes(result, *content, measure_base(result, *content))
+        result = drop_to_bytes(result, *content, measure_least_bytes(result, *content))
     return result
 
 
 def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, limit: int | None) -> Gaussians:
-    """Drop the Gaussians that none of the ``cameras`` shows, but keep some if a budget of ``limit`` has to be full."""
+    """Drop the Gaussians that no camera sees.
+
+    If the options fill the budget of ``limit`` Gaussians, as many of them are kept as the budget allows.
+    """
     seen, unseen = split_unseen(joined, cameras)
-    room = len(unseen) if limit is None else limit - len(seen)
-    unseen = unseen[: max(0, room) if options.budget.is_filled else 0]
+    max_unseen = len(unseen) if limit is None else max(0, limit - len(seen))
+    unseen = unseen[: max_unseen if options.budget.is_filled else 0]
     record_choices(pruned=len(joined) - len(seen) - len(unseen))
     return Gaussians.concat([seen, unseen])
 
 
 def free_scene(scene: Scene) -> None:
-    """Release the memory of those arrays of a scene that :func:`gsmerge.runtime.memory.make_array` put into files."""
+    """Release the memory of the arrays of a scene that are kept in files, from which they are read again if needed."""
     free_pages([*vars(scene.gaussians).values(), *([] if scene.images is None else [scene.images])])
 
 
 def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptions:
-    """Return options with the fit steps and the networks that were chosen for the whole scene."""
+    """Return options with the steps of the fit, the networks and the density that were chosen for the whole scene."""
     checkpoint = options.checkpoint if choices.checkpoint != "none" else "none"
     options = options.with_settings({"fit_steps": choices.fit.steps, "checkpoint": checkpoint})
     return replace(options, fit=replace(options.fit, share=choices.limits.share))
@@ -234,14 +245,15 @@ def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptio
 def block_options(
     options: CompactOptions, scene: Scene, block: Block, factor: float, limit: int | None
 ) -> CompactOptions:
-    """Return the options of a block: the scene's options, with ``factor`` times the block's share of the Gaussians.
+    """Return the options of a block: those of the scene, but with its part of the Gaussians and of the fit's steps.
 
-    Cameras and exposures stay fixed. The block gets its share of the steps of the fit, so each view is fitted as often
-    as in one piece. That also holds for the first steps, which draw a quarter of the pixels. ``limit`` is the number of
-    Gaussians of all blocks together; None: ``superpixels`` and K decide.
+    The part is that of the block's views. Its number of Gaussians is also multiplied by ``factor``. Cameras and
+    exposures stay fixed. ``limit`` is the number of Gaussians of all blocks together; None: ``superpixels`` and K
+    decide.
     """
     settings: dict[str, Any] = {**ONE_PIECE, "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
+    # with few steps, the share of steps that draw a quarter of the pixels would be another one than in the whole scene
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels

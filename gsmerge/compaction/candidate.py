@@ -19,18 +19,18 @@ from gsmerge.types import Cameras, Gaussians
 class Candidate:
     """Gaussians built for one count, with their PSNR; a search compares several candidates."""
 
-    count: int | None  # Number of Gaussians that was asked for; None: as many as `superpixels` and K give
+    count: int | None  # Number of Gaussians that was asked for; None: `superpixels` and K decide it
     fitted: Fitted  # Fitted canonical Gaussians
     gaussians: Gaussians  # The same Gaussians in the world
     cameras: Cameras  # The given views in the world; their poses are those of the fit
     psnr: float | None  # Mean PSNR (dB) of the scored views, against photos or renders of the input; None without views
     record: Record  # Seconds, choices and notes of building and scoring it
-    # PSNR (dB) that a search compares with its target: over the pixels that the input covers, if it does not cover all
+    # PSNR (dB) that a search compares with its target. Only pixels that the input covers count, if it leaves gaps
     deciding_psnr: float | None = None
 
 
 def make_candidate(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
-    """Make a candidate of fitted canonical Gaussians: move them into the world, and measure their PSNR."""
+    """Move fitted canonical Gaussians into the world, measure their PSNR, and return them as a candidate."""
     moved = with_moved_views(prepared, fitted.cameras)
     gaussians, cameras = moved.frame.leave(fitted.gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
@@ -40,7 +40,7 @@ def make_candidate(count: int | None, fitted: Fitted, prepared: Prepared, plan: 
 
 
 def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
-    """Return a candidate with ``gaussians``, which are all or some of its own, and measure their PSNR again."""
+    """Return a candidate that has only ``gaussians``, which are all or some of its own, with their PSNR."""
     with record_part(silent=True) as record:
         psnr, _ = _measure_candidate(gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan)
     choices = candidate.record.choices | record.choices
@@ -48,9 +48,10 @@ def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan
 
 
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tuple[float | None, float | None]:
-    """Measure two PSNR (dB) of Gaussians of the world: the mean of the scored views, and the PSNR that a search uses.
+    """Return ``psnr`` and ``deciding_psnr`` of a candidate with these Gaussians of the world.
 
-    Both are measured against photos, or against renders of the input if these stand for photos; None without either.
+    They are measured against photos, or against renders of the input if these stand for photos. Both are None without
+    either. ``moved`` is the scene with the cameras of the fit.
     """
     if moved.reference.name == RENDERS:
         fidelity = _measure_fidelity(moved.frame.enter(round_for_output(gaussians, plan)), moved, plan)
@@ -68,28 +69,28 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tup
 
 @stage("score")
 def _measure_fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
-    """Measure the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input.
+    """Return the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input.
 
-    If the plan has the pixels that the input covers, only these count.
+    If the input leaves gaps, only the pixels that it covers count.
     """
     measured = measure_renders(gaussians, prepared, plan)
     return measured.psnr if plan.covered is None else measured.covered_psnr
 
 
 def with_moved_views(prepared: Prepared, cameras: Cameras) -> Prepared:
-    """Return the scene with all views at the canonical ``cameras`` of a fit.
+    """Return a prepared scene whose views have the canonical ``cameras`` of a fit.
 
-    The input's views follow in the world. Their cameras stay the same object if the fit moved none.
+    The views of the input, which are in the world, move along. If the fit moved no camera, theirs stay the same object.
     """
     prepared = prepared.with_cameras(cameras)
-    final = prepared.final_cameras()
-    if final is prepared.input_scene.cameras:
+    input_cameras = prepared.final_cameras()
+    if input_cameras is prepared.input_scene.cameras:
         return prepared
-    return replace(prepared, input_scene=replace(prepared.input_scene, cameras=final))
+    return replace(prepared, input_scene=replace(prepared.input_scene, cameras=input_cameras))
 
 
 def _record_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
-    """Record how far the fit moved each camera of the world, and add a note."""
+    """Record how far the fit moved each camera, in the world, and add a note."""
     input_scene = prepared.input_scene
     cause = "poses are free" if plan.free_poses else "the photos of some views agree only under other poses"
     depth = scene_depth(prepared.scene) * prepared.frame.unit

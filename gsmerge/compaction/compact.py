@@ -50,8 +50,8 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
-# If a result is clearly worse than its input, the scene is compacted again with one of these changes of the options, in
-# this order. The words are for a note
+# If a result is clearly worse than its input, the scene is compacted again with these changes of the options, one after
+# another, until a result is not. A note has the words
 SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
     ("with the scene's own colours in place of the photos", lambda o: o.with_settings({"look": "scene"})),
     ("without a fit", lambda o: o.with_settings({"fit": "none"})),
@@ -92,7 +92,10 @@ def compact(
 
 
 def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Progress | None = None) -> CompactResult:
-    """Replace a scene by a compact one as :func:`compact` does, but leave doubts to the report: no Python warnings."""
+    """Replace a scene by a compact one as :func:`compact` does, but without Python warnings.
+
+    The report has the doubts.
+    """
     with use_threads(options.threads), record_run(progress):
         # a weak reference, so that the result does not keep the scene in memory
         source: StrPath | ReferenceType[Scene] = scene if isinstance(scene, str | PathLike) else ref(scene)
@@ -108,15 +111,15 @@ def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Pro
 
 
 def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult) -> CompactResult:
-    """Compact a scene again with one change of ``SIMPLER`` after another, until a result is not clearly worse.
+    """Compact a scene again with the changes of ``SIMPLER``, until a result is not clearly worse than its input.
 
-    ``result`` is the first result, which is clearly worse than its input. A note says what was changed. Raises
-    TargetError if all results are clearly worse.
+    ``result`` is the first result, which is clearly worse. A note says what was changed. Raises TargetError if all
+    results are clearly worse.
     """
     cause = result.report.worse
     for words, change in SIMPLER:
         simpler = change(options)
-        if simpler == options:  # the first result was made like this
+        if simpler == options:  # the first result was made with these options
             continue
         with record_part():
             note(Doubt(f"{cause}; so it was made again {words}"))
@@ -155,9 +158,9 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     plan = add_target(make_plan(prepared, options), prepared)  # from here on, the plan replaces the options
 
     def rebuild(count: int | None) -> Candidate:
-        """Build a count from all views, and add its seconds to those of the run."""
+        """Build a count from all views after the search, and add its seconds to those of the run."""
         candidate = build_scored(method.build, prepared, plan, count)
-        add_seconds(candidate.record.seconds)  # in addition to those of the search
+        add_seconds(candidate.record.seconds)
         return candidate
 
     costs = measure_costs(prepared, plan)
@@ -191,7 +194,10 @@ def run_search(search: CountSearch, build: Build, rebuild: Rebuild, prepared: Pr
 
 
 def find_count(scene: Scene, options: CompactOptions) -> int:
-    """Search for the number of Gaussians of a scene without cameras as a run does, if a PSNR decides it; return it."""
+    """Return the number of Gaussians that a run gives a scene without cameras, if a PSNR decides it.
+
+    It is found by the same search as in a run, for an estimate.
+    """
     with use_threads(options.threads), record_part(silent=True):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
@@ -210,7 +216,7 @@ def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None
 
 @record_part()
 def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
-    """Clean up a candidate of a search without clean-up, and score it again."""
+    """Clean up the best candidate of a search, which built without clean-up, and score it again."""
     adopt(candidate.record)
     gaussians, dropped = _clean_fitted(candidate.fitted, prepared, plan)
     _record_dropped(dropped, len(gaussians), None, prepared)
@@ -218,17 +224,17 @@ def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
 
 
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-    """Build Gaussians and clean them up, so that exactly ``count`` remain if the scene has that many.
+    """Build Gaussians and clean them up, so that ``count`` remain if the scene has that many.
 
-    More Gaussians than ``count`` are built. If too few remain after clean-up, all are built once more, with a surplus
-    that makes up for the share that was dropped. If too many remain, the faintest are dropped.
+    A few more than ``count`` are built. If too few remain after clean-up, they are built once more, with as large a
+    surplus as clean-up dropped. If too many remain, the faintest are dropped.
     """
     if not plan.clean.asked:
         return build(prepared, plan, count)
     from gsmerge.stages.clean import faintest_dropped
 
     def build_once(built_count: int | None) -> tuple[Fitted, dict[str, int], Record]:
-        """Build and clean once; return the result, the dropped Gaussians by reason, and the record of both."""
+        """Build and clean up once; return what remains, the number of dropped Gaussians by reason, and the record."""
         with record_part() as record:
             fitted = build(prepared, plan, built_count)
             gaussians, dropped = _clean_fitted(fitted, prepared, plan)
@@ -253,19 +259,19 @@ def _clean_fitted(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gauss
     """Clean up fitted Gaussians; return the remaining Gaussians, and the number of dropped Gaussians by reason."""
     from gsmerge.stages.clean import clean
 
-    # The few cameras that are placed for scores do not show all of the scene. Without cameras, `clean` places more
+    # Cameras that were placed for scores are too few to show all of the scene. Without cameras, `clean` places its own
     cameras = None if prepared.reference.placed else fitted.cameras[sorted({*prepared.repeated})]
     rows, dropped = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
     return fitted.gaussians[rows], dropped
 
 
 def _record_dropped(dropped: dict[str, int], remaining: int, count: int | None, prepared: Prepared) -> None:
-    """Record how many Gaussians clean-up dropped for which reason, with a note; note if fewer than ``count`` remain."""
+    """Record the number of dropped Gaussians by reason, with notes, also if fewer than ``count`` remain."""
     from gsmerge.stages.clean import describe_counts
 
     record_choices(clean=dropped)
-    # The run has cropped its input. Gaussians are only cropped here if the fit moved them over the border, so a zero
-    # is not worth a note
+    # The input was cropped before the run. Here only Gaussians are cropped that the fit moved across the border, and
+    # usually there are none
     shown = {name: number for name, number in dropped.items() if number or name != "cropped"}
     if shown:
         note(f"left out by clean-up: {describe_counts(shown, placed=prepared.reference.placed)}")

@@ -40,11 +40,11 @@ from gsmerge.types import NO_CAMERAS, Gaussians, StrPath, make_scene
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """Files to convert, how to read them, and what to do with them."""
+    """What ``gsmerge convert`` reads and writes, and how."""
 
     inputs: Sequence[Path]  # Several inputs are joined in this order
     outputs: Outputs
-    cameras: StrPath | None = None  # In the frame of the first input; None: those of this input if it is a result
+    cameras: StrPath | None = None  # In the frame of the first input; None: if this is a result, its own cameras
     images: StrPath | None = None  # Photos of these cameras, which show where the sky is
     opacity: OpacityChoice = "auto"
     scales: ScaleChoice = "auto"
@@ -65,7 +65,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         for path in options.inputs:
             report_progress(f"convert: {path.name}", len(files), steps)
             files.append(read_gaussians(path, opacity=options.opacity, scales=options.scales, colors=options.colors))
-        # a selection of all rows would be a copy
+        # Indexing copies, so files without invalid rows are not indexed
         gaussians = join_gaussians([f.gaussians if f.valid.all() else f.gaussians[f.valid] for f in files])
         stored, camera_notes = _find_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
@@ -76,15 +76,15 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
             problem = f"expected Gaussians that are kept, found none of {count:,}"
             raise SceneError(options.inputs[0], problem, "find the extent of the scene with gsmerge inspect")
         frame = find_placement(options.placement, cameras, upward_axis(files[0].info.comments))
-        gaussians, moved = move_to_frame(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
+        gaussians, moved_cameras = move_to_frame(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
         largest = max(float(np.abs(gaussians.means).max()), float(gaussians.scales.max()))
         if options.placement.moves and not 1e-30 < largest < 1e30:  # numbers in files have 32 bits
             problem = f"expected coordinates of 1e-30 to 1e30, the largest would be {largest:.0e}"
             raise UsageError(f"--scale, --translate: {problem}")
     gaussians = pad_harmonics(gaussians, NUM_FULL) if outputs.options.columns == "full" else gaussians
     infos = [file.info for file in files]
-    columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
-    columns = columns[rows]
+    all_columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
+    columns = all_columns[rows]
     named_notes = [name_notes(path.name, file_notes(info)) for path, info in zip(options.inputs, infos, strict=True)]
     notes = [*file_notes(infos[0])] if len(files) == 1 else [*chain(*named_notes)]
     notes += [*camera_notes, *describe_extra_columns(columns, missing, format_, moves=options.placement.moves)]
@@ -100,23 +100,30 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     levels = [gaussians]
     for level_count in level_counts(len(gaussians), STREAMED_LEVELS) if format_.levels == "inside" else ():
         levels.append(merge_neighbors(levels[-1], level_count))
-    notes += frame_notes(outputs, moved)
-    contents = Contents(levels, comments, moved, names, scene_title(options.inputs[0]), extra_columns=columns)
-    num_bytes, camera_path = write_outputs(outputs, contents), outputs.viewer_cameras if len(moved) else None
+    notes += frame_notes(outputs, moved_cameras)
+    contents = Contents(levels, comments, moved_cameras, names, scene_title(options.inputs[0]), extra_columns=columns)
+    num_bytes, camera_path = write_outputs(outputs, contents), outputs.viewer_cameras if len(moved_cameras) else None
     facts = {"path": str(outputs.result), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
     inputs = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     input_cameras = None if stored is None else str(stored.path)
     earlier_cameras = viewer_cameras_path(outputs.result)
     if camera_path is None and not format_.has_cameras and earlier_cameras.is_file():
         notes.append(f"{earlier_cameras} is of an earlier file of that name, not of this one: delete it")
-    document = document_head() | {"inputs": inputs, "cameras": input_cameras, "dropped": dropped, "output": facts}
-    return document | {"viewer_cameras": camera_path and str(camera_path), **note_entries(notes)}
+    return {
+        **document_head(),
+        "inputs": inputs,
+        "cameras": input_cameras,
+        "dropped": dropped,
+        "output": facts,
+        "viewer_cameras": camera_path and str(camera_path),
+        **note_entries(notes),
+    }
 
 
 def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -> tuple[list[str], list[str]]:
-    """Return the header comments that all files share, and notes on the comments that the output will lack.
+    """Return the header comments that all files have, and notes about the others, which the output lacks.
 
-    If the scene moves, comments on its frame are no longer true, and are left out.
+    If the scene moves, comments about its frame are no longer true, and are left out.
     """
     file_comments = [
         [comment for comment in kept_comments(info) if not (moves and states_vertical_axis(comment))] for info in infos
@@ -142,7 +149,7 @@ def conversion_line(document: dict[str, Any]) -> str:
 
 
 def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: StrPath | None) -> list[str]:
-    """Return a note for ``--drop unseen`` if its views were placed, or see less than half of the Gaussians."""
+    """Return a note about ``--drop unseen`` if no cameras are known, or if they see less than half of the Gaussians."""
     if cameras is None:
         likely = None if options.cameras == NONE else find_scene_files(options.inputs[0]).cameras
         remedy = "" if options.cameras == NONE else f"; name them with --cameras {likely or 'FILE'}"
@@ -154,15 +161,15 @@ def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: Str
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
-    """Join Gaussians of one world frame; those of a lower degree get harmonics of zero."""
+    """Join Gaussians of one world frame. Harmonics are padded with zeros to the highest degree of all parts."""
     num_higher = max(gaussians.shN.shape[1] for gaussians in parts)
     return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
 
 
 def _find_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]]:
-    """Return the cameras that were named, or else those of the first input if it is a result; also return notes.
+    """Return the cameras that the options name, or else those of the first input if it is a result, and notes.
 
-    Cameras beside the input that were not named are left out with a note if they cannot be read.
+    If the latter cannot be read, a note says so, and None is returned.
     """
     named, first_input = options.cameras, options.inputs[0]
     path = result_cameras(first_input) if named is None else named_path(named)
@@ -178,7 +185,10 @@ def _find_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]
 def _clean_joined(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[np.ndarray, dict[str, int]]:
-    """Crop the Gaussians and drop what the options name; return the rows that remain, and how many were dropped why."""
+    """Crop the Gaussians, and drop the kinds that the options name.
+
+    Returns the rows that remain, and the number of dropped Gaussians by reason.
+    """
     drops = options.clean.drops
     if not {"sky", "unseen"} & set(drops) or len(gaussians) == 0:
         return clean(gaussians, options.clean, None, None, lambda g: g)

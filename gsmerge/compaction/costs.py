@@ -1,7 +1,7 @@
 """Estimate the processor seconds of a run and of its parts.
 
-The time that ``inspect`` and ``--dry-run`` show is their sum, and the progress of a run follows their ratios. The costs
-below are means of whole runs with any settings. The estimates are right within a factor of about two.
+``inspect`` and ``--dry-run`` show the sum as the time of a run. The progress of a run follows the ratios of its parts.
+The costs below are means of whole runs with any settings. Estimates are right within a factor of about two.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from gsmerge.settings.compact import OURS
 from gsmerge.types import Scene
 
 IMPORT_SECONDS = 1.0  # imports, and the constant part of every run
-# For each million pixels of all views together, or each million Gaussians if there are more of these:
+# Seconds for each million pixels of all views together, or for each million Gaussians if there are more of these:
 COST_BUILD = 1.0  # superpixels, merging and scores of a result
 COST_INPUT = 0.3  # reading and scoring the input
 COST_NETWORKS = 1.4  # the shipped networks
 COST_PAPER = 4.5  # the paper's networks, which have more inputs and refine
 COST_PAIRS = 3.0  # merging neighbours pair by pair
 COST_PLACED = 6.0  # drawing a scene without views from placed ones
-COST_SLOW = {"greedy": 25.0, "splat-transform": 60.0}  # in addition
-# For each step of the fit:
+COST_SLOW = {"greedy": 25.0, "splat-transform": 60.0}  # in addition, for slow methods
+# Seconds for each step of the fit:
 COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.25  # per million Gaussians that it draws
 THREAD_GAIN = 0.35  # speed of each thread after the first, relative to the first
 TRIAL_SHARE = 0.25  # cost of the trial that estimates new views, as a share of building the result
-# Candidates that a search usually builds: if they are scored on photos, and on renders of the input
+# Number of candidates that a search usually builds, if photos score them, and if renders of the input do
 USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
 INSIDE_GAUSSIANS = 10_000  # sample of Gaussians for the mean share that lies inside a view
 PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
@@ -45,7 +45,7 @@ PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
 
 @dataclass(frozen=True)
 class CountChoice:
-    """How a run chooses the number of Gaussians; by default, the options state it."""
+    """How a run chooses the number of Gaussians; by default, the options state the number."""
 
     has_target: bool = False  # Several candidates are built until one reaches a PSNR
     has_curve: bool = False  # The scene's curve decides, unless ``has_target`` or ``rendered``
@@ -55,7 +55,7 @@ class CountChoice:
 
 @dataclass(frozen=True, eq=False)
 class RunCosts:
-    """Facts about a run from which its costs follow."""
+    """Facts about a run that decide how many seconds its parts take."""
 
     settings: Mapping[str, Any]  # All settings by flat name, with the networks in use
     num_pixels: int  # Of all views together, or the number of Gaussians if that is larger
@@ -70,20 +70,19 @@ class RunCosts:
     def all_parts(self, limits: CountLimits, count: int) -> list[RunPart]:
         """Return the parts that a run for about ``count`` Gaussians is expected to have, in their order.
 
-        First come the fits of a curve, if there is one, then the builds of the result, or of all candidates of a
-        search. The parts of :meth:`end_parts` follow.
+        First come the fits of a curve, if there is one. Then come the build of the result, or those of all candidates
+        of a search. The parts of :meth:`end_parts` follow.
         """
-        choice, builds = self.choice, 1
-        if choice.has_target:
-            builds = USUAL_BUILDS_OF_RENDERS if choice.rendered else USUAL_BUILDS
-        parts = [self.build_part(count)] * builds
+        choice = self.choice
+        builds_of_search = USUAL_BUILDS_OF_RENDERS if choice.rendered else USUAL_BUILDS
+        parts = [self.build_part(count)] * (builds_of_search if choice.has_target else 1)
         if choice.has_curve and not (choice.has_target or choice.rendered):
             counts, steps = curve_counts(choice.max_drop, limits.default, limits.min_count, limits.max_count)
             parts = [*(self.build_part(point_count, steps) for point_count in counts), *parts]
         return [*parts, *self.end_parts(count, level_counts(count, self.settings["levels"], limits.min_count))]
 
     def build_part(self, count: float, steps: int | None = None) -> RunPart:
-        """Return the part that builds ``count`` Gaussians, with a fit of ``steps`` (None: of the run's steps)."""
+        """Return the part that builds ``count`` Gaussians with a fit of ``steps``; None: as many steps as the run."""
         settings, steps = self.settings, self.steps if steps is None else steps
         method = settings["method"]
         work = COST_PAIRS if self.merges_pairs else COST_BUILD
@@ -95,9 +94,9 @@ class RunCosts:
         return RunPart(self.num_pixels * work / 1e6, steps * step / 1e6)
 
     def end_parts(self, count: float, coarser: Sequence[float]) -> list[RunPart]:
-        """Return the parts that follow a result of ``count`` Gaussians: coarser levels, a trial, scores of the input.
+        """Return the parts that follow after the result is built: coarser levels, a trial, and scores of the input.
 
-        ``coarser`` are the numbers of Gaussians of the levels. The trial has two rounds.
+        ``count`` is the number of Gaussians of the result, ``coarser`` those of the levels. The trial has two rounds.
         """
         build = self.build_part(count)
         trial = [RunPart(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)] * self.has_trial
@@ -105,18 +104,21 @@ class RunCosts:
         return [*map(self.build_part, coarser), *trial, scores]
 
     def seconds(self, parts: Sequence[RunPart], num_views: int, threads: int) -> float:
-        """Return the wall time of a run with these parts, imports included."""
+        """Return the wall time of a run with these parts, which includes imports."""
         work = sum(part.seconds for part in parts)
         return IMPORT_SECONDS + work / (1 + THREAD_GAIN * max(0, min(threads, num_views) - 1))
 
 
 def mean_inside(scene: Scene) -> float:
-    """Measure the mean share of a scene's Gaussians that lie in a view, on a sample; 1 without views."""
+    """Return the share of a scene's Gaussians that lies in a view, as the mean of all views; 1 without views.
+
+    It is measured on a sample.
+    """
     return float(np.mean(shares_inside(scene, INSIDE_GAUSSIANS) or [1.0]))
 
 
 def measure_costs(prepared: Prepared, plan: Plan) -> RunCosts:
-    """Return the facts about a run in one piece from which the costs of its parts follow."""
+    """Return the facts that decide the costs of a run in one piece."""
     scene, steps = prepared.scene, 0 if plan.fit.fit == "none" else plan.fit.steps
     return RunCosts(
         settings=plan.settings | ({} if plan.checkpoint else {"checkpoint": "none"}),

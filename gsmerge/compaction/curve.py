@@ -1,7 +1,8 @@
-"""Measure the scene's curve, which is the quality of short fits by their number of Gaussians, and choose a number.
+"""Measure the scene's curve, and choose a number of Gaussians by it.
 
-The quality is measured on photos that the fits leave out. With too few photos, it is measured on patches of photos that
-they leave out. The number is at the knee of the curve, or the smallest that is good enough.
+The curve is the quality of short fits by their number of Gaussians. It is measured on photos that the fits leave out
+or, with too few photos, on patches that they leave out. The number is at the knee of the curve, or the smallest that is
+good enough.
 """
 
 from __future__ import annotations
@@ -46,9 +47,10 @@ class CurvePoint:
 
 
 def curve_counts(max_drop: float | None, usual: int, least: int, most: int) -> tuple[list[int], int]:
-    """Return the counts to measure a curve at, rising from ``least`` to ``most``, and the steps of its short fits.
+    """Return the counts at which a curve is measured, ascending, and the steps of its short fits.
 
-    ``max_drop`` is the largest loss of quality (dB) that the curve has to show; None: it has to show the knee.
+    The counts lie around the ``usual`` one, between ``least`` and ``most``. ``max_drop`` is the largest loss of quality
+    (dB) by which the curve decides the number; None: the knee decides it.
     """
     shares, steps = [1 / 8, 1 / 4, 1 / 2, 1.0], 60  # shares of the usual count; this is enough to find the knee
     if max_drop is not None:
@@ -59,10 +61,10 @@ def curve_counts(max_drop: float | None, usual: int, least: int, most: int) -> t
 def measure_curve(
     prepared: Prepared, plan: Plan, build: Build, steps: int, counts: Sequence[int], left_out: LeftOut | None = None
 ) -> list[CurvePoint]:
-    """Measure PSNR and SSIM, at full size, of fits with each of the ``counts``.
+    """Measure PSNR and SSIM, at full size, of short fits with each of the ``counts``.
 
-    Every fit takes ``steps`` steps, whatever the plan says. It is scored on the photos of ``left_out``; without them,
-    on patches of all photos that the fit leaves out.
+    Every fit takes ``steps`` steps, whatever the plan says. It is scored on the photos of ``left_out`` or, without
+    them, on patches of all photos that the fit leaves out.
     """
     holdout = 0.1  # share of the photos' patches that the fits leave out
     short = replace(
@@ -91,7 +93,7 @@ def measure_curve(
 def _score_fit(
     count: int, gaussians: Gaussians, photos: Photos, weights: list[np.ndarray], min_gain: float
 ) -> CurvePoint:
-    """Score Gaussians on those pixels of the photos that have a weight of 0, since the fit left them out."""
+    """Score a fit on the pixels of the photos that it left out, which have a weight of 0."""
     images = [np.clip(image, 0, 1) for image in render_photos(gaussians, photos)]
     views = range(len(photos))
     similarities = parallel_map(lambda v: _measure_ssim(images[v], photos.images[v], weights[v] == 0), views)
@@ -101,7 +103,7 @@ def _score_fit(
 def _measure_ssim(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float:
     """Return the SSIM over the windows inside the mask, or over the whole picture if no window lies inside.
 
-    0 for a picture smaller than a window.
+    The SSIM of a picture that is smaller than a window is 0.
     """
     if min(mask.shape) < WINDOW:
         return 0.0
@@ -134,8 +136,8 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
     This knee is the last count at which the quality grows by at least 0.15 dB per doubling of the count. Halfway
-    between two neighbouring points, the slope is that of the line through them. It is linear between these places. The
-    points are sorted by count.
+    between two neighbouring points, the slope of the curve is that of the line through them. Between these places the
+    slope is interpolated. The points are sorted by count.
     """
     doublings = [float(log(p.count) / log(2)) for p in points]
     pairs = list(pairwise(range(len(points))))

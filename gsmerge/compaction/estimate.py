@@ -38,13 +38,14 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """Estimate size, time and memory of a run without running it.
 
     Returns:
-        ``num_gaussians``: the largest number of Gaussians that the result can have or, if ``exact``, their number. It
-        is the smallest number if ``psnr_kept`` or ``loss_kept`` is a number. Then the run takes more Gaussians until
-        the PSNR against the input is ``psnr_kept`` dB, or until the photos are shown at most ``loss_kept`` dB worse. If
-        ``quality`` is given, the run takes more or fewer until this is met. ``ratio`` to the input, and ``bytes`` of a
-        ``.ply``. ``blocks``, ``method``, ``superpixels_per_view`` (None if a budget distributes them, 0 if neighbours
-        are merged), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as the run uses them. ``seconds`` and
-        ``memory_bytes`` have two digits and are right within a factor of about two. ``memory_problem`` says that this
+        ``num_gaussians`` is the largest number of Gaussians that the result can have or, if ``exact``, their number. If
+        ``psnr_kept`` is a number, it is the smallest one, and the run takes more Gaussians until the PSNR against the
+        input is ``psnr_kept`` dB. If ``loss_kept`` is a number, the run takes more until the photos are shown at most
+        ``loss_kept`` dB worse. If ``quality`` is given, the run takes more or fewer until this quality is met.
+        ``ratio`` is the number relative to the input, ``bytes`` the size as a ``.ply``. ``superpixels_per_view`` is
+        None if a budget distributes superpixels among the views, and 0 if neighbours are merged. ``blocks``,
+        ``method``, ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` are those of the run. ``seconds`` and
+        ``memory_bytes`` have two digits, and are right within a factor of about two. ``memory_problem`` says that this
         machine has too little memory, or is None.
     """
     if options.clean.crop is not None:
@@ -67,16 +68,20 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     num_drawn = num_pixels if options.method == "unmerged-fit" else count
     fit = {OURS: choices.fit.fit, "unmerged-fit": "full"}.get(options.method, "none")
     steps = 0 if fit == "none" else choices.fit.steps
-    all_pixels, budget = at_once * num_blocks, options.budget  # pixels of views in several blocks count several times
+    all_pixels, budget = at_once * num_blocks, options.budget  # a view that is in two blocks is built twice
     inside = 1.0 if no_views else mean_inside(scene)
     costs = RunCosts(
-        settings, all_pixels, all_pixels / max(1, len(scene)), inside, steps, merges_pairs=no_views, is_placed=no_views,
-        choice=CountChoice(has_target, budget.auto or budget.max_drop is not None, budget.max_drop, size.rendered),
+        settings=settings, num_pixels=all_pixels, view_pixels=all_pixels / max(1, len(scene)), inside=inside,
+        steps=steps, merges_pairs=no_views, is_placed=no_views,
+        choice=CountChoice(
+            has_target=has_target, has_curve=budget.auto or budget.max_drop is not None, max_drop=budget.max_drop,
+            rendered=size.rendered,
+        ),
         has_trial=steps > 0 and scene.has_own_pixels and options.new_views is not False,
     )  # fmt: skip
     seconds = costs.seconds(costs.all_parts(limits, num_drawn), len(scene), options.threads or available_threads())
     memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=num_pixels - at_once)
-    distributed = limits.count is not None or options.budget.auto
+    is_distributed = limits.count is not None or budget.auto
     return {
         "num_gaussians": count,
         "exact": options.budget.is_filled or found_count is not None,
@@ -87,7 +92,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": num_blocks,
         "method": options.method,
-        "superpixels_per_view": 0 if choices.may_merge_pairs else None if distributed else limits.per_view,
+        "superpixels_per_view": 0 if choices.may_merge_pairs else None if is_distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit,
         "fit_steps": choices.fit.steps,
@@ -124,7 +129,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 
 
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
-    """Describe in a document what :func:`gsmerge.compaction.files.compact_files` would make of a scene."""
+    """Return the document of ``--dry-run``: what :func:`gsmerge.compaction.files.compact_files` would make."""
     scene, out, settings = load.scene, outputs.result, with_output_name(settings, outputs)
     notes = [*load.notes, *views_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:

@@ -1,4 +1,4 @@
-"""Meet a size in bytes in formats whose number of bytes depends on the content of the file."""
+"""Meet a budget in bytes, in compressed formats, where the number of Gaussians alone does not give the bytes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Rebuild = Callable[[int | None], Candidate]  # build a count of Gaussians from a
 
 
 def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: Sequence[str] = ()) -> int:
-    """Return the number of bytes of a file with these Gaussians and cameras; of a page, an upper bound of it."""
+    """Return how many bytes a file with these Gaussians and cameras has, or an upper bound if it is a page."""
     comments = RESULT_COMMENT, MIP_COMMENT
     if file.measure is not None:
         return file.measure(gaussians, cameras, comments)
@@ -39,39 +39,39 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
     """Make the file of a candidate nearly as large as a budget in bytes allows.
 
     The candidate is rebuilt with other counts until its file is about that large. Then the faintest Gaussians are
-    dropped until it fits. Without such a budget, or if the bytes follow from the count, the candidate is returned
-    unchanged.
+    dropped until the file fits. The candidate is returned unchanged without a budget in bytes, or if the format has a
+    fixed number of bytes for each Gaussian.
     """
     if plan.size is None or not plan.size.packed:
         return candidate
     max_bytes, file = plan.size.num_bytes, plan.size.file
     names = prepared.input_scene.names
-    base_bytes = measure_base(candidate.gaussians, max_bytes, file, candidate.cameras, names)
+    base_bytes = measure_least_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names)
 
     def choose_next(built: Sequence[Candidate]) -> int | None:
-        """Return the count that seems to fill the size; None if the last build fits after a few are dropped."""
-        size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras, names), len(built[-1].gaussians)
-        # unseen Gaussians were dropped from the requested number; the bytes that they free are not filled up
-        requested = max(count, built[-1].count or 0)
-        full_size = base_bytes + (size - base_bytes) * requested / max(count, 1)  # bytes with the dropped Gaussians
-        full_count = min(
-            int(BUILD_SURPLUS * count * (max_bytes - base_bytes) / max(size - base_bytes, 1)), plan.limits.most
-        )
-        near_share = 0.97  # share of the size that a build has to reach
-        is_near = full_size >= near_share * max_bytes or full_count <= BUILD_SURPLUS * requested
-        most_dropped = 0.08  # largest share of the Gaussians that is dropped after the last build
-        fits = full_count >= (1 - most_dropped) * count and is_near
-        return None if fits or len(built) > MAX_REBUILDS else full_count
+        """Return the count whose file is expected to be as large as allowed; None if the last build is near enough."""
+        last, count = built[-1], len(built[-1].gaussians)
+        num_bytes = measure_bytes(last.gaussians, file, last.cameras, names)
+        expected_count = int(BUILD_SURPLUS * count * (max_bytes - base_bytes) / max(num_bytes - base_bytes, 1))
+        next_count = min(expected_count, plan.limits.most)
+        # Gaussians that no view sees were dropped from the requested number. Others do not take their place
+        requested_count = max(count, last.count or 0)
+        requested_bytes = base_bytes + (num_bytes - base_bytes) * requested_count / max(count, 1)
+        near_share = 0.97  # share of the allowed bytes that is near enough
+        is_large_enough = requested_bytes >= near_share * max_bytes or next_count <= BUILD_SURPLUS * requested_count
+        most_dropped = 0.08  # largest share of the Gaussians that may be dropped from the last build
+        is_small_enough = next_count >= (1 - most_dropped) * count
+        return None if (is_large_enough and is_small_enough) or len(built) > MAX_REBUILDS else next_count
 
     candidate = build_in_turn(rebuild, candidate, choose_next)[-1]
     gaussians = drop_to_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names, base_bytes)
     return candidate if len(gaussians) == len(candidate.gaussians) else rescore(candidate, gaussians, prepared, plan)
 
 
-def measure_base(
+def measure_least_bytes(
     gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, names: Sequence[str] = ()
 ) -> int:
-    """Return the bytes of a file with one Gaussian; UsageError if they are more than ``max_bytes``."""
+    """Return the bytes of a file with one Gaussian; UsageError if these are more than ``max_bytes``."""
     base_bytes = measure_bytes(gaussians[:1], file, cameras, names)
     if base_bytes > max_bytes:
         problem = f"expected at least {human_bytes(base_bytes)} for a {file.ending} with one Gaussian"
@@ -86,18 +86,18 @@ def drop_to_bytes(
 
     ``base_bytes`` are the bytes of a file with one Gaussian.
     """
-    low, high = 0, len(gaussians)  # the largest count that is known to fit, and the largest that may fit
-    best, count = gaussians[:0], len(gaussians)
+    fitting_count, most_count = 0, len(gaussians)  # the largest count that is known to fit, and the largest that may
+    fitting, count = gaussians[:0], len(gaussians)
     full_share = 0.985  # a file with this share of ``max_bytes`` is full enough
     for _ in range(MOST_MEASURED):
-        trial = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
-        size = measure_bytes(trial, file, cameras, names)
-        if size <= max_bytes:
-            low, best = count, trial
+        kept = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
+        num_bytes = measure_bytes(kept, file, cameras, names)
+        if num_bytes <= max_bytes:
+            fitting_count, fitting = count, kept
         else:
-            high = count - 1
-        if low == len(gaussians) or (low and full_share * max_bytes <= size <= max_bytes) or low >= high:
+            most_count = count - 1
+        if fitting_count >= most_count or (fitting_count and full_share * max_bytes <= num_bytes <= max_bytes):
             break
-        next_count = int(count * ((1 + full_share) / 2 * max_bytes - base_bytes) / max(size - base_bytes, 1))
-        count = min(max(low + 1, next_count), high)
-    return best
+        expected_count = int(count * ((1 + full_share) / 2 * max_bytes - base_bytes) / max(num_bytes - base_bytes, 1))
+        count = min(max(fitting_count + 1, expected_count), most_count)
+    return fitting

@@ -1,4 +1,4 @@
-"""Compact a scene from its files: read it, compact it, write the result, and report."""
+"""Compact a scene from files, and write the result to files."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def compact_files(
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels and cameras: all files or none.
 
-    The input is hashed for the report if ``hashed``. ``seconds_before`` has the wall time of the caller's earlier
+    ``hashed``: the report has hashes of the input files. ``seconds_before`` has the wall time of the caller's earlier
     steps, by name. ``on_read`` is called with the scene after it was read.
 
     Returns the report, see :func:`gsmerge.compaction.report.report_document`. Raises SceneError if the scene cannot be
-    read or the result cannot be written; UsageError if the settings need something that the scene does not have.
+    read or the result cannot be written, and UsageError if the scene lacks something that the settings need.
     """
     start, out, settings = perf_counter(), outputs.result, with_output_name(settings, outputs)
     format_ = outputs.format
@@ -85,7 +85,7 @@ def compact_files(
 
 
 def with_output_name(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
-    """Return the settings with the name of the output file, whose bytes a budget may count."""
+    """Return the settings with the name of the output file, because a budget may count the bytes of this file."""
     return replace(settings, budget=replace(settings.budget, output=outputs.result.name))
 
 
@@ -98,7 +98,7 @@ def _pad_to_full(result: CompactResult) -> CompactResult:
 
 
 def _list_first_layers(scene: Scene) -> list[int]:
-    """List the views, but only the first of several layers of a view, which have the same name and camera."""
+    """Return the views, but only the first of views with the same name and camera, which are layers of one view."""
     cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
     keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
@@ -109,12 +109,12 @@ def read_input(
 ) -> Loaded:
     """Read a scene from its files, with notes on missing or unusual content.
 
-    The files of Gaussians are also hashed if ``hashed``. SceneError if the scene cannot be read, or if one of its files
-    changes meanwhile.
+    ``hashed``: the files of Gaussians are also hashed. Raises SceneError if the scene cannot be read, or if one of its
+    files changes while it is read.
     """
     stats = read_stats(files)
     loaded = load_files(files, opacity=opacity, hints=hints)
-    # photos inside the camera file are in the scene already, so their memory is freed
+    # The scene already has the photos that were inside the camera file, so this copy is freed
     cameras = None if loaded.cameras is None else replace(loaded.cameras, images=())
     sha256 = file_sha256(*files.all_plys) if hashed else None
     if changed := list_changed(stats):
@@ -124,13 +124,13 @@ def read_input(
 
 
 def _compact_notes(loaded: Loaded) -> list[str]:
-    """Return notes on columns that results lack, and on a scene that is a result already.
+    """Return notes on columns that the result will lack, and on a scene that is a result already.
 
     A file of gsmerge is recognised by its header or, in formats without one, by the cameras beside it. It is a result
-    if its header says so, or if it has few Gaussians for the pixels of its views.
+    if its header says so, or if it has at most one Gaussian for every two pixels of its views.
     """
     scene, comments, notes = loaded.scene, loaded.info.comments, list[str]()
-    unused = " ".join(note for note in loaded.info.adapted if note.startswith(UNUSED))  # another note has these
+    unused = " ".join(note for note in loaded.info.adapted if note.startswith(UNUSED))  # columns that a note names
     lost = [name for name in loaded.info.extra_columns if name not in unused]
     if lost:
         notes.append(f"merged Gaussians do not have the columns {list_names(lost)}; gsmerge convert copies them")

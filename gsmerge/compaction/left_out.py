@@ -18,7 +18,7 @@ from gsmerge.settings.compact import OURS, TRIAL, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene
 
 LEAST_VIEWS = 4  # fewest views with photos of which some are left out; of fewer views, too little would remain
-# One of every LEFT_OUT_PART views is left out in a round, but at most MOST_LEFT_OUT views
+# One of every LEFT_OUT_PART views is left out at a time, but at most MOST_LEFT_OUT views
 LEFT_OUT_PART, MOST_LEFT_OUT = 6, 3
 LEAST_SEEN = 0.02  # a left-out photo counts if the other views see more than this share of it
 
@@ -38,7 +38,7 @@ class LeftOut:
 
     @property
     def rows(self) -> Gaussians:
-        """The input's Gaussians of the other views."""
+        """Gaussians of the input that belong to the other views."""
         return self.rest.scene.file_gaussians
 
     def score(self, gaussians: Gaussians) -> np.ndarray:
@@ -54,9 +54,10 @@ class LeftOut:
     def plan(self, plan: Plan, **settings: Any) -> Plan:
         """Plan a run on the other views with the settings of ``plan``, some of which ``settings`` replace.
 
-        Settings that only the whole scene can decide get the values of a trial.
+        Settings that depend on the whole scene, such as a crop, are replaced by those of ``TRIAL``.
         """
         settings = plan.settings | TRIAL | settings
+        # without networks in the plan, the settings must not ask for any
         settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
         return make_plan(self.rest, CompactOptions().with_settings(settings), plan.checkpoint)
 
@@ -66,9 +67,9 @@ def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) ->
     rest = subset(scene, [view for view in range(len(scene)) if view not in views])
     if not views or len(rest.file_gaussians) == 0:
         return None
-    every = tuple(range(len(rest)))
+    rest_ids = tuple(range(len(rest)))
     prepared_rest = replace(
-        prepared, input_scene=rest, scene=rest, reference=Reference(PHOTOS, every), repeated=every, moved=False,
+        prepared, input_scene=rest, scene=rest, reference=Reference(PHOTOS, rest_ids), repeated=rest_ids, moved=False,
         agreement=None,
     )  # fmt: skip
     left_out_views = subset(scene, views)
@@ -88,7 +89,7 @@ def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
 def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
     """Choose the views to leave out in each of two rounds, evenly spread among ``views``.
 
-    The rounds take turns along the views, so a round leaves no two neighbours out.
+    The chosen views belong to the first and the second round in turn, so no round leaves out two neighbours.
     """
     count = min(MOST_LEFT_OUT, max(1, len(views) // LEFT_OUT_PART))
     spread = [views[i] for i in pick_views(len(views), 2 * count)]

@@ -31,7 +31,8 @@ class Method:
     Args:
         name: The name on the command line.
         run: A function of a prepared scene, a plan and a number of Gaussians. It returns at most so many canonical
-            Gaussians, unless the method keeps those of the input. It times itself by stages of the record.
+            Gaussians, unless the method keeps those of the input. Its parts are blocks of
+            :func:`gsmerge.runtime.record.stage`, which measures their time.
         needs_photos: The scene must have photos.
         uses: Flat names of the settings that it uses, in addition to those that all methods use.
         check: Raises a UsageError if a program that the method runs is missing.
@@ -46,14 +47,14 @@ class Method:
     prepare: Callable[[Scene, PrepareOptions], Prepared] = prepare
 
     def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-        """Build ``count`` canonical Gaussians by ``run``; None: as many as ``superpixels`` and K give."""
+        """Build ``count`` canonical Gaussians by ``run``; None: ``superpixels`` and K decide the number."""
         gaussians = self.run(prepared, plan, plan.limits.default if count is None else count)
         return Fitted(gaussians, prepared.scene.cameras, None)
 
 
 @dataclass(frozen=True)
 class _OwnMethod(Method):
-    """Our own method: the pipeline, which also fits what it builds."""
+    """Our own method: the pipeline of :mod:`gsmerge.pipeline`, which also fits the Gaussians."""
 
     def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
         """Build and fit ``count`` canonical Gaussians."""
@@ -64,7 +65,7 @@ OWN_METHOD = _OwnMethod(OURS, lambda *arguments: build(*arguments).gaussians)
 
 
 def find_method(options: CompactOptions) -> Method:
-    """Load the method that the options name. Raises UsageError if a program that it runs is missing."""
+    """Load the method that the options name; UsageError if a program that it runs is missing."""
     if options.method == OURS:
         return OWN_METHOD
     method: Method = load_plugin(METHODS, options.method)
@@ -73,9 +74,9 @@ def find_method(options: CompactOptions) -> Method:
 
 
 def is_without_views(scene: Scene, options: CompactOptions) -> bool:
-    """Return whether a run needs no views, because the scene has none and no option asks for a stage that uses them.
+    """Return whether a run works without views: the scene has none, and no option asks for a stage that needs them.
 
-    Its Gaussians are then merged by their positions and colours alone.
+    Gaussians are then merged with their neighbours, by positions and colours alone.
     """
     return len(scene) == 0 and not options.replaces_stages
 

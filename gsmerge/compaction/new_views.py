@@ -1,8 +1,8 @@
 """Estimate how much new views gain, by a trial on small photos that a short fit has not seen.
 
-Scores on photos that a fit has seen only say how well it remembers them. So the trial leaves some views out with their
-Gaussians, and compacts the other views at a small size. Then both the other views' Gaussians and the result are scored
-on the photos that were left out, over the pixels that these Gaussians cover.
+Scores on photos that a fit has seen only say how well it remembers them. So the trial leaves out some views with their
+Gaussians, and compacts the other views at a small size. The photos that were left out then score the Gaussians of the
+other views before and after compaction, over the pixels that the other views see.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from gsmerge.settings.stages import SHARE
 from gsmerge.types import Cameras, PicturedScene, Pixels
 
 TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this many pixels
-# Most steps of the fit. Below 150 steps, fits of few views are of another kind (gsmerge.fit.schedule.MANY_STEPS), and
-# predict less
+# Most steps of the fit. With fewer than 150 steps, fits of few views have other settings
+# (gsmerge.fit.schedule.MANY_STEPS), and predict less
 TRIAL_STEPS = 200
-# Most views of a round, the nearest to those that are left out. With more views, TRIAL_STEPS would draw each too seldom
-# to tell how a run with more steps ends. Besides, farther views show little of what the left-out views show
+# Most views of a round: those nearest to the left-out ones. Farther views show little of what these show. With more
+# views, TRIAL_STEPS would also draw each view too seldom to tell how a run with more steps ends
 TRIAL_VIEWS = 64
-# Small pictures have more detail in each pixel, so they lose more with few Gaussians. The trial therefore has a larger
-# share of Gaussians per pixel. Relative to the usual share, it is that of the result to the power of LESS. On five
-# captures at 1 % this lowers the error of the estimated gain from 2.3 to 1.0 dB
-USUAL, LESS = parse_share(SHARE), 0.3
-# The expected gain of new views is a mean of the gain of own photos, with the weight OWN and only where depth is
-# confirmed, and of the gain in the trial. The true gain lies between the two, or at most SPREAD dB outside, for 80 % of
-# the results or more, on ten captures as on five others (docs/internals/notebook.md). Nothing is known about more than
-# MOST_SHARE Gaussians for each pixel
-OWN, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
+# Small pictures have more detail in each pixel, so they lose more with few Gaussians. The trial therefore has more
+# Gaussians per pixel than the result. If the result has x times the usual share, the trial has x to the power of
+# SHARE_POWER times this share. On five captures at 1 % this lowers the error of the estimated gain from 2.3 to 1.0 dB
+USUAL_DENSITY, SHARE_POWER = parse_share(SHARE), 0.3
+# The expected gain of new views is a weighted mean of two gains: that of the result's own photos, as far as depth is
+# confirmed, with the weight OWN_WEIGHT, and that of left-out photos in the trial. The true gain lies between the two,
+# or at most SPREAD dB outside, for 80 % of the results or more, on ten captures and on five others
+# (docs/internals/notebook.md). Nothing is known about results with more than MOST_SHARE Gaussians for each pixel
+OWN_WEIGHT, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 
 @dataclass(frozen=True)
@@ -52,39 +52,41 @@ class NewViews(ExpectedScores):
 
     @property
     def gain(self) -> float:
-        """PSNR (dB) that a new view gains."""
+        """Gain of PSNR (dB) of a new view."""
         return self.after - self.before
 
     def to_dict(self) -> dict[str, float]:
-        """Return the numbers for a report."""
+        """Return the numbers, rounded for a report, by name."""
         return {name: round(value, 4) for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What a trial measured: PSNR (dB) of small photos that its short fits have not seen."""
+    """What a trial measured: the PSNR (dB) of small left-out photos, rendered from three sets of Gaussians."""
 
-    own_before: float  # Rendered from all Gaussians of the input
-    before: float  # Rendered from the Gaussians of the other views
-    after: float  # Rendered from the result that the trial made of the other views
+    own_before: float  # All Gaussians of the input, including those of the left-out views
+    before: float  # The Gaussians of the other views
+    after: float  # The result that the trial made of the other views
     views: int  # Number of left-out photos that count
 
     def predict(self, own_before: float, own_after: float, confirmed: float) -> NewViews:
         """Predict the PSNR of new views of a result.
 
-        ``own_before`` and ``own_after`` are the PSNR (dB) of its own photos, rendered from the input and from the
-        result. New views gain at most a part of what own photos gain: the share of ``confirmed`` depth. Renders of the
-        input are assumed to be worse in new views than in its own views, by the same difference as in the trial.
+        ``own_before`` and ``own_after`` are the PSNR (dB) of the result's own photos, rendered from the input and from
+        the result. ``confirmed`` is the share of the pixels whose depth other views confirm. New views gain at most
+        this share of what own photos gain. The input is assumed to show new views worse than its own views, by the same
+        difference as in the trial.
         """
-        most = confirmed * max(0.0, own_after - own_before)
-        least = min(self.after - self.before, most)
+        most_gain = confirmed * max(0.0, own_after - own_before)
+        least_gain = min(self.after - self.before, most_gain)
         before = own_before + self.before - self.own_before
-        after, low, high = before + OWN * most + (1 - OWN) * least, least - SPREAD, most + SPREAD
-        return NewViews(round(before, 2), round(after, 2), round(low, 2), round(high, 2), self.views)  # as in files
+        after = before + OWN_WEIGHT * most_gain + (1 - OWN_WEIGHT) * least_gain
+        low, high = round(least_gain - SPREAD, 2), round(most_gain + SPREAD, 2)  # files have two digits
+        return NewViews(round(before, 2), round(after, 2), low, high, self.views)
 
 
 def can_try(prepared: Prepared, count: int = 0) -> bool:
-    """Return whether a trial is possible for a scene and says something about a result of ``count`` Gaussians."""
+    """Return whether a trial is possible for a scene, and can tell something about a result of ``count`` Gaussians."""
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
     return prepared.agreement is not None and can_leave_out(prepared) and count <= MOST_SHARE * pixels
 
@@ -92,18 +94,18 @@ def can_try(prepared: Prepared, count: int = 0) -> bool:
 def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:
     """Run the trial for a result of ``count`` Gaussians, in two rounds, and return what it measured.
 
-    None if the plan wants no trial, with too few views or photos, or with too many Gaussians. None also if views have
-    no Gaussians of their own. The Gaussians would then still contain the left-out photos, so the error would be 2 dB
-    instead of 1.2, and the trial would take a quarter of a run's time.
+    None if the plan wants no trial, with too few photos, or with too many Gaussians. None also if views have no
+    Gaussians of their own, because the content of the left-out photos would remain in the Gaussians. The error of the
+    estimate would then be 2 dB instead of 1.2, and the trial would take a quarter of a run's time.
     """
     if not plan.new_views or not can_try(prepared, count):
         return None
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
     begin_part()
     with record_part(silent=True) as record:
-        share = min(1.0, USUAL * float(power(count / (USUAL * pixels), LESS)))
-        chosen = choose_left_out(prepared.reference.score_views)
-        rounds = [_score_round(prepared, views, plan, build, share) for views in chosen]
+        share = min(1.0, USUAL_DENSITY * float(power(count / (USUAL_DENSITY * pixels), SHARE_POWER)))
+        views_of_rounds = choose_left_out(prepared.reference.score_views)
+        rounds = [_score_round(prepared, views, plan, build, share) for views in views_of_rounds]
         scores = [round_scores for round_scores in rounds if round_scores is not None]
     add_seconds({"new views": sum(record.seconds.values())})
     if not scores:
@@ -114,36 +116,40 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
 
 
 def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Build, share: float) -> np.ndarray | None:
-    """Compact the views around ``views`` without these, at a small size, and score the result on their photos.
+    """Leave out ``views``, compact other views near them at a small size, and score the result on the left-out photos.
 
-    Returns an array ``[4,v]``. Its rows are the share of each photo that the remaining views see, and the PSNR (dB) of
-    renders from all Gaussians, from those of the remaining views, and from the result. None if no remaining view sees
-    what the photos show.
+    ``share`` is the number of Gaussians per pixel. Returns an array ``[4,v]``. Its rows are the share of each photo
+    that the other views see, and the PSNR (dB) of renders from all Gaussians, from those of the other views, and from
+    the result. None if no other view sees what the photos show.
     """
-    around = views_around(prepared.scene.cameras, views, TRIAL_VIEWS)
-    scene = prepared.scene if len(around) == len(prepared.scene) else subset(prepared.scene, around)
+    used_views = views_around(prepared.scene.cameras, views, TRIAL_VIEWS)
+    scene = prepared.scene if len(used_views) == len(prepared.scene) else subset(prepared.scene, used_views)
     small = shrink_scene(scene, max(1, max(scene.cameras.width, scene.cameras.height) // TRIAL_PIXELS))
-    left_out = leave_out(small, [around.index(view) for view in views], prepared)
+    left_out = leave_out(small, [used_views.index(view) for view in views], prepared)
     if left_out is None:
         return None
     superpixels = max(1, round(share * small.pixels_per_view))
-    short = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(TRIAL_STEPS, plan.fit.steps))
-    # Without views from outside and without pruning, which hardly change the score (docs/internals/notebook.md)
-    inside = replace(short.fit, tuning=replace(short.fit.tuning, outside_from=1.0))
-    compacted = build(left_out.rest, replace(short, fit=inside, is_trial=True), None).gaussians
-    drawn = small.file_gaussians, left_out.rows, compacted
-    return np.stack([left_out.shares, *(left_out.score(gaussians) for gaussians in drawn)])
+    trial_plan = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(TRIAL_STEPS, plan.fit.steps))
+    # The fit draws no views from outside, and nothing is pruned. Both hardly change the score
+    # (docs/internals/notebook.md)
+    fit = replace(trial_plan.fit, tuning=replace(trial_plan.fit.tuning, outside_from=1.0))
+    compacted = build(left_out.rest, replace(trial_plan, fit=fit, is_trial=True), None).gaussians
+    scored = small.file_gaussians, left_out.rows, compacted
+    return np.stack([left_out.shares, *(left_out.score(gaussians) for gaussians in scored)])
 
 
 def views_around(cameras: Cameras, views: Sequence[int], most: int) -> list[int]:
-    """Choose ``views`` and those whose cameras are nearest to any of them, at most ``most`` in all; sorted."""
+    """Return ``views`` and the views whose cameras are nearest to any of them, at most ``most`` together, ascending."""
     distances = camera_distances(cameras)[list(views)].min(0)
     distances[list(views)] = -1.0
     return sorted(np.argsort(distances, kind="stable")[:most].tolist())
 
 
 def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
-    """Shrink the pictures by a factor ``step`` per side; each new pixel keeps one front Gaussian, of larger scales."""
+    """Shrink the pictures by a factor ``step`` per side.
+
+    A new pixel keeps the front Gaussian of one old pixel in its middle, with scales that are ``step`` times as large.
+    """
     cameras, shape = scene.cameras, scene.images.shape[1:3]
     height, width = (max(1, side // step) for side in shape)
     Ks = cameras.Ks / np.array([[step], [step], [1]], cameras.Ks.dtype)

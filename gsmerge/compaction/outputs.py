@@ -20,8 +20,8 @@ from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import AXES
 from gsmerge.types import Cameras
 
-# Cameras count as the same if their viewmats differ by at most this number, relative to the largest translation, and
-# their Ks by at most this share or a hundred times this number of pixels
+# Two cameras are the same if their viewmats and Ks differ by rounding alone. For viewmats this is a share of the
+# largest translation. Ks may differ by this share, or by a hundred times this number in pixels
 CAMERA_TOLERANCE = 1e-5
 
 
@@ -47,9 +47,9 @@ class Outputs:
 
 
 def plan_outputs(result: Path, options: FileOptions | None = None, *, overwrite: bool = False) -> Outputs:
-    """Name the files of an output; cameras get a file of their own if the format cannot hold them.
+    """Return the paths of the files of an output. Cameras get a file of their own if the format cannot hold them.
 
-    UsageError if the name has no ending that can be written, or if the options do not fit the format.
+    Raises UsageError if the name has no ending that can be written, or if the options do not fit the format.
     """
     options, format_ = options or FileOptions(), output_format(result)
     if options.columns == "full" and not (format_.columns and options.normals):
@@ -63,7 +63,7 @@ def plan_outputs(result: Path, options: FileOptions | None = None, *, overwrite:
 
 
 def write_outputs(outputs: Outputs, contents: Contents) -> int:
-    """Write the files of an output; return the bytes of the result with its levels."""
+    """Write the files of an output; return how many bytes the result and its levels have together."""
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         written = add_outputs(add, outputs, add(outputs.result), contents)
         num_bytes = sum(file.stat().st_size for files in written.values() for file in files)
@@ -72,11 +72,11 @@ def write_outputs(outputs: Outputs, contents: Contents) -> int:
 
 
 def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write the files of an output as part of :func:`atomic_outputs`; return the temporary files of each level.
+    """Write the files of an output in a block of :func:`atomic_outputs`; return the temporary files of each level.
 
-    ``temporary`` is the file that was added for the result. Viewers of some formats start at the first camera in the
-    file, or in a file of settings beside it. For these a camera is placed if the scene has none. A file of settings
-    that exists already stays unchanged, unless gsmerge wrote it and may overwrite files.
+    ``add`` is what the block yields, and ``temporary`` what it has returned for the result. Viewers of some formats
+    start at the first camera in the file, or in a file of settings beside it. If the scene has no camera, one is placed
+    for them. A file of settings that exists already stays unchanged, unless gsmerge wrote it and may overwrite files.
     """
     format_, gaussians, has_views = outputs.format, contents.levels[0], len(contents.cameras) > 0
     contents = replace(contents, options=outputs.options)
@@ -94,25 +94,25 @@ def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Con
 
 
 def frame_notes(outputs: Outputs, cameras: Cameras) -> list[str]:
-    """Return notes if viewers of the format do not show the scene upright, or not at its place on the globe."""
+    """Return notes if viewers of the format will not show the scene upright, or not at its place on the globe."""
     format_, notes = outputs.format, list[str]()
     if format_ is TILESET and outputs.options.place is None:
         notes.append("without a place the scene lies in the middle of the earth: --set place=LON,LAT,HEIGHT")
     if len(cameras) and (format_.first_view or format_ is TILESET):
         up = -cameras.viewmats[:, 1, :3].mean(0)
         axis = int(np.abs(up).argmax())
-        name = AXES[2 * axis + int(up[axis] < 0)]
-        if name != "-y":
-            problem = f"{name} is upward for the cameras, and -y for viewers of {format_.ending}"
+        up_axis = AXES[2 * axis + int(up[axis] < 0)]
+        if up_axis != "-y":
+            problem = f"{up_axis} is upward for the cameras, and -y for viewers of {format_.ending}"
             notes.append(f"{problem}: gsmerge convert --up -y turns the scene")
     return notes
 
 
 def _add_cameras(add: AddOutput, path: Path, contents: Contents, *, overwrite: bool) -> None:
-    """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has other cameras.
+    """Write the file of cameras for viewers in a block of :func:`atomic_outputs`.
 
-    If the file has these cameras already, to within rounding, it stays unchanged, because results in several formats
-    share it.
+    Results in several formats share this file. If it has these cameras already, to within rounding, it stays unchanged.
+    Raises UsageError if it has other cameras.
     """
     cameras, names = contents.cameras, contents.names
     if overwrite or not path.exists():
@@ -122,9 +122,9 @@ def _add_cameras(add: AddOutput, path: Path, contents: Contents, *, overwrite: b
 
 
 def refuse_to_replace_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool = False) -> None:
-    """Raise UsageError if a file has other cameras than these, to within rounding.
+    """Raise UsageError if an existing file has other cameras than these, to within rounding.
 
-    With ``moved``, a run may still move these cameras, so poses are not compared.
+    ``moved``: the run may still move these cameras, so poses are not compared.
     """
     if not _has_cameras(path, cameras, names, moved=moved):
         remedy = "name another output, or pass --overwrite to replace it"
@@ -132,7 +132,7 @@ def refuse_to_replace_cameras(path: Path, cameras: Cameras, names: Sequence[str]
 
 
 def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool) -> bool:
-    """Return whether a file can be read and has these cameras; with ``moved``, poses are not compared."""
+    """Return whether a file can be read and has these cameras; poses are not compared if the run ``moved`` them."""
     with suppress(SceneError):
         file, farthest = read_cameras(path), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
         stored = to_cameras(file)

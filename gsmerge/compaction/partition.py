@@ -1,7 +1,8 @@
 """Cut a scene into blocks of views that see the same surfaces; each block also gets some views of its neighbours.
 
 Views are nodes of a graph. The weight of an edge says how much two views see of each other's surfaces. Blocks grow one
-by one from the rim of the graph. Each step adds the view that shares most with the block.
+after another. Each begins at the border of the views that are left, and each step adds the view that shares most
+surfaces with the block.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ MOST_CUT = 1 / 3  # largest share of the weights that blocks may cut; beyond it,
 
 
 def gaussians_at_once(num_gaussians: int, blocks: int) -> int:
-    """Return how many Gaussians are in memory at once when a scene is compacted in ``blocks`` blocks."""
+    """Return how many Gaussians are in memory together when a scene is compacted in ``blocks`` blocks."""
     return num_gaussians if blocks == 1 else round(num_gaussians * (1 + SHARED) / blocks)
 
 
@@ -58,15 +59,15 @@ class Covisibility:
 
 
 def measure_covisibility(scene: Scene) -> Covisibility:
-    """Measure which share of every view each other view sees; hidden surfaces do not count.
+    """Measure, for every two views, which share of the surfaces of one view the other one sees.
 
-    The scene has to have pixels.
+    Surfaces that are hidden in a view are not seen by it. The scene must have pixels.
     """
     grid_cells = 24  # cells along the longer side of a view's depth map
     cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // grid_cells))
     rows, columns = (np.arange(step // 2, side, step) for side in (cameras.height, cameras.width))
-    picked = (rows[:, None] * cameras.width + columns).reshape(-1)
-    fronts = scene.get_pixels().fronts.reshape(len(scene), -1)[:, picked]
+    cell_pixels = (rows[:, None] * cameras.width + columns).reshape(-1)
+    fronts = scene.get_pixels().fronts.reshape(len(scene), -1)[:, cell_pixels]
     means = scene.gaussians.means[fronts].astype(np.float64)
     free_pages([scene.gaussians.means])
     valid = fronts >= 0
@@ -78,22 +79,23 @@ def measure_covisibility(scene: Scene) -> Covisibility:
 
     depths = np.stack(parallel_map(measure_depths, range(len(scene)))).reshape(-1, len(rows), len(columns))
     sample_cells = 120  # most cells of a view that are looked up in all other views
-    stride = slice(None, None, max(1, len(picked) // sample_cells))
+    stride = slice(None, None, max(1, len(cell_pixels) // sample_cells))
     samples = [means[view, stride][valid[view, stride]] for view in range(len(scene))]
 
     def measure_shares(points: np.ndarray) -> np.ndarray:
-        """Return the share of the samples of a view that each view sees."""
-        return see(points, cameras, depths)[1].sum(1) / max(1, len(points))
+        """Return the share of the samples of one view that each view sees."""
+        _, seen = mark_inside_and_seen(points, cameras, depths)
+        return seen.sum(1) / max(1, len(points))
 
     shares = np.stack(parallel_map(measure_shares, samples))
     sample_views = np.repeat(np.arange(len(scene)), [len(points) for points in samples])
     return Covisibility(cameras, depths, shares, np.concatenate(samples), sample_views)
 
 
-def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mark_inside_and_seen(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two masks ``[c,n]`` of points ``[n,3]``: inside the frustum of each camera, and seen by each camera.
 
-    Points behind the surfaces of the coarse depth maps ``depths [c,h,w]`` are not seen.
+    A point is not seen if it lies behind the surfaces of the coarse depth maps ``depths [c,h,w]``.
     """
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     same_depth = 0.15  # a point is seen if it lies at most this share of the depth behind the surface of its cell
@@ -101,27 +103,28 @@ def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.nd
 
 
 def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
-    """Return a factor for each block's number of Gaussians that makes all blocks equally dense.
+    """Return for each block the factor on its number of Gaussians that makes all blocks equally dense.
 
-    Views outside a block also have Gaussians on its surfaces. The block does not get these, so its own have to be more.
+    Some Gaussians on surfaces of a block belong to pixels of views outside it, so the block is built without them. The
+    Gaussians of its own views are then increased by this factor.
     """
     views = range(len(covisibility.cameras))
     owners = owning_views(covisibility.samples, covisibility, views)
     factors = np.ones(len(blocks))
     for i, block in enumerate(blocks):
-        inside = np.isin(owners, block.own)
-        used = np.isin(covisibility.sample_views, block.views)
-        num_kept = int((inside & used).sum())
+        on_surfaces = np.isin(owners, block.own)
+        of_views = np.isin(covisibility.sample_views, block.views)
+        num_kept = int((on_surfaces & of_views).sum())
         if num_kept:
-            factors[i] = max(1.0, int(inside.sum()) / num_kept)
+            factors[i] = max(1.0, int(on_surfaces.sum()) / num_kept)
     return factors
 
 
 def partition_views(weights: np.ndarray, count: int) -> list[Block]:
-    """Cut v views into ``count`` blocks of similar size with weak edges between them; add views of neighbours.
+    """Cut v views into ``count`` blocks of similar size, with weak edges between them.
 
-    ``weights [v,v]`` are symmetric and at least 0. Every view belongs to one block. A block also shares those views of
-    other blocks that have the largest weights with it, up to ``SHARED`` times the number of its own views.
+    ``weights [v,v]`` of the edges are symmetric and at least 0. Every view belongs to one block. A block also shares
+    the views of other blocks that have the largest weights with it, up to ``SHARED`` times the number of its own views.
     """
     labels = grow_blocks(weights, count)
     blocks = []
@@ -134,24 +137,24 @@ def partition_views(weights: np.ndarray, count: int) -> list[Block]:
 
 
 def partition_apart(weights: np.ndarray, count: int) -> list[Block]:
-    """Cut views into at most ``count`` blocks that see little of each other.
+    """Cut views into at most ``count`` blocks that see little of each other, with :func:`partition_views`.
 
-    The blocks are those of :func:`partition_views`. Their number is halved, down to one, as long as more than a third
-    of the weights lies on edges between blocks.
+    The number of blocks is halved, down to one, as long as more than a third of the weights lies on edges between
+    blocks.
     """
     while True:
         blocks = partition_views(weights, count)
-        inside = sum(float(weights[np.ix_(block.own, block.own)].sum()) for block in blocks)
-        if count == 1 or inside >= (1 - MOST_CUT) * float(weights.sum()):
+        weight_inside = sum(float(weights[np.ix_(block.own, block.own)].sum()) for block in blocks)
+        if count == 1 or weight_inside >= (1 - MOST_CUT) * float(weights.sum()):
             return blocks
         count //= 2
 
 
 def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
-    """Return the block of each view ``[v]``, 0 to ``count - 1``; blocks grow one by one from the rim of the views.
+    """Return the block of each view ``[v]``, 0 to ``count - 1``; blocks grow one after another.
 
-    A block starts with the view that has the weakest edges to the views without a block. It grows by the view that
-    shares most with the block.
+    A free view has no block yet. A block begins with the free view that has the weakest edges to other free views. It
+    grows by the free view that shares most with the block.
     """
     num_views = len(weights)
     labels, is_free = np.full(num_views, -1), np.ones(num_views, bool)
@@ -174,19 +177,19 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
 def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence[int]) -> np.ndarray:
     """Return the owner ``[n]`` of each point ``[n,3]``: the nearest of the ``views`` that see the point.
 
-    If no view sees the point, its owner is the nearest view with the point inside its picture. If no picture contains
-    the point, its owner is the nearest view.
+    If no view sees the point, the owner is the nearest view whose picture contains it. If no picture contains it, the
+    owner is the nearest view.
     """
     cameras, depths = covisibility.cameras[list(views)], covisibility.depths[list(views)]
     centres = camera_centres(cameras.viewmats.astype(np.float64))
 
     def find_owners(part: np.ndarray) -> np.ndarray:
         """Return for each point of a part the index of its owner among ``views``."""
-        squares = np.square(part - centres[:, None]).sum(-1)
-        inside, seen = see(part, cameras, depths)
+        squared_distances = np.square(part - centres[:, None]).sum(-1)
+        inside, seen = mark_inside_and_seen(part, cameras, depths)
         may_own = np.where(seen.any(0), seen, inside)
-        squares[~may_own & may_own.any(0)] = np.inf
-        return squares.argmin(0)
+        squared_distances[~may_own & may_own.any(0)] = np.inf
+        return squared_distances.argmin(0)
 
     part_size = 1024  # points whose owners are found together
     parts = np.array_split(points.astype(np.float64), max(1, len(points) // part_size))

@@ -15,16 +15,16 @@ NUM_FULL = 15  # number of harmonics of the degrees 1 to 3
 
 
 def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
-    """Pad the harmonics above degree 0 with zeros to at least ``count``."""
+    """Pad the harmonics above degree 0 with zeros, so that each Gaussian has at least ``count``."""
     missing = max(0, count - gaussians.shN.shape[1])
     return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
 
 
 def find_placement(options: PlacementOptions, cameras: Cameras | None, marked: str | None = None) -> Similarity:
-    """Find the map from the frame of the scene to that of its file.
+    """Return the map from the frame of the scene to the frame of the output file.
 
-    The upward axis of the scene is the mean of the ``cameras``. Without cameras it is ``marked``, the axis that the
-    header of the file names, or else -y.
+    The upward axis of the scene is the mean of those of the ``cameras``. Without cameras it is ``marked``, the axis
+    that the header of the input file names, or else -y.
     """
     if not options.moves:
         return IDENTITY
@@ -46,16 +46,12 @@ def _axis(name: str) -> np.ndarray:
 
 
 def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation ``[3,3]`` from one unit vector to another (Rodrigues).
-
-    If the vectors are opposite, the axis of the rotation is the part of x that is perpendicular to them; of y if they
-    are almost parallel to x.
-    """
+    """Return the rotation ``[3,3]`` by the smallest angle from one unit vector to another (Rodrigues' formula)."""
     cosine = float((start * end).sum())
-    if cosine < -1 + 1e-12:
-        about = np.eye(3)[0] if abs(start[0]) < 0.9 else np.eye(3)[1]
-        about = normalize(about - (about * start).sum() * start)
-        return 2 * np.outer(about, about) - np.eye(3)
+    if cosine < -1 + 1e-12:  # opposite vectors: turn by 180 degrees about any axis that is perpendicular to them
+        axis = np.eye(3)[0] if abs(start[0]) < 0.9 else np.eye(3)[1]
+        axis = normalize(axis - (axis * start).sum() * start)
+        return 2 * np.outer(axis, axis) - np.eye(3)
     x, y, z = np.cross(start, end)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.asarray(np.eye(3) + cross + matmul(cross, cross) / (1 + cosine))
@@ -64,7 +60,7 @@ def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 def move_to_frame(
     gaussians: Gaussians, cameras: Cameras, frame: Similarity, sh_degree: int | None
 ) -> tuple[Gaussians, Cameras]:
-    """Move Gaussians and cameras by ``frame``, and leave out harmonics above ``sh_degree``, if it is given."""
+    """Move Gaussians and cameras into ``frame``, and leave out harmonics above ``sh_degree``; None: keep all."""
     if sh_degree is not None:
         gaussians = replace(gaussians, shN=gaussians.shN[:, : (sh_degree + 1) ** 2 - 1])
     if frame is IDENTITY:

@@ -22,10 +22,10 @@ class Covered:
     """PSNR over the pixels of the input views that the input covers, if it does not cover all.
 
     Args:
-        share: Share of the scored pixels that the input covers. If a file lacks the rows of some pixels, it covers the
-            pixels that have a row; otherwise it covers the pixels in which its opacity is at least a half.
-        before: Mean PSNR (dB) of these pixels rendered from the input.
-        after: The same, rendered from the result.
+        share: Share of the scored pixels that the input covers. If a file has rows for some pixels only, it covers
+            these; otherwise it covers the pixels in which its opacity is at least a half.
+        before: Mean PSNR (dB) of the covered pixels, rendered from the input.
+        after: Mean PSNR (dB) of the covered pixels, rendered from the result.
     """
 
     share: float
@@ -36,17 +36,20 @@ class Covered:
 def compared_psnr(
     covered: Covered | None, before: float | None, after: float | None
 ) -> tuple[float | None, float | None]:
-    """Return the PSNR (dB) of input and result to compare: over covered pixels, if the input lacks some."""
+    """Return the PSNR (dB) of input and result that are compared with each other.
+
+    They are those over the pixels that the input covers, if it does not cover all.
+    """
     return (before, after) if covered is None else (covered.before, covered.after)
 
 
 @dataclass(frozen=True)
 class PhotoFiles:
-    """PSNR on the photos as their files have them, if a run changed their colours or what covers them.
+    """PSNR on the photos as they are in their files, if a run changed any photo.
 
     Args:
-        before: Mean PSNR (dB) of the input views rendered from the input.
-        after: The same, rendered from the result.
+        before: Mean PSNR (dB) of the input views, rendered from the input.
+        after: Mean PSNR (dB) of the input views, rendered from the result.
     """
 
     before: float
@@ -61,31 +64,33 @@ class CompactReport:
         num_input: Gaussians in the scene.
         num_output: Gaussians in the result.
         seconds: Wall time of each stage.
-        psnr_before: Mean PSNR (dB) of the input views rendered from the input; None if neither photos nor pixels are
-            known. Unless a quality was asked for, or the result may be worse, it is measured on a sample: a tenth of
-            the pixels of at most eight views. Then the gain is off by .3 dB (rms); :func:`gsmerge.evaluate` is exact.
+        psnr_before: Mean PSNR (dB) of the input views, rendered from the input; None if neither photos nor pixels are
+            known. It is measured on a tenth of the pixels of at most eight views, unless a quality was asked for, or
+            the result may be worse. The gain by such a sample is off by .3 dB (rms); :func:`gsmerge.evaluate` is exact.
         new_views: Expected PSNR of new views, estimated on photos that a short fit left out; None with fewer than four
             photos, in drafts, and in blocks.
-        psnr_after: Like ``psnr_before``, rendered from the result; if a file is written that rounds positions visibly,
-            rendered from the rounded values.
-        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit), and ``pruned``, by
-            how many Gaussians the result is below its limit, because no view shows more. Without photos and pixels,
-            ``fidelity`` has the ``psnr`` (dB) against renders of the input and the number of ``views`` for it; these
-            are ``held_out`` if they were placed because the scene has no cameras.
-        notes: Warnings about the input and adaptations to it, one sentence each.
+        psnr_after: Like ``psnr_before``, but rendered from the result. If the format of the output rounds positions
+            visibly, the rounded Gaussians are rendered.
+        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). ``pruned`` is the number
+            of Gaussians that the result has less than allowed, because no view shows more. Without photos and pixels,
+            ``fidelity`` has the ``psnr`` (dB) against renders of the input, and the number of ``views`` of these
+            renders. ``held_out`` is true if the views were placed because the scene has no cameras.
+        notes: Warnings about the input and notes about what was adapted to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how near the result came; None if it is met.
-        worse: A warning, also among the notes: the result shows the scene's own photos more than .5 dB worse than the
-            input does, or lies far from the input between the views; or, if ``fidelity`` is measured, its PSNR against
-            the input is below 30 dB. None if neither is the case, or if it cannot be measured, as with a crop.
+        worse: A warning that the result is worse than the input, which is also among the notes; None if it is not, or
+            if that cannot be measured. The result is worse if it shows the scene's own photos more than .5 dB worse
+            than the input, or if ``is_far`` is true. If ``fidelity`` is measured, it is worse below 30 dB.
+            docs/reference/report.md lists all cases.
         psnr_reference: What the PSNR of the input views is measured against: "photos" or "the model's own pixels"; None
             if it is not measured.
-        covered: PSNR over the pixels that the input covers; None if it lacks at most 2 % of them.
-        is_far: The result is clearly worse than the input: its pictures differ more than twice as much from the photos
-            as the input's do, or else, between the views, from the input's pictures.
-        photo_files: PSNR on the photos as their files have them; None if the run changed no photo.
-        protected: PSNR over the pixels that ``protect`` names, and their share of all; None without such pixels.
+        covered: PSNR over the pixels that the input covers; None if it covers at least 98 % of them.
+        is_far: The result is clearly worse than the input. Its pictures differ from the photos more than twice as much
+            as those of the input. Or, between the views, they differ from those of the input more than twice as much as
+            these differ from the photos.
+        photo_files: PSNR on the photos as they are in their files; None if the run changed no photo.
+        protected: PSNR over the pixels that ``protect`` marks, and their share of all pixels; None without such pixels.
 
     Example:
         >>> report = gsmerge.compact("demo", effort="draft", budget=300).report
@@ -124,7 +129,7 @@ class CompactReport:
         return asdict(self) | {"doubts": self.doubts}
 
     def _facts(self) -> list[tuple[str, str]]:
-        """List the main facts, each with its name."""
+        """Return the main facts for ``repr``, each with its name."""
         share = human_share(self.num_output / max(1, self.num_input))
         facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share})")]
         if new := self.new_views:
@@ -159,19 +164,13 @@ def report_document(
         seconds_after: Wall time by name after these stages, such as writing.
         coarser: File and report of each coarser level of detail.
         notes: Notes from reading and writing, which come before those of the report.
-        written_at: The temporary files of each output, if they are not renamed yet; they have its bytes.
+        written_at: The temporary files of each output, whose bytes are counted if they are not renamed yet.
         cameras_path: The file of cameras for viewers, if any.
 
     Returns:
-        ``schema_version``; within a version keys are only added. ``unmet``: why a target is not met, or null.
-        ``new_views``: the expected PSNR of new views ``before`` and ``after``, estimated on so many ``views`` that a
-        short fit left out; null with fewer than four photos, or if it was not asked for. ``psnr_reference``: what
-        ``psnr_input_views`` are measured against: "photos", or other pictures. ``psnr_covered``: ``share``,
-        ``before``, ``after`` over the pixels that the input covers, if it lacks some. ``psnr_photo_files``: ``before``,
-        ``after`` on the photos as their files have them, if the run changed some. ``psnr_protected``: ``share``,
-        ``before``, ``after`` over the pixels that ``protect`` names. ``worse``: a warning that the result, or else a
-        level, shows the photos worse than the input or, without photos, has a PSNR below 30 dB against the input; or
-        null.
+        The keys of the document, which docs/reference/report.md describes. They are those of :class:`CompactReport`,
+        partly under other names, and facts about the files. ``worse`` is the warning of the result or, if it has none,
+        of a level. Within a ``schema_version`` keys are only added.
     """
     numbers, at = asdict(report), written_at or {}
     return {
@@ -211,13 +210,16 @@ def report_document(
 
 
 def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Sequence[Path]]) -> dict[str, Any]:
-    """Return path, bytes and number of Gaussians of an output, whose temporary files are in ``at`` if it has some."""
+    """Return path, bytes and number of Gaussians of an output.
+
+    ``at`` has the temporary files of outputs that are not renamed yet.
+    """
     num_bytes = sum(file.stat().st_size for file in at.get(path, [path]))
     return {"path": os.fspath(path), "bytes": num_bytes, "num_gaussians": report.num_output}
 
 
 def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """List the figures of a result: for each its name, the values before and after, and a short explanation."""
+    """Return the rows of the table of a result: a name, the value before and after, and a short explanation."""
     files, psnr, choices = (document["input"], document["output"]), document["psnr_input_views"], document["choices"]
     counts, sizes = [f"{file['num_gaussians']:,}" for file in files], [human_bytes(file["bytes"]) for file in files]
     rows = [("Gaussians", counts[0], counts[1], human_share(document["ratio"])), ("file", sizes[0], sizes[1], "")]
@@ -245,23 +247,24 @@ def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]
 
 
 def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
-    """Return the closing table of ``compact`` in a terminal of ``columns`` characters, with a ``next_step`` if any.
+    """Return the lines that ``compact`` prints at its end: the path, a table, and the command to run next, if any.
 
-    Paths and the next step are never broken into lines, because people copy them.
+    Lines are broken at ``columns`` characters, except for paths and ``next_step``, which people copy.
     """
     rows = result_facts(document)
     figures = text_table([row[:3] for row in rows], "  ")
-    hang = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
-    lines = [(f"{left}  {row[3]}".rstrip(), hang) for left, row in zip(figures, rows, strict=True)]
+    # a line that is broken continues below its explanation, or below its first value in a narrow terminal
+    indent = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
+    lines = [(f"{left}  {row[3]}".rstrip(), indent) for left, row in zip(figures, rows, strict=True)]
     lines += [(line, 2) for line in (*level_lines(document), *curve_lines(document))]
-    wrapped = [part for line, hang in lines for part in wrap_line(line, columns, hang)]
-    last = {"cameras": document.get("viewer_cameras"), "next": next_step}
-    shown = [f"  {name:9}  {text}" for name, text in last.items() if text is not None]
-    return [document["output"]["path"], *wrapped, *shown]
+    wrapped = [part for line, indent in lines for part in wrap_line(line, columns, indent)]
+    last_texts = {"cameras": document.get("viewer_cameras"), "next": next_step}
+    last_lines = [f"  {name:9}  {text}" for name, text in last_texts.items() if text is not None]
+    return [document["output"]["path"], *wrapped, *last_lines]
 
 
 def _describe_fidelity_views(fidelity: Mapping[str, Any]) -> str:
-    """Say in which views the PSNR against the input was measured."""
+    """Return words for the views in which the PSNR against the input was measured."""
     return f"from the input in {fidelity['views']} {'held-out' if fidelity['held_out'] else 'of its'} views"
 
 
@@ -269,17 +272,21 @@ def level_lines(document: Mapping[str, Any]) -> list[str]:
     """Return one line of text for each coarser level of detail."""
     return [
         f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
-        + (f"; {_name_pictures(document)} {psnr_figure(psnr, level['choices'])}" if psnr is not None else "")
+        + (
+            f"; {_name_pictures(document)} {psnr_figure(level['psnr_input_views'], level['choices'])}"
+            if level["psnr_input_views"] is not None
+            else ""
+        )
         + f"; {level['seconds']:.1f} s"
-        for level, psnr in ((level, level["psnr_input_views"]) for level in document["levels"])
+        for level in document["levels"]
     ]
 
 
 def curve_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return the scene's curve as a small table: by the number of Gaussians, PSNR and SSIM of a short fit.
+    """Return the scene's curve as a table: a row for each number of Gaussians, with PSNR and SSIM of a short fit.
 
-    They are measured on photos, or patches of photos, that the fit left out. The row nearest to the number of Gaussians
-    in the result is marked; the result may lie between two rows.
+    The scores are measured on photos, or patches of photos, that the fits left out. The row nearest to the number of
+    Gaussians in the result is marked. Empty if no curve was measured.
     """
     points, count = document["choices"].get("curve"), document["output"]["num_gaussians"]
     if not points:
@@ -299,17 +306,17 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:
-    """Return the PSNR on the photos as their files have them; None if both figures equal those on changed photos.
+    """Return the PSNR on the photos as they are in their files, before and after.
 
-    They are compared as printed.
+    None if that would print the same numbers as the PSNR on the photos that the run changed.
     """
-    files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
-    if files is None or own["after"] is None or any(f"{files[name]:.2f}" != f"{own[name]:.2f}" for name in own):
-        return files
+    on_files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
+    if on_files is None or own["after"] is None or any(f"{on_files[name]:.2f}" != f"{own[name]:.2f}" for name in own):
+        return on_files
     return None
 
 
 def _name_pictures(document: Mapping[str, Any]) -> str:
-    """Name the pictures that a result was fitted to, such as its own photos."""
+    """Return words for the pictures that a result was fitted to, such as "its own photos"."""
     reference = document.get("psnr_reference")
     return "its own photos" if reference in (None, "photos") else str(reference)

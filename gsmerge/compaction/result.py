@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from weakref import ReferenceType
 
 from gsmerge.compaction.candidate import Candidate, rescore, with_moved_views
-from gsmerge.compaction.distance import describe_far, is_far
+from gsmerge.compaction.distance import describe_clear_loss, is_clearly_worse
 from gsmerge.compaction.new_views import SPREAD, TRIAL_PIXELS, NewViews, Trial
 from gsmerge.compaction.outputs import plan_outputs, write_outputs
 from gsmerge.compaction.report import CompactReport, compared_psnr
@@ -138,9 +138,8 @@ def make_result(
     """Make the result from the best candidate and its coarser levels of detail, with a report.
 
     The input is scored here, when memory is free again, unless the plan has its score. Scores may come from a sample of
-    the photos. If by these a result may be worse than the input, both are scored again on all photos. The report
-    contains the seconds, choices and notes of the current record, followed by those of the search and of the
-    candidates.
+    the photos. If a sample shows that a result may be worse than the input, this function starts again with all photos.
+    The report contains the seconds, choices and notes of the current record, of the search and of the candidates.
     """
     run = current_record()
     input_scores, candidates = score_input(prepared, plan), (best, *levels)
@@ -156,16 +155,16 @@ def make_result(
         plan = replace(plan, scored_views=own_views(prepared), samples=False)
         best, *levels = (rescore(candidate, candidate.gaussians, prepared, plan) for candidate in candidates)
         return make_result(best, levels, prepared, plan, search, trial)
-    names = {**run.seconds, **search.seconds}
-    seconds = {name: run.seconds.get(name, 0.0) + search.seconds.get(name, 0.0) for name in names}
+    stage_names = {**run.seconds, **search.seconds}
+    seconds = {name: run.seconds.get(name, 0.0) + search.seconds.get(name, 0.0) for name in stage_names}
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # moved to the end, since the input is scored last
-    main = _report(best, prepared, plan, before, part_scores[0], seconds, 0)
-    new_views, worse = _expect_new_views(main, prepared, trial)
-    main = main if worse is None else with_worse(main, worse)
-    main = replace(
-        main, choices=run.choices | main.choices | search.choices, notes=[*run.notes, *search.notes, *main.notes],
-        unmet=search.unmet, new_views=new_views,
+    report = _report(best, prepared, plan, before, part_scores[0], seconds, 0)
+    new_views, worse = _expect_new_views(report, prepared, trial)
+    report = report if worse is None else with_worse(report, worse)
+    report = replace(
+        report, choices=run.choices | report.choices | search.choices,
+        notes=[*run.notes, *search.notes, *report.notes], unmet=search.unmet, new_views=new_views,
     )  # fmt: skip
     coarser = tuple(
         CompactResult(
@@ -175,7 +174,7 @@ def make_result(
         )
         for level, candidate in enumerate(levels, 1)
     )
-    return CompactResult(best.gaussians, main, best.cameras, coarser)
+    return CompactResult(best.gaussians, report, best.cameras, coarser)
 
 
 def _report(
@@ -187,7 +186,10 @@ def _report(
     seconds: Mapping[str, float],
     level: int,
 ) -> CompactReport:
-    """Report on one level of detail; level 0 is the result itself. ``before`` is the PSNR (dB) of the input."""
+    """Return the report of one level of detail; level 0 is the result itself.
+
+    ``before`` is the PSNR (dB) of the input. The report says whether the level is worse than the input.
+    """
     reference, record = prepared.reference, candidate.record
     rendered = reference.name == RENDERS
     after = None if rendered else candidate.psnr
@@ -196,7 +198,7 @@ def _report(
         record.notes, plan.settings, peak_memory(), psnr_reference=None if before is None else reference.name,
         **vars(parts),
     )  # fmt: skip
-    if prepared.doubt is not None:  # scores of such a scene mean nothing, so the report has none
+    if prepared.doubt is not None:  # the photos do not fit the scene, so the report has no scores
         choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
         report = replace(report, psnr_before=None, psnr_after=None, **vars(PartScores()), choices=choices)
         return with_worse(report, prepared.doubt)
@@ -206,9 +208,9 @@ def _report(
     elif reference.of_views and not plan.clean.visible_drops:
         name, pictures = f"level {level}" if level else "the result", reference.name
         compared = compared_psnr(parts.covered, before, after)
-        worse = describe_loss(name, *compared, OWN_PHOTOS if pictures == PHOTOS else pictures)
-        far = describe_far(candidate.fitted.gaussians, prepared) if level == 0 else None
-        worse, report = worse or far, replace(report, is_far=far is not None or is_far(*compared))
+        clear_loss = describe_clear_loss(candidate.fitted.gaussians, prepared) if level == 0 else None
+        report = replace(report, is_far=clear_loss is not None or is_clearly_worse(*compared))
+        worse = describe_loss(name, *compared, OWN_PHOTOS if pictures == PHOTOS else pictures) or clear_loss
     return report if worse is None else with_worse(report, worse)
 
 
@@ -218,19 +220,19 @@ def with_worse(report: CompactReport, worse: str) -> CompactReport:
 
 
 def _expect_new_views(
-    main: CompactReport, prepared: Prepared, trial: Trial | None
+    report: CompactReport, prepared: Prepared, trial: Trial | None
 ) -> tuple[NewViews | None, str | None]:
-    """Predict the PSNR of new views by a trial; also return a warning if they are expected to be worse.
+    """Return the expected PSNR of new views by a trial, and a warning if they are expected to be worse than before.
 
-    The first is None without a trial or without scores. The warning is None if new views are not expected to be worse
-    than those of the input, or if the report already says that the result is worse.
+    The PSNR is None without a trial or without scores. The warning is also None if the report already says that the
+    result is worse.
     """
-    before, after = compared_psnr(main.covered, main.psnr_before, main.psnr_after)
+    before, after = compared_psnr(report.covered, report.psnr_before, report.psnr_after)
     if trial is None or prepared.agreement is None or before is None or after is None:
         return None, None
     expected = trial.predict(before, after, prepared.agreement.confirmed)
-    # no warning by smaller pictures, since a trial on these says little
+    # a trial on very small pictures says too little for a warning
     is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= TRIAL_PIXELS
-    if not is_large or main.worse is not None or expected.gain >= -SPREAD:
+    if not is_large or report.worse is not None or expected.gain >= -SPREAD:
         return expected, None
     return expected, f"new views of the result are expected to be {-expected.gain:.1f} dB worse than those of the input"

@@ -18,16 +18,16 @@ from gsmerge.runtime.record import stage
 from gsmerge.stages.prune import ROUNDING
 from gsmerge.types import Gaussians, Scene
 
-# A sample of the scored photos takes one of INPUT_EVERY tiles for the input. For a result it takes one of RESULT_EVERY,
-# because far fewer Gaussians are drawn faster. On fifteen captures a gain is then off by .27 dB (rms)
+# A sample has one of INPUT_EVERY tiles of the scored photos for the input. For a result it has one of RESULT_EVERY,
+# because its far fewer Gaussians are drawn faster. On fifteen captures the gain by such samples is off by .27 dB (rms)
 INPUT_EVERY, RESULT_EVERY = 10, 2
 
 
 def compares_all_pixels(before: PhotoScore | None) -> bool:
-    """Return whether results are compared with their input over all pixels, rather than over those that it covers.
+    """Return whether results are compared with their input over all pixels, not only over those that it covers.
 
-    ``before`` is the score of the input. All pixels count if the input covers nearly all of them, if it covers none, or
-    if it has no score.
+    ``before`` is the score of the input. All pixels count if the input covers nearly all or none of them, or if it has
+    no score.
     """
     return before is None or before.share >= WHOLE_SHARE or not math.isfinite(before.covered_psnr)
 
@@ -38,42 +38,42 @@ def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Pho
 
 
 def may_leave_gaps(prepared: Prepared, plan: Plan) -> bool:
-    """Return whether more than a few pixels are black in renders of the input; it may cover nothing there."""
+    """Return whether the input may leave gaps, because more than a few pixels are black in its renders."""
     pictures = (prepared.scene.images[view] for view in plan.scored_views)
     return bool(np.mean([(picture.max(-1) > ROUNDING).mean() for picture in pictures]) < WHOLE_SHARE)
 
 
 def round_for_output(gaussians: Gaussians, plan: Plan) -> Gaussians:
-    """Round the values of Gaussians as the output's file does; return them unchanged if no file is written."""
+    """Round the values of Gaussians as the output file does; return them unchanged if no file is written."""
     return round_as_written(plan.output, gaussians) if plan.output else gaussians
 
 
 def measure_result(
     gaussians: Gaussians, prepared: Prepared, plan: Plan, covered: Sequence[np.ndarray] | None = None
 ) -> PhotoScore | None:
-    """Score Gaussians of the world, as the output's file rounds them, on the scored photos; None without photos.
+    """Score Gaussians of the world, as the output file rounds them, on the scored photos; None without photos.
 
-    ``covered`` has a mask ``[h,w]`` for each scored photo. Then ``covered_psnr`` is measured over its pixels, on the
-    sample of the input. None: over the pixels that the Gaussians themselves cover.
+    ``covered`` has a mask ``[h,w]`` for each scored photo, over which ``covered_psnr`` is measured. The sample of tiles
+    is then that of the input. None: over the pixels that the Gaussians themselves cover.
     """
     if not prepared.reference.of_views:
         return None
-    every, shown = RESULT_EVERY if covered is None else INPUT_EVERY, prepared.result_views()
-    return _score_photos("score", round_for_output(gaussians, plan), shown, prepared, plan, covered, every)
+    every, views = RESULT_EVERY if covered is None else INPUT_EVERY, prepared.result_views()
+    return _score_photos("score", round_for_output(gaussians, plan), views, prepared, plan, covered, every)
 
 
 def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
-    """Score the input's own Gaussians on the scored photos, and over the pixels that they cover; None without photos.
+    """Score the Gaussians of the input on the scored photos, and over the pixels that they cover; None without photos.
 
     If views have Gaussians of their own, the covered pixels are those that have one.
     """
     if not prepared.reference.of_views:
         return None
-    scene, shown = prepared.input_scene, prepared.scene
-    if shown.empty is not None:  # where a result may show nothing, the input is not compared either
-        scene = replace(scene, masks=prepared.result_views().masks)
-    covered = None if scene.covered is None else list(scene.covered[list(plan.scored_views)])
-    return _score_photos("input", scene.file_gaussians, scene, prepared, plan, covered)
+    views = prepared.input_scene
+    if prepared.scene.empty is not None:  # where a result may show nothing, the input is not scored either
+        views = replace(views, masks=prepared.result_views().masks)
+    covered = None if views.covered is None else list(views.covered[list(plan.scored_views)])
+    return _score_photos("input", views.file_gaussians, views, prepared, plan, covered)
 
 
 def _score_photos(
@@ -85,7 +85,7 @@ def _score_photos(
     covered: Sequence[np.ndarray] | None,
     every: int = INPUT_EVERY,
 ) -> PhotoScore:
-    """Score Gaussians on the scored photos; ``name`` is the stage that the time counts for.
+    """Score Gaussians of the world on the scored photos of ``views``; ``name`` is the stage whose time it takes.
 
     If the plan allows samples, only one of ``every`` tiles of the photos counts.
     """
@@ -95,9 +95,9 @@ def _score_photos(
 
 
 def _measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Covered | None:
-    """Score a result over the pixels that the input covers; ``before`` is the score of the input.
+    """Return the PSNR of input and result over the pixels that the input covers; ``before`` is the input's score.
 
-    None if all pixels are compared, or if photos count only where the input covers them anyway.
+    None if the input covers nearly all pixels, or if the masks of the photos leave out the others anyway.
     """
     if before is None or compares_all_pixels(before) or prepared.scene.empty is not None:
         return None
@@ -106,44 +106,47 @@ def _measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: 
 
 
 def _measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float | None:
-    """Score Gaussians of the world on photos as their files have them; None if no scored photo was changed."""
-    files = prepared.reference.photo_files
-    if files is None:
+    """Return the PSNR (dB) of Gaussians of the world on the photos as they are in their files.
+
+    None if the run changed no scored photo.
+    """
+    photos = prepared.reference.photo_files
+    if photos is None:
         return None
-    shown = prepared.result_views()
-    if shown.images is None or all(np.array_equal(shown.images[view], files[view]) for view in plan.scored_views):
+    views = prepared.result_views()
+    if views.images is None or all(np.array_equal(views.images[view], photos[view]) for view in plan.scored_views):
         return None
-    return _score_photos("score", gaussians, replace(shown, images=files), prepared, plan, None).psnr
+    return _score_photos("score", gaussians, replace(views, images=photos), prepared, plan, None).psnr
 
 
 def _measure_protected(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PhotoScore | None:
-    """Score Gaussians of the world over the protected pixels of the views that have some; None if no view has any.
+    """Score Gaussians of the world over the protected pixels, in views that have some; None if no view has any.
 
-    The share of the score is the share of protected pixels in all photos.
+    ``share`` of the score is the share of protected pixels in all photos.
     """
     if not prepared.reference.of_views or prepared.input_scene.protected is None:
         return None
     with stage("score"):
-        shown = prepared.result_views()
-        assert shown.protected is not None
-        protected_views = np.flatnonzero(shown.protected.any((1, 2))).tolist()
-        views = [protected_views[i] for i in scored_views(len(protected_views))]
-        near, masks = NEAR_PLANE * prepared.frame.unit, list(shown.protected[views])
-        score = score_photos(gaussians, scene_photos(shown), views, near=near, covered=masks)
-        return replace(score, share=float(shown.protected.mean()))
+        views = prepared.result_views()
+        assert views.protected is not None
+        protected_ids = np.flatnonzero(views.protected.any((1, 2))).tolist()
+        ids = [protected_ids[i] for i in scored_views(len(protected_ids))]
+        near, masks = NEAR_PLANE * prepared.frame.unit, list(views.protected[ids])
+        score = score_photos(gaussians, scene_photos(views), ids, near=near, covered=masks)
+        return replace(score, share=float(views.protected.mean()))
 
 
 @dataclass(frozen=True)
 class InputScores:
     """Scores of an input, with which a result is compared; each is None if it cannot be measured."""
 
-    photos: PhotoScore | None  # On the scored views
-    on_files: float | None  # On the photos as their files have them, if the run changed some, dB
+    photos: PhotoScore | None  # On the scored photos
+    on_files: float | None  # PSNR (dB) on the photos as they are in their files, if the run changed some
     protected: PhotoScore | None  # Over protected pixels
 
 
 def score_input(prepared: Prepared, plan: Plan) -> InputScores:
-    """Score the input's own Gaussians; the score on the scored views is taken from the plan if it has one."""
+    """Score the Gaussians of the input. The plan may already have the score on the scored photos."""
     photos, gaussians = plan.before or measure_input(prepared, plan), prepared.input_scene.file_gaussians
     return InputScores(
         photos, _measure_on_files(gaussians, prepared, plan), _measure_protected(gaussians, prepared, plan)
@@ -154,7 +157,7 @@ def score_input(prepared: Prepared, plan: Plan) -> InputScores:
 class PartScores:
     """PSNR of input and result over parts of the pixels, and on photos before the run changed them.
 
-    None where there is no such part or change. The names are those of
+    None for a part without pixels, or without changed photos. The names are those of
     :class:`gsmerge.compaction.report.CompactReport`.
     """
 
@@ -164,13 +167,14 @@ class PartScores:
 
 
 def measure_parts(before: InputScores, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PartScores:
-    """Score a result over covered and over protected pixels, and on photos as their files have them.
+    """Score a result over covered and over protected pixels, and on the photos as they are in their files.
 
-    ``before`` are the scores of the input.
+    ``before`` are the scores of the input, with which those of the result are returned.
     """
-    covered, rounded = _measure_covered(before.photos, gaussians, prepared, plan), round_for_output(gaussians, plan)
-    after = None if before.on_files is None else _measure_on_files(rounded, prepared, plan)
-    files = None if before.on_files is None or after is None else PhotoFiles(before.on_files, after)
-    score = None if before.protected is None else _measure_protected(rounded, prepared, plan)
-    protected = score and before.protected and (score.share, before.protected.covered_psnr, score.covered_psnr)
-    return PartScores(covered, files, Covered(*protected) if protected else None)
+    parts = PartScores(_measure_covered(before.photos, gaussians, prepared, plan))
+    rounded = round_for_output(gaussians, plan)
+    if before.on_files is not None and (after := _measure_on_files(rounded, prepared, plan)) is not None:
+        parts = replace(parts, photo_files=PhotoFiles(before.on_files, after))
+    if before.protected is not None and (score := _measure_protected(rounded, prepared, plan)) is not None:
+        parts = replace(parts, protected=Covered(score.share, before.protected.covered_psnr, score.covered_psnr))
+    return parts

@@ -22,19 +22,19 @@ from gsmerge.types import Decoded, Gaussians, PicturedScene
 
 FOREIGN_SHARE = 0.1  # a Gaussian is at a seam if other blocks' views have more than this share of its blending weights
 SEAM_VIEW_STEPS = 2  # steps for each view
-# If at least the share ROOM_SHARE of the Gaussians is at seams, the blocks are parts of one room. Then each view gets
-# ROOM_VIEW_STEPS steps
+# If at least ROOM_SHARE of all Gaussians are at seams, the blocks show the same room from all sides. Then the fit takes
+# ROOM_VIEW_STEPS steps for each view
 ROOM_SHARE, ROOM_VIEW_STEPS = 0.5, 4
-# Step sizes relative to those of other fits. They are smaller, because the Gaussians have been fitted before, though
+# Step sizes relative to those of other fits. They are smaller, because the Gaussians have been fitted before, only
 # beside other neighbours
 SEAM_RATE = 0.6
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart], seed: int) -> Gaussians:
-    """Fit the Gaussians at seams again, to the photos of all blocks that show them.
+    """Fit the Gaussians at seams again, to the photos of all blocks that show them; the others stay unchanged.
 
-    All other Gaussians stay unchanged. ``owners [n]`` is the block of each Gaussian. Before, each block fitted its
-    Gaussians beside its own version of the neighbouring blocks' Gaussians. Here they are fitted beside the final ones.
+    The fit of a block also changed its copies of neighbouring blocks' Gaussians, which are not in the result. At the
+    seams its Gaussians therefore do not fit those of its neighbours. ``owners [n]`` is the block of each Gaussian.
     """
     plan = next((start.plan for start in starts if start.plan.fit.fit != "none"), None)
     if plan is None:
@@ -60,54 +60,57 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
     add_seconds(record.seconds)
     record_choices(seams={"views": len(scene), "num_gaussians": int(at_seam.sum()), "steps": options.steps})
     columns = {f.name: np.array(getattr(joined, f.name)) for f in fields(Gaussians)}
-    moved = at_seam[rows]  # the fit also returns the fixed Gaussians, but rounded
+    was_fitted = at_seam[rows]  # the others were fixed, and the fit returns them rounded
     for name, column in columns.items():
-        column[rows[moved]] = getattr(fitted.gaussians, name)[moved]
+        column[rows[was_fitted]] = getattr(fitted.gaussians, name)[was_fitted]
     return Gaussians(**columns)
 
 
 def find_seams(
     joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart]
 ) -> tuple[np.ndarray, list[list[int]]]:
-    """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views that show many of them."""
+    """Return a mask ``[n]`` of Gaussians at seams and, for each block, those of its own views that show many of them.
+
+    A Gaussian is at a seam if views of other blocks show it, too.
+    """
     total, foreign, splats = np.zeros(len(joined)), np.zeros(len(joined)), make_splats(joined)
-    views: list[list[int]] = [[] for _ in starts]
-    for number, _, ids, weights in _view_weights(splats, starts):
-        total[ids] += weights
-        foreign[ids] += np.where(owners[ids] == number, 0, weights)
+    seam_views: list[list[int]] = [[] for _ in starts]
+    for block, _, rows, weights in _view_weights(splats, starts):
+        total[rows] += weights
+        foreign[rows] += np.where(owners[rows] == block, 0, weights)
     at_seam = foreign > FOREIGN_SHARE * total
     seam_share = 0.1  # seams are fitted to a view if more than this share of its weights is on Gaussians at seams
-    # measured a second time, because the weights of all views would not fit into memory
-    for number, view, ids, weights in _view_weights(splats, starts):
-        seam_weight, view_weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam[ids]], weights))
+    # The weights are measured a second time, because those of all views would not fit into memory
+    for block, view, rows, weights in _view_weights(splats, starts):
+        seam_weight, view_weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam[rows]], weights))
         if seam_weight > seam_share * view_weight:
-            views[number].append(view)
-    return at_seam, views
+            seam_views[block].append(view)
+    return at_seam, seam_views
 
 
 def join_views(scene_views: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedScene:
-    """Join views of several scenes without Gaussians into one scene; its photos are kept in a file if they are many.
+    """Join views of several scenes, which have no Gaussians, into one scene; many photos are kept in a file.
 
     ``scene_views`` has pairs of a scene and the ids of its views to join.
     """
-    total, cameras = sum(len(ids) for _, ids in scene_views), scene_views[0][0].cameras
-    images, count = make_array((total, cameras.height, cameras.width, 3), np.float32), 0
+    num_views, cameras = sum(len(ids) for _, ids in scene_views), scene_views[0][0].cameras
+    images, num_copied = make_array((num_views, cameras.height, cameras.width, 3), np.float32), 0
     for scene, ids in scene_views:
         for view in ids:
-            images[count] = scene.images[view]
-            count += 1
+            images[num_copied] = scene.images[view]
+            num_copied += 1
         free_pages([scene.images, images])
     joined = concat_scenes([subset(scene.without_pictures(), ids) for scene, ids in scene_views], images)
     return PicturedScene.with_pictures(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
 
 
 def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
-    """Yield four values for each block's own views: the block, the view, and rows and weights ``[m]``.
+    """Yield for each view of a block's own views: the block, the view, and rows and weights ``[m]`` of Gaussians.
 
-    The rows are those of the Gaussians that the view draws; the weights are the sums of their blending weights there.
-    Views are numbered within the prepared scene of their block.
+    The rows are those of the Gaussians that the view draws. A weight is the sum of the blending weights of a Gaussian
+    in the view. Views are numbered within the prepared scene of their block.
     """
-    for number, start in enumerate(starts):
+    for block, start in enumerate(starts):
         own_views, repeated = set(start.block.own), start.prepared.repeated
         views = sorted({repeated[i] for i, view in enumerate(start.block.views) if view in own_views})
         photos = blank_photos(start.prepared.scene.cameras[views], 2)
@@ -118,4 +121,4 @@ def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tupl
             return tiled.ids, list_contributions(tiled)[0]
 
         for view, (ids, weights) in zip(views, in_turn(list_weights, range(len(photos))), strict=True):
-            yield number, view, ids, weights
+            yield block, view, ids, weights

@@ -18,28 +18,29 @@ from gsmerge.plan import FIDELITY_LOSS, Plan
 from gsmerge.runtime.record import begin_part, current_record, note, record_choices, record_part, stage
 from gsmerge.stages.segment import knee_count
 
-# dB of PSNR per doubling of the count, assumed until two counts were tried: against photos, and against renders
+# The slope is the gain of PSNR (dB) per doubling of the count. Until two counts were built, a search assumes these
+# slopes, against photos and against renders of the input
 PHOTOS_SLOPE, RENDERS_SLOPE = 1.0, 3.0
 SAME_COUNT_RATIO = 1.15  # two counts are the same up to this ratio
-# A search ends at a count whose PSNR is at most this many dB above a target for renders. At their slope, that is
-# SAME_COUNT_RATIO
+# A search against renders ends at a count whose PSNR is at most this many dB above the target. With RENDERS_SLOPE, such
+# a count is at most SAME_COUNT_RATIO too large
 NEAR_DB = 0.6
-# The same bound if photos decide how many Gaussians keep the input. It is less than FIDELITY_LOSS, because the whole
-# input loses nothing
+# The same for a search against photos that has to keep the quality of the input. It is less than FIDELITY_LOSS, because
+# otherwise the search would end with the whole input, which loses nothing
 PHOTOS_NEAR_DB = 0.2
 MAX_BUILDS = 6  # most builds of a search
 MAX_LEFT_OUT_BUILDS = 3  # most builds of a search by left-out photos, in addition to the build of the result
-# A PSNR counts as at most this many dB above the target. Larger values, such as that of the whole input, say little of
-# the slope near the target
+# A PSNR that is more than this many dB above the target is lowered to this value, because a larger one, such as that of
+# the whole input, says little about the slope near the target
 FAR_DB = 6.0
 
 T = TypeVar("T")
 
 
 def build_in_turn(build: Callable[[int], T], first: T, choose_next: Callable[[list[T]], int | None]) -> list[T]:
-    """Build one candidate after another; return all of them, beginning with ``first``, which is built already.
+    """Build one candidate after another, and return all of them; ``first`` is built already.
 
-    ``choose_next`` chooses the next count by all candidates so far; None ends the search.
+    ``choose_next`` returns the next count, by all candidates so far, or None to end.
     """
     built = [first]
     while (count := choose_next(built)) is not None:
@@ -49,7 +50,7 @@ def build_in_turn(build: Callable[[int], T], first: T, choose_next: Callable[[li
 
 @dataclass(frozen=True)
 class SearchFacts:
-    """Facts that a search adds to the report of a run."""
+    """What a search adds to the report of a run."""
 
     seconds: dict[str, float]  # Wall time by stage, of all candidates
     choices: dict[str, Any]
@@ -59,7 +60,7 @@ class SearchFacts:
 
 @dataclass(eq=False)
 class CountSearch:
-    """Search for the number of Gaussians: one count, or several until a quality is met."""
+    """Search for the number of Gaussians: it builds one count, or several until a quality is met."""
 
     plan: Plan  # Has the target and the limits
     first: int | None  # The count to begin with; None: as many as `superpixels` and K give
@@ -78,11 +79,11 @@ class CountSearch:
         if target is None or len(candidates) >= (MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS):
             return None
         psnrs = psnr_by_count(candidates)
-        count = next_count(psnrs, target, *self._allowed_counts(), *self._expected_slope())
+        count = next_count(psnrs, target, *self._allowed_counts(), *self._slope_and_tolerance())
         return None if count in psnrs else count
 
     def _allowed_counts(self) -> tuple[int, int]:
-        """Return the fewest and the most Gaussians that a candidate may have."""
+        """Return the fewest and the most Gaussians that a candidate may have, by the limits and the kind of search."""
         plan, limits = self.plan, self.plan.limits
         least, most = limits.min_count, limits.max_count
         if plan.keeps_fidelity and not plan.auto_count:
@@ -94,12 +95,13 @@ class CountSearch:
             most = min(most, self.most)
         return least, most
 
-    def _expected_slope(self) -> tuple[float, float]:
-        """Return the dB per doubling of the count to assume at first, and the dB above the target that end a search."""
+    def _slope_and_tolerance(self) -> tuple[float, float]:
+        """Return the slope to assume at first (dB per doubling of the count), and the tolerance of the search (dB).
+
+        The search ends at a PSNR that is at most the tolerance above the target.
+        """
         if self.left_out is not None:
-            # The slope is the mean of eleven captures below the usual count. The search ends within half of a doubling
-            left_out_slope, left_out_near_db = 0.3, 0.15
-            return left_out_slope, left_out_near_db
+            return 0.3, 0.15  # the mean slope of eleven captures below the usual count; half of it is near enough
         if self.rendered:
             return RENDERS_SLOPE, NEAR_DB
         return PHOTOS_SLOPE, PHOTOS_NEAR_DB if self.plan.keeps_fidelity else 0.0
@@ -111,9 +113,10 @@ class CountSearch:
 
     @property
     def count(self) -> int | None:
-        """Number of Gaussians of the best candidate; with left-out photos, the number at which they reach the target.
+        """The number of Gaussians that the search has chosen: that of the best candidate.
 
-        That may lie between the counts of two candidates.
+        With left-out photos it is the number at which these reach the target. It may lie between those of two
+        candidates.
         """
         if self.plan.target_psnr is None or self.left_out is None:
             return self.best.count
@@ -121,9 +124,9 @@ class CountSearch:
 
     @property
     def best(self) -> Candidate:
-        """Candidate with the fewest Gaussians of those that reach the target; if none does, that of the highest PSNR.
+        """The candidate with the fewest Gaussians that reaches the target; if none does, the one with the highest PSNR.
 
-        Without a target, the only candidate.
+        Without a target there is only one candidate.
         """
         if self.plan.target_psnr is None:
             return self.candidates[0]
@@ -138,19 +141,20 @@ class CountSearch:
         return self.plan.target_psnr is not None and max(self.psnrs.values()) >= self.plan.target_psnr
 
     def facts(self, result: Candidate) -> SearchFacts:
-        """Return the facts about the search for the report; ``result`` is made from the best candidate."""
+        """Return what the report says about the search; ``result`` is the final candidate, built after the search."""
         names = dict.fromkeys(name for run in self.candidates for name in run.record.seconds)
         seconds = {name: sum(run.record.seconds.get(name, 0.0) for run in self.candidates) for name in names}
         target = self.plan.target_psnr
         if target is None:
             return SearchFacts(seconds, {}, self.notes, None)
         best, met, left_out = self.best, self.is_met, 0 if self.left_out is None else len(self.left_out.photos)
-        # a count between two candidates is where the curve between them reaches the target
+        # at a count between those of two candidates, the PSNR is expected to be that of the target
         psnr = best.deciding_psnr if self.count == best.count else target
-        tried = tuple(self.psnrs.items())
         choices: dict[str, Any] = {
-            "search": {"count": self.count, "psnr": psnr, "met": met, "tried": tried, "left_out": left_out}
-        }
+            "search": {
+                "count": self.count, "psnr": psnr, "met": met, "tried": tuple(self.psnrs.items()), "left_out": left_out,
+            }
+        }  # fmt: skip
         views = "photos left out" if left_out else "the input views"
         reached = f"{views} reach {psnr or 0.0:.2f} dB with {len(result.gaussians):,} Gaussians"
         notes, unmet = self.notes, None
@@ -162,26 +166,26 @@ class CountSearch:
 
     @property
     def notes(self) -> list[str]:
-        """One note, if keeping the quality of the input takes more Gaussians than usual; otherwise none."""
+        """A note, if keeping the quality of the input takes more Gaussians than usual; otherwise empty."""
         count, limits = self.best.count or 0, self.plan.limits
         if not self.plan.keeps_fidelity or count <= limits.default:
             return []
         kept = f"kept {len(self.best.gaussians):,} of {limits.num_input:,} Gaussians"
-        short = f"be below {self.plan.target_psnr:g} dB from it"
-        good = f"are {self.plan.target_psnr:g} dB from the input or better"
+        miss = f"be below {self.plan.target_psnr:g} dB from it"
+        reach = f"are {self.plan.target_psnr:g} dB from the input or better"
         if not self.rendered:
-            short = f"show the photos over {FIDELITY_LOSS:g} dB worse"
-            good = f"show the photos at most {FIDELITY_LOSS:g} dB worse than the input"
+            miss = f"show the photos over {FIDELITY_LOSS:g} dB worse"
+            reach = f"show the photos at most {FIDELITY_LOSS:g} dB worse than the input"
         if not self.is_met:
-            return [f"{kept}: each of the {len(self.psnrs)} counts tried would {short}"]
+            return [f"{kept}: each of the {len(self.psnrs)} counts tried would {miss}"]
         compact_share = 0.5  # a scene is compact already if the result needs more than this share of its Gaussians
         if count > compact_share * limits.num_input:
-            return [f"the scene is compact already: {kept}, since fewer would {short}"]
-        return [f"{kept}, about the fewest that {good}"]
+            return [f"the scene is compact already: {kept}, since fewer would {miss}"]
+        return [f"{kept}, about the fewest that {reach}"]
 
 
 def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
-    """Return the deciding PSNR (dB) of each candidate by its count, in the order of the candidates."""
+    """Return the PSNR (dB) that decides about each candidate, by its count, in the order of the candidates."""
     psnrs = dict[int, float]()
     for candidate in candidates:
         if candidate.count is not None:
@@ -192,9 +196,9 @@ def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
 def add_target(plan: Plan, prepared: Prepared) -> Plan:
     """Add to the plan the PSNR that a result has to reach, and the pixels that count if the input leaves gaps.
 
-    If a result has to keep the quality of the input, the target is the PSNR of the input on the photos less the allowed
-    loss. If renders of the input stand for photos, only the pixels that the input covers are scored, because any result
-    equals the input where both are empty.
+    If a result has to keep the quality of the input, the target is the PSNR of the input on the photos, minus the
+    allowed loss. If renders of the input stand for photos, only the pixels that the input covers count. In gaps, where
+    input and result are both black, any result would look perfect.
     """
     if prepared.reference.name == RENDERS and may_leave_gaps(prepared, plan):
         input_score = measure_renders(prepared.scene.gaussians, prepared, plan)
@@ -208,13 +212,13 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
 
 
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
-    """Return a search for the number of Gaussians, which has not begun; it may have only one count to build.
+    """Return the search for the number of Gaussians, before its first build.
 
-    If the scene's curve decides that count, it is measured here.
+    Without a quality target, the search has one count. If the scene's curve decides it, the curve is measured here.
     """
     limits, left_out = plan.limits, leave_out_for_scores(prepared, plan)
     agreement, most = prepared.agreement, limits.max_count
-    if left_out is not None and agreement is not None:  # more Gaussians gain nothing on photos that are left out
+    if left_out is not None and agreement is not None:  # left-out photos gain nothing from more Gaussians than this
         most = max(limits.min_count, min(most, int(agreement.share * limits.num_pixels)))
     if plan.target_psnr is None:
         return CountSearch(plan, choose_count(prepared, plan, build, left_out, most))
@@ -226,8 +230,7 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
     """Leave out views, so that their photos can score candidates or a curve; None if no view is left out.
 
     Views are left out if a quality target or the curve decides the count, because a fit shows the photos that it has
-    seen better than new ones. Without a fit that is not needed. It is not needed either if candidates are compared with
-    the input, which is scored on its own views.
+    seen better than new ones. No view is left out without a fit, or if candidates only have to be as good as the input.
     """
     has_target = plan.target_psnr is not None and not plan.keeps_fidelity
     if plan.fit.fit == "none" or not (has_target or plan.max_drop is not None or plan.auto_count):
@@ -247,10 +250,9 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
 
 @record_part()
 def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | None) -> Candidate:
-    """Build a candidate from the views that remain, by a ``plan`` for these, and score it on the left-out photos.
+    """Build a candidate from the views that remain, by a ``plan`` for them, and score it on the left-out photos.
 
-    ``count`` is the number of Gaussians for all views. The candidate has a part of it, by the share of views that
-    remain.
+    ``count`` is the number of Gaussians for all views. The candidate has as much of it as its share of the views.
     """
     assert count is not None
     begin_part()
@@ -263,8 +265,8 @@ def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | Non
 def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int) -> int | None:
     """Choose the number of Gaussians by the budget or the scene's curve; None if ``superpixels`` and K decide.
 
-    The curve is measured on the photos of ``left_out``; without them, on patches of all photos. ``most`` is its largest
-    count.
+    The curve is measured on the photos of ``left_out`` or, without them, on patches of all photos. ``most`` is the
+    largest count of the curve.
     """
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
@@ -285,17 +287,17 @@ def next_count(
 ) -> int:
     """Choose the next count to build in the search for the fewest Gaussians that reach a PSNR, within 15 %.
 
-    A count that was built already is returned if it is near enough, so the search ends. The PSNR is assumed to rise
-    with the count. It is interpolated between the nearest counts on both sides of the target, or extrapolated from one
-    side.
+    If a count that was built already is near enough, it is returned, and the search ends. The PSNR is assumed to rise
+    with the logarithm of the count. The next count is interpolated between the nearest counts on both sides of the
+    target, or extrapolated from one side.
 
     Args:
         psnrs: PSNR (dB) by count, of at least one count.
         target: The PSNR (dB) to reach.
         least: Fewest Gaussians to build.
         most: Most Gaussians to build.
-        slope: dB per doubling of the count to assume, until two counts were built.
-        near: A count at most this many dB above the target is near enough.
+        slope: PSNR (dB) to assume per doubling of the count, until two counts were built.
+        near: A count whose PSNR is at most this many dB above the target is near enough.
     """
     above = min((c for c, psnr in psnrs.items() if psnr >= target), default=None)
     below = max((c for c, psnr in psnrs.items() if psnr < target and (above is None or c < above)), default=None)
@@ -304,17 +306,19 @@ def next_count(
     if above is not None and below is not None:
         if above <= below * SAME_COUNT_RATIO:
             return above
-        width = float(log(above / below))  # of the interval between the two counts; PSNR is linear in it
+        width = float(log(above / below))  # of the interval between the two counts, on a logarithmic scale
         rise = (min(psnrs[above], target + FAR_DB) - psnrs[below]) / width
         step = (target - psnrs[below]) / rise if rise > 0 else width / 2
+        # a little more than interpolated, to reach the target, and not so near to either count that it says nothing new
         return round(below * float(exp(min(max(step + 0.1 * width, 0.15 * width), 0.85 * width))))
     if above is None and len(psnrs) > 1:
         first, last = sorted(psnrs)[-2:]
         measured = (psnrs[last] - psnrs[first]) / float(log(last / first) / log(2.0))
         slope = min(max(measured, slope / 3), slope)
-    edge = below if above is None else above
-    assert edge is not None  # one count has been built
-    doublings = (target - psnrs[edge]) / slope
+    nearest = below if above is None else above
+    assert nearest is not None  # one count has been built
+    doublings = (target - psnrs[nearest]) / slope
+    # a step changes the PSNR by half a dB at least, and the count by three doublings at most
     if above is None:
-        return min(most, round(edge * float(power(2, min(max(doublings, 0.5 / slope), 3.0)))))
-    return max(least, round(edge * float(power(2, max(min(doublings, -0.5 / slope), -3.0)))))
+        return min(most, round(nearest * float(power(2, min(max(doublings, 0.5 / slope), 3.0)))))
+    return max(least, round(nearest * float(power(2, max(min(doublings, -0.5 / slope), -3.0)))))

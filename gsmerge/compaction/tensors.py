@@ -1,4 +1,4 @@
-"""Compact arrays and tensors in memory, after their conventions were checked."""
+"""Check the conventions of arrays and tensors in memory, and compact the scene that they describe."""
 
 from __future__ import annotations
 
@@ -136,10 +136,10 @@ def _combine(
     names: Sequence[str] | None,
     order: str,
 ) -> tuple[Scene, list[str]]:
-    """Combine Gaussians and views into a scene after a check that they fit; return the scene and notes.
+    """Check that Gaussians and views fit each other, and return their scene, with notes.
 
-    ``valid`` is a mask ``[n]`` of the Gaussians that the scene gets. ``order`` says whether they are the pixels of the
-    views.
+    ``valid`` is a mask ``[n]`` of the Gaussians that the scene gets. ``order`` says whether each Gaussian belongs to a
+    pixel.
     """
     if names is None or len(cameras) == 0:
         names = [f"view{view}" for view in range(len(cameras))]
@@ -167,7 +167,7 @@ def _to_numpy(name: str, values: Any) -> np.ndarray:
 
 
 def _copy_rows(name: str, values: Any, *row_shape: int) -> np.ndarray:
-    """Copy values of shape ``[...,*row_shape]`` to ``[n,*row_shape]`` float32; means may stay float64."""
+    """Return a float32 copy ``[n,*row_shape]`` of values ``[...,*row_shape]``; means may stay float64."""
     array = _to_numpy(name, values)
     if array.ndim < len(row_shape) or array.shape[array.ndim - len(row_shape) :] != row_shape:
         expected = ", ".join(map(str, ("n", *row_shape)))
@@ -177,9 +177,9 @@ def _copy_rows(name: str, values: Any, *row_shape: int) -> np.ndarray:
 
 
 def _check_gaussians(columns: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
-    """Make Gaussians from columns after checks; SceneError if values have another convention.
+    """Check columns, and make Gaussians of them; SceneError if their values have another convention.
 
-    The columns are changed in place. Rows with NaN or infinities become transparent, opacities are cut to [0, 1], and
+    The columns are changed in place: rows with NaN or infinities become transparent, opacities are cut to [0, 1], and
     quaternions get the length 1. Returns the Gaussians, a mask ``[n]`` of the rows that are finite and not empty, and
     notes.
     """
@@ -193,7 +193,8 @@ def _check_gaussians(columns: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndar
     valid = np.ones(n, np.bool_)
     for column in columns.values():
         valid &= np.isfinite(column.reshape(n, -1)).all(1)
-    num_bad = clear_invalid("means", columns | {"valid": valid})
+    columns_and_mask = columns | {"valid": valid}
+    num_bad = clear_invalid("means", columns_and_mask)
     check_values(columns)
     quats, opacities = columns["quats"], columns["opacities"]
     _check_lengths(quats[valid])
@@ -203,21 +204,21 @@ def _check_gaussians(columns: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndar
     quats[rows] = normalize(quats[rows])
     quats[(quats == 0).all(1)] = (1, 0, 0, 0)
     notes = [count_words(num_bad, "row", "with NaN or inf, set aside")] if num_bad else []
-    empty = find_empty("means", columns | {"valid": valid})
-    clear_rows(columns | {"valid": valid}, empty)
+    empty = find_empty("means", columns_and_mask)
+    clear_rows(columns_and_mask, empty)  # these rows are no longer valid
     notes += [count_words(len(empty), "empty row", "at the origin, set aside")] if len(empty) else []
     return Gaussians(**columns), valid, notes
 
 
 def _copy_sh0(sh0: Array | None, colors: Array | None) -> np.ndarray:
-    """Return a copy of ``sh0 [n,1,3]``, or compute it from ``colors``; SceneError if both or neither are given."""
+    """Return a copy ``[n,1,3]`` of ``sh0``, or compute it from ``colors``; SceneError unless one of them is given."""
     if (sh0 is None) == (colors is None):
         found = "neither" if sh0 is None else "both"
         raise SceneError("sh0", f"expected either sh0 or colors, found {found}")
     if sh0 is not None:
         return _copy_rows("sh0", sh0, 3).reshape(-1, 1, 3)
     rgb = _copy_rows("colors", colors, 3)
-    slack = 1.0  # harmonics may take colours beyond [0, 1], but hardly by more than this
+    slack = 1.0  # colours of Gaussians may lie outside [0, 1], but hardly by more than this
     _expect_unit_range("colors", rgb[np.isfinite(rgb)], slack)
     return rgb_to_sh0(rgb)[:, None]
 
@@ -236,9 +237,9 @@ def _copy_harmonics(shN: Array | None, n: int) -> np.ndarray:
 
 
 def _check_lengths(quats: np.ndarray) -> None:
-    """Raise SceneError if many quaternions do not have the length 1, since they may be something else."""
+    """Raise SceneError if many quaternions do not have the length 1, because they may have another meaning."""
     lengths = np.linalg.norm(quats, axis=1)
-    max_difference, max_share = 0.01, 0.01  # of a length from 1; share of rows that may differ by more
+    max_difference, max_share = 0.01, 0.01  # at most this share of the lengths may differ from 1 by more than this
     share = float((np.abs(lengths - 1) > max_difference).mean())
     if share > max_share:
         sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
@@ -247,7 +248,10 @@ def _check_lengths(quats: np.ndarray) -> None:
 
 
 def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
-    """Raise SceneError for colours more than ``slack`` outside [0, 1]; the remedy guesses which range they have."""
+    """Raise SceneError for colours that are more than ``slack`` outside [0, 1].
+
+    If they look like 0 to 255 or -1 to 1, the error says how to convert them.
+    """
     low, high = float(values.min(initial=0)), float(values.max(initial=0))
     if -slack <= low and high <= 1 + slack:
         return
@@ -262,7 +266,7 @@ def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
 def _check_cameras_and_images(
     viewmats: Array | None, Ks: Array | None, images: Array | None, shape: Sequence[int] | None
 ) -> tuple[Cameras, np.ndarray | None]:
-    """Return the cameras and ``images [v,h,w,3]``; SceneError for shapes or values that these cannot have."""
+    """Check cameras and images, and return them as cameras and ``[v,h,w,3]``; SceneError for wrong shapes or values."""
     if viewmats is None or Ks is None:
         raise SceneError("viewmats" if viewmats is None else "Ks", "expected one matrix for each view, found none")
     photos = None if images is None else _to_numpy("images", images)
@@ -290,7 +294,10 @@ def _check_cameras_and_images(
 
 
 def _to_matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: int) -> np.ndarray:
-    """Return a float64 matrix for each of so many ``views``; SceneError if their shape is none of ``shapes``."""
+    """Return a float64 matrix for each view; SceneError if their number or their shape is wrong.
+
+    ``views`` is the number of views, and ``shapes`` are the shapes that a matrix may have.
+    """
     array = _to_numpy(name, values).astype(np.float64, order="C")
     if array.shape[-2:] not in shapes or array.size != views * array.shape[-2] * array.shape[-1]:
         expected = " or ".join(str([views, *shape]) for shape in shapes)
@@ -299,7 +306,7 @@ def _to_matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], view
 
 
 def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple[int, int, int]:
-    """Return the number of views, their height and width: those of ``shape``, or else those of the photos."""
+    """Return the number of views, their height and their width, from ``shape`` or else from the photos."""
     if shape is not None:
         if len(shape) != 3:
             raise SceneError("shape", f"expected views, height and width, found {list(shape)}")
@@ -324,9 +331,10 @@ def _image_error(photos: np.ndarray, expected: str) -> SceneError:
 def _check_pixels(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, names: tuple[str, ...]
 ) -> tuple[Cameras, list[str]]:
-    """Return the cameras, moved slightly if needed, and notes; SceneError unless Gaussians project into their pixels.
+    """Check that Gaussians project into their pixels; return the cameras, which may be moved slightly, and notes.
 
-    The error names what else the cameras may be, such as those of another convention or another size.
+    Raises SceneError if they do not. If the cameras look like those of another convention or another image size, the
+    error says so.
     """
     pairs = sample_pixels(gaussians, cameras, valid)
     alignment = check_pairs(pairs, cameras)
@@ -349,10 +357,10 @@ def _check_pixels(
 
 
 def _rotation_notes(quats: np.ndarray) -> list[str]:
-    """Return a note if the w of quaternions may come last: the last column is never negative, and the first is.
+    """Return a note if w may be the last column of the quaternions, because this column alone has no negative number.
 
     Quaternions that are computed from matrices rarely have a negative w. The note may be wrong for Depth Anything 3,
-    whose quaternions wxyz have a last component that is never negative.
+    where the last column is z and is never negative.
     """
     if not quats[:, 3].min(initial=0) >= 0 > quats[:, 0].min(initial=0):
         return []
@@ -360,7 +368,7 @@ def _rotation_notes(quats: np.ndarray) -> list[str]:
 
 
 def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:
-    """Raise SceneError if poses see the Gaussians only in another convention; return notes on other doubtful poses."""
+    """Raise SceneError if the poses see the Gaussians only in another convention; otherwise return notes of doubt."""
     poses, check, note = choose_poses(gaussians, valid, cameras, photo_array(images), W2C_OPENCV)
     if poses is not None:
         raise _convention_error(poses.convention, poses.description, check.description)

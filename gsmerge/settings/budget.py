@@ -1,6 +1,6 @@
 """Declare the settings that decide the number of Gaussians, and parse their texts.
 
-A user asks for a count, a share of the input, a file size, a device or a quality.
+A user gives a number, a share of the input, a file size, a device or a quality.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}  # Gaus
 
 @dataclass(frozen=True)
 class BudgetOptions(Settings):
-    """Settings that decide the number of Gaussians, next to superpixels per view and K."""
+    """Settings that decide the number of Gaussians, besides `superpixels` and `k`."""
 
     budget: int | str | None = setting(None, "Number of Gaussians in the result. A number such as 40000 is met "
         "exactly. Upper limits are a share of the input such as 2%, a file size such as 5MB, or a device that draws "
@@ -66,27 +66,27 @@ class BudgetOptions(Settings):
 
     @property
     def leaves_open(self) -> bool:
-        """True if the scene decides the number of Gaussians, freely or up to the limit of a device."""
+        """True if the budget leaves the number of Gaussians to the scene, without a limit or with that of a device."""
         return self.budget in (None, AUTO, *DEVICES)
 
     @property
     def auto(self) -> bool:
-        """True if the scene alone decides the number of Gaussians."""
+        """True if the user asks for as many Gaussians as the scene needs."""
         return self.budget == AUTO
 
     @property
     def is_limit(self) -> bool:
-        """True if the budget is a share, a size or a device, and used only as far as new views gain."""
+        """True if the budget is a share, a size or a device, of which a run uses only what improves new views."""
         return not self.fill and not self.auto and self.budget is not None and self.number is None
 
     @property
     def is_filled(self) -> bool:
-        """True if the result has as many Gaussians as the budget names or allows, even if no view sees some of them."""
+        """True if the result has all Gaussians of the budget, even if no view sees some of them."""
         return self.number is not None or self.fill
 
     @property
     def number(self) -> int | None:
-        """The number of Gaussians that the budget names; None without a budget, or for a share, a size or a device."""
+        """The number of Gaussians if the budget is a number; None for any other budget, or without one."""
         if self.budget is None or self.auto or self.in_bytes or self.budget in DEVICES or "%" in str(self.budget):
             return None
         return parse_budget(self.budget, sys.maxsize)
@@ -98,19 +98,19 @@ class BudgetOptions(Settings):
 
     @property
     def target_psnr(self) -> float | None:
-        """PSNR (dB) that the photos have to reach; None without such a target."""
+        """PSNR (dB) that the result has to reach; None if the user asks for none."""
         quality = None if self.quality is None else parse_quality(self.quality)
         return None if quality is None or self.max_drop is not None else quality
 
     @property
     def max_drop(self) -> float | None:
-        """Largest loss in dB against the best number of Gaussians on the scene's curve; None without such a target."""
-        loss = self.quality is not None and self.quality.strip().startswith("-")
-        return -parse_quality(str(self.quality)) if loss else None
+        """Largest loss (dB) against the best number of Gaussians on the scene's curve; None if the user gives none."""
+        is_loss = self.quality is not None and self.quality.strip().startswith("-")
+        return -parse_quality(str(self.quality)) if is_loss else None
 
 
 def parse_quality(text: str) -> float:
-    """Parse a quality into dB: a PSNR such as "30dB", or a loss such as "-0.2dB", which is returned below zero.
+    """Parse a PSNR such as "30dB", or a loss such as "-0.2dB", into a number of dB; a loss is negative.
 
     Example:
         >>> parse_quality("30dB"), parse_quality("-0.2dB")
@@ -118,7 +118,7 @@ def parse_quality(text: str) -> float:
     """
     match = re.fullmatch(r"(-?)(\d*\.?\d+)\s*db", str(text).strip().lower(), re.ASCII)
     value = float(match[2]) if match else math.inf
-    grey_psnr = 6.0  # dB that a picture of the mean grey reaches on any photo, so nobody asks for less
+    grey_psnr = 6.0  # PSNR (dB) that a grey picture reaches on any photo, so a smaller target is a mistake
     if match is None or not math.isfinite(value) or (value < grey_psnr and not match[1]):
         hint = f'; perhaps "{text}dB"' if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else ""
         hint = f'; perhaps "-{value:g}dB"' if match is not None and 0 < value < grey_psnr else hint
@@ -127,7 +127,7 @@ def parse_quality(text: str) -> float:
 
 
 def parse_share(text: str) -> float:
-    """Parse a share above 0 and up to 100 %, such as "4.4%", to a number such as 0.044."""
+    """Parse a share such as "4.4%" into a number such as 0.044; ValueError unless it is above 0 and at most 1."""
     match = re.fullmatch(r"(\d*\.?\d+)\s*%", str(text).strip(), re.ASCII)
     share = Fraction(match[1]) / 100 if match else Fraction(0)
     if not 0 < share <= 1:
@@ -136,7 +136,7 @@ def parse_share(text: str) -> float:
 
 
 def share_text(share: float) -> str:
-    """Format a share such as 0.044 as a text such as "4.4%", which :func:`parse_share` reads as the same number."""
+    """Format a share such as 0.044 as a text such as "4.4%", which :func:`parse_share` parses into the same number."""
     if isinstance(share, bool) or not isinstance(share, int | float):
         raise ValueError(f"expected a share as a number, got {share!r}")
     return f"{(Decimal(repr(share)) * 100).normalize():f}%"

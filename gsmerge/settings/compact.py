@@ -1,4 +1,7 @@
-"""Declare all settings of a run, which users give by their flat names, without the stage."""
+"""Declare all settings of a run.
+
+They are grouped by stage. Users give each setting by its flat name, which is its name without the group.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,8 @@ from gsmerge.settings.stages import (
 OURS = "gsmerge"  # name of the built-in method; all others are plugins
 EFFORT_NAMES = ("draft", "fast", "default", "best")  # gsmerge.plan.EFFORTS has the settings of each
 CHECKPOINTS = ("auto", "shipped", "paper", "none")  # values of `checkpoint` that are not paths of files
-# Several settings under one name; settings that a user gives as well take precedence. "paper" is the method of the
-# superpixel merging paper. It cuts 476 x 476 pixels into 12,000 superpixels by BASS from saliency seeds. It uses
+# A recipe stands for several settings. Settings that a user also gives take precedence. "paper" is the method of the
+# superpixel merging paper: it cuts 476 x 476 pixels into 12,000 superpixels by BASS, from saliency seeds. It uses
 # networks with absolute outputs, matches by latents and boxes, does not fit, and prunes by opacity only
 RECIPES: Mapping[str, Mapping[str, Any]] = {
     "paper": {
@@ -35,9 +38,9 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
 }  # fmt: skip
 # Settings that decide the number of Gaussians
 COUNTS = ("superpixels", "k", "budget")
-# Settings of a run on a piece of a scene, which is a block or a batch of views. Only the whole scene can decide these
+# Settings of a run on a part of a scene, such as a block of views. Their usual values would need the whole scene
 ONE_PIECE: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
-# Settings of a run that tries something on some of the views
+# Settings of a trial, which is a short run on some of the views
 TRIAL: dict[str, Any] = {
     **ONE_PIECE, "budget": None, "quality": None, "levels": 1, "crop": None, "drop": None,
     "photo_scale": 1.0, "recipe": None,
@@ -53,8 +56,8 @@ def method_names() -> tuple[str, ...]:
 class CompactOptions(Settings):
     """Every setting of :func:`gsmerge.compact`, stage by stage.
 
-    Settings that exclude each other raise ValueError: a PSNR target together with ``drop="sky"``, a method other than
-    ``"gsmerge"`` that would have to search for the number of Gaussians, or a required checkpoint without a name.
+    Settings that contradict each other raise ValueError, such as a PSNR target with ``drop="sky"``, or a search for the
+    number of Gaussians with a method other than ``"gsmerge"``.
 
     Example:
         >>> options = gsmerge.CompactOptions().with_settings({"k": 2, "effort": "draft"})
@@ -96,11 +99,11 @@ class CompactOptions(Settings):
             raise ValueError(f'recipe paper: expected a checkpoint with absolute outputs, got "{self.checkpoint}"')
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
-        for name in self.clean.visible_drops if self.budget.target_psnr is not None else ():
-            quality = f"quality {self.budget.quality}"
-            raise ValueError(f"{name}: expected a budget or superpixels, got {quality}; photos show what it removes")
-        for name in self.budget.search_names if self.method != OURS else ():
-            raise ValueError(f"method {self.method}: expected a budget or superpixels, got {name}")
+        if self.budget.target_psnr is not None and self.clean.visible_drops:
+            problem = f"expected a budget or superpixels, got quality {self.budget.quality}"
+            raise ValueError(f"{self.clean.visible_drops[0]}: {problem}; photos show what it removes")
+        if self.method != OURS and (names := self.budget.search_names):
+            raise ValueError(f"method {self.method}: expected a budget or superpixels, got {names[0]}")
 
     @property
     def changed_counts(self) -> list[str]:
@@ -109,27 +112,27 @@ class CompactOptions(Settings):
 
     @property
     def scene_decides(self) -> bool:
-        """True if the scene decides the number of Gaussians: no setting does, and none replaces stages.
+        """True if no setting decides the number of Gaussians, so that a run may choose it for the scene.
 
-        Other stages than the usual ones seldom keep the quality of the input.
+        False also if settings replace the usual stages, because other stages seldom keep the quality of the input.
         """
-        decided = [name for name in self.changed_counts if name != "budget" or not self.budget.leaves_open]
-        return not (decided or self.budget.quality is not None or self.replaces_stages)
+        deciding = [name for name in self.changed_counts if name != "budget" or not self.budget.leaves_open]
+        return not (deciding or self.budget.quality is not None or self.replaces_stages)
 
     @property
     def replaces_stages(self) -> bool:
-        """True if a method, networks or a recipe replace the closed formulas of the stages."""
+        """True if another method, networks or a recipe replace the usual computations of stages."""
         return self.method != OURS or self.checkpoint not in ("auto", "none") or self.recipe is not None
 
     @property
     def changes_superpixels(self) -> bool:
-        """True if settings change how superpixels are cut, merged or decoded, other than their number."""
+        """True if any setting changes how superpixels are cut, merged or decoded; their number does not count."""
         kinds = (SegmentOptions, MatchOptions, DecodeOptions)
         return bool(self.changed([name for kind in kinds for name in flat_settings(kind) if name not in COUNTS]))
 
     @property
     def whole_only(self) -> list[str]:
-        """Names of the settings in use that require the scene in one piece."""
+        """Names of the settings in use that need the whole scene in one piece."""
         drops = [f"drop {name}" for name in self.clean.drops]
         quality = [] if self.budget.quality is None else [f"quality {self.budget.quality}"]
         method = [] if self.method == OURS else [f"method {self.method}"]
@@ -137,9 +140,12 @@ class CompactOptions(Settings):
 
     @property
     def uncut(self) -> list[str]:
-        """Names of the settings in use that exclude blocks; views that arrive in batches allow some of them."""
-        values, kept = self.to_dict(), {"poses": "free", "exposure": "per-photo", "budget": AUTO}
-        return [*self.whole_only, *(f"{name} {value}" for name, value in kept.items() if values[name] == value)]
+        """Names of the settings in use that are not possible in blocks of views.
+
+        Some of them are possible for views that arrive in batches, see :attr:`compact_only`.
+        """
+        values, excluded = self.to_dict(), {"poses": "free", "exposure": "per-photo", "budget": AUTO}
+        return [*self.whole_only, *(f"{name} {value}" for name, value in excluded.items() if values[name] == value)]
 
     @property
     def compact_only(self) -> list[str]:
@@ -147,23 +153,23 @@ class CompactOptions(Settings):
         return [*self.whole_only, *self.blocks.asked]
 
     def changed(self, names: Iterable[str]) -> list[str]:
-        """Return those of the flat ``names`` whose settings differ from their defaults."""
+        """Return those of the ``names`` whose settings differ from their defaults; they are flat names."""
         values, declared = self.to_dict(), flat_settings(CompactOptions)
         return [name for name in names if values[name] != declared[name].default]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all settings by their flat names, as plain values."""
-        flat: dict[str, Any] = {}
+        """Return the values of all settings by flat name."""
+        values: dict[str, Any] = {}
         for name, declared in settings_of(CompactOptions).items():
             value = getattr(self, name)
-            names = flat_settings(declared.kind) if declared.is_group else ()
-            flat |= {inner: getattr(value, inner) for inner in names} or {name: value}
-        return flat
+            inner_names = flat_settings(declared.kind) if declared.is_group else ()
+            values |= {inner_name: getattr(value, inner_name) for inner_name in inner_names} or {name: value}
+        return values
 
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
-        """Return options in which settings are changed by flat name (``k=2``), after those of a recipe.
+        """Return options with other ``settings``, by flat name; ValueError for an unknown name.
 
-        Raises ValueError for an unknown name.
+        If ``recipe`` is among them, its settings are changed first.
         """
         if not isinstance(settings, Mapping):
             raise TypeError(f"settings: expected a dictionary of values by name, got {type(settings).__name__}")

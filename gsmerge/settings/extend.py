@@ -1,4 +1,7 @@
-"""Declare the settings for adding a batch of new views to a state."""
+"""Declare the settings of ``gsmerge extend``, which adds a batch of views to a state.
+
+A state is a file to which further views can be added, and from which a result can be made at any time.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +25,9 @@ class ExtendOptions(Settings):
 
 
 def batch_settings(settings: Mapping[str, Any]) -> tuple[CompactOptions, ExtendOptions]:
-    """Make the options of a batch of views from settings by flat name; the default effort is "draft".
+    """Make the options for adding a batch of views, from settings by flat name; the default effort is "draft".
 
-    Raises ValueError for an unknown setting, and for levels.
+    Raises ValueError for an unknown setting, and for several levels of detail.
     """
     names = ExtendOptions.__dataclass_fields__.keys()
     values = {"effort": "draft"} | dict(settings)

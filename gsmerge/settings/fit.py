@@ -13,9 +13,9 @@ STEPS = 320  # default number of steps of the full fit
 LONG_STEPS = 600  # runs with at least this many steps gain from a little dropout
 USUAL_SHARE = 0.044  # for this many Gaussians per pixel, a quarter of the pixels is enough in the first steps
 GROW_STEPS = 150  # runs with fewer steps do better when they begin with all their Gaussians
-# A run grows only if it has this many steps for each photo, because each step draws one photo. A run with fewer does
-# not draw every photo before it grows. Without growth, a scene of 100 real views has 20.9 instead of 20.7 dB, in .6 of
-# the time
+# A run grows only if it has at least this many steps for each photo, because each step draws one photo, and each photo
+# has to be drawn before the growth. With fewer steps, a real scene of 100 views has 20.9 dB without growth, instead of
+# 20.7 dB, and takes .6 of the time
 GROW_ROUNDS = 2
 
 
@@ -28,47 +28,47 @@ class Tuning:
     quats_lr: float = 0.03  # Step size of a quaternion
     opacities_lr: float = 0.3  # Step size of an opacity's logit
     colors_lr: float = 0.03  # Step size of a colour, sRGB in [0, 1]
-    poses_lr: float = 0.1  # First step size of a camera that moves, of its rotation and of its shift, in pixels
-    # At the end, the step sizes of Gaussians are multiplied by this, or by less in runs of more than 300 steps
+    poses_lr: float = 0.1  # Step size at the start, in pixels, of the rotation and the shift of a camera that moves
+    # Step sizes of Gaussians at the end, relative to those at the start. Runs of more than 300 steps use less
     decay: float = 0.4
     beta1: float = 0.8  # Largest decay of Adam's first moment; gsmerge.fit.schedule.first_decay may give less
     beta2: float = 0.9  # Decay of Adam's second moment
     max_mean_shift: float = 2.0  # Largest shift of a mean, in units of the Gaussian's size
     max_scale_change: float = 2.5  # Largest change of a log scale
     max_opacity_change: float = 4.0  # Largest change of an opacity's logit
-    # A Gaussian that only one photo shows may use this share of the limits of mean and scales, because the photo
-    # determines its colour but not its depth. With two photos or more it may use them in full
+    # If only one photo shows a Gaussian, its mean and scales may change by this share of the limits above, because one
+    # photo determines its colour but not its depth
     single_view_share: float = 0.3
-    # Least scale, in pixels of the photo nearest to the Gaussian, because thinner Gaussians look like needles when a
-    # viewer enlarges them. 0 sets no limit
+    # Least scale, in pixels of the photo nearest to the Gaussian. Thinner Gaussians look like needles if a viewer
+    # enlarges them. 0 sets no limit
     min_scale: float = 0.5
-    # A Gaussian is long if three standard deviations exceed `long_share` of the width of the nearest photo. After the
-    # growth of a run, a long Gaussian may be at most `max_ratio` times as long as its second axis, because longer
-    # ones look like strokes from other viewpoints. Before the growth there is no such limit, because the few Gaussians
-    # find their places better if they may be long
+    # A Gaussian is long if three standard deviations exceed `long_share` of the width of the nearest photo. Its longest
+    # axis may be at most `max_ratio` times its second one, because longer Gaussians look like strokes from other
+    # viewpoints. This holds after the growth of a run. Before it there are few Gaussians, which fit better if they may
+    # be long
     long_share: float = 0.25
     max_ratio: float = 3.0
     average_share: float = 0.2  # The parameters are averaged over this share of the steps, which are the last ones
     ssim_lambda: float = 0.35  # Share of structural similarity in the loss; the rest is L1
-    # Weight in the loss, at the end of a run, of the L1 error of differences between neighbouring pixels. It grows from
-    # 0, because these differences mean little before the edges in a picture are in their places
+    # Weight in the loss of the L1 error of differences between neighbouring pixels, at the end of a run. At its start
+    # the weight is 0, because such differences only help once edges are roughly in their places
     edge_weight: float = 2.4
-    # Weight of the mean opacity in the loss (3DGS-MCMC, Kheradmand et al. 2024). It lets Gaussians fade that the photos
-    # do not need, and that would hide surfaces in other views
+    # Weight of the mean opacity in the loss (3DGS-MCMC, Kheradmand et al. 2024). Gaussians that the photos do not need,
+    # and that would hide surfaces in other views, fade by it
     opacity_reg: float = 0.03
-    # Weight in the loss of the mean scale, in units of each Gaussian's size at its start. With it fewer Gaussians
-    # overlap, and a step takes a third less time
+    # Weight of the mean scale in the loss, relative to each Gaussian's size at its start. It lets fewer Gaussians
+    # overlap, so that a step takes a third less time
     scale_reg: float = 0.01
-    outside_every: int = 7  # Steps from one view from outside to the next, see gsmerge.fit.outside
-    # Share of the steps before the first view from outside; 1 for none. Early in a run, Gaussians in gaps help the
-    # others to find their places
+    outside_every: int = 7  # Every so many steps, a view from outside is drawn, see gsmerge.fit.outside
+    # Share of the steps before the first view from outside; 1 for no such view. Such views remove Gaussians in gaps,
+    # which at first help the others to move
     outside_from: float = 0.15
-    # Scores compensate the exposure of views only if one differs from the mean by this factor. Smaller differences come
-    # from holes and highlights as often as from the camera
+    # Scores compensate the exposures of views only if one exposure differs from the mean by this factor. Smaller
+    # differences often come from holes and highlights instead of the camera
     min_gain: float = 1.15
 
     def scaled(self, factor: float) -> Tuning:
-        """Return the constants with the step sizes of Gaussians multiplied by ``factor``."""
+        """Return these constants, but with step sizes of Gaussians that are multiplied by ``factor``."""
         names = ("means_lr", "scales_lr", "quats_lr", "opacities_lr", "colors_lr")
         return replace(self, **{name: factor * getattr(self, name) for name in names})
 
@@ -120,14 +120,14 @@ class FitOptions(Settings):
         """The share of the steps, at the start of a run, that draw only a quarter of the pixels."""
         if self.half_res_share is not None:
             return self.half_res_share
-        too_few_steps = 20  # runs with fewer steps have no time for whole photos
+        too_few_steps = 20  # runs with fewer steps are too short to draw whole photos
         if self.steps < too_few_steps:
             return 1.0
-        most = 0.5 if self.steps >= LONG_STEPS else 1.0  # details come last, and long runs have the time for them
-        share = 1.0 if self.share is None or not self.grows else self.share / USUAL_SHARE
-        return min(most, 0.7 / math.sqrt(max(share, 1.0)))
+        most = 0.5 if self.steps >= LONG_STEPS else 1.0  # long runs have time for details, which need whole photos
+        density = 1.0 if self.share is None or not self.grows else self.share / USUAL_SHARE
+        return min(most, 0.7 / math.sqrt(max(density, 1.0)))  # more Gaussians show more details
 
     @property
     def grows(self) -> bool:
-        """True if the fit starts with fewer Gaussians than requested, and adds the rest after half of its steps."""
+        """True if the fit starts with fewer Gaussians than requested, and adds the others after half of its steps."""
         return self.fit == "full" and self.steps >= self.grow_steps

@@ -1,4 +1,4 @@
-"""List the endings of the files that ``gsmerge render`` writes."""
+"""Endings of the names of files that ``gsmerge render`` can write."""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 GIF = ".gif"

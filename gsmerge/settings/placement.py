@@ -31,7 +31,7 @@ class PlacementOptions(Settings):
 
     @property
     def asked(self) -> bool:
-        """True if any setting changes the scene."""
+        """True if any of these settings changes what is written."""
         return self.moves or self.sh_degree is not None
 
     @property
@@ -41,7 +41,7 @@ class PlacementOptions(Settings):
 
 
 def parse_triple(name: str, text: str | None) -> tuple[float, float, float]:
-    """Parse three numbers that are separated by commas; None gives zeros.
+    """Parse three numbers that are separated by commas; None stands for three zeros.
 
     Example:
         >>> parse_triple("rotate", "90,0,0")

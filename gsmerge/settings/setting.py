@@ -22,7 +22,7 @@ KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", s
 
 @dataclass(frozen=True)
 class Setting:
-    """The declaration of a setting. :func:`setting` makes it; :func:`settings_of` adds its name and its type."""
+    """The declaration of a setting. :func:`setting` makes it, and :func:`settings_of` adds its name and its type."""
 
     help: str  # first sentences of the help, which the command line shows too; names of values are in single backticks
     more: str = ""  # further sentences, which only Python's help and docs/reference show
@@ -46,17 +46,17 @@ class Setting:
 
     @property
     def is_group(self) -> bool:
-        """True if the value is itself a dataclass of settings, such as those of a stage."""
+        """True if the value is a group of settings in its own dataclass, such as the settings of a stage."""
         return is_dataclass(self.kind)
 
     @property
     def is_list(self) -> bool:
-        """True if the value is a list. Choices and range then apply to its elements."""
+        """True if the setting takes a list. Choices and range then apply to the elements of the list."""
         return get_origin(self.kind) is tuple
 
     @property
     def kinds(self) -> list[Any]:
-        """The types that a value may have, other than listed words."""
+        """The types that a value may have, besides the words that are listed one by one."""
         kinds = [kind for kind in _types(self.kind) if get_origin(kind) is not Literal]
         return [kind for kind in kinds if kind is NoneType] if self.choices else kinds
 
@@ -68,13 +68,13 @@ class Setting:
         return (*listed, *(word for kind in literals for word in get_args(kind)))
 
     def fits(self, value: Any) -> bool:
-        """Return true if a value has one of the types, without a check of choices and range."""
+        """Return whether a value has one of the types of this setting. Choices and range are not checked."""
         if self.is_list:
             return isinstance(value, list | tuple) and all(map(self._fits, value))
         return self._fits(value)
 
     def _fits(self, value: Any) -> bool:
-        """Return true if a value, or an element of a list, has one of the types."""
+        """Return whether a value, or one element of a list, has one of the types of this setting."""
         is_bool = type(value).__name__.startswith("bool")  # of Python or NumPy, which is not imported here
         for kind in _types(self.kind):
             if get_origin(kind) is Literal:
@@ -90,7 +90,7 @@ class Setting:
         return False
 
     def _in_range(self, value: Any) -> bool:
-        """Return true if a value of the right type is one of the choices and in the range."""
+        """Return whether a value of the right type is one of the choices, and in the range."""
         if self.choices:
             return value is None or value in self.words
         is_number = isinstance(value, Real)
@@ -98,13 +98,13 @@ class Setting:
         return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
 
     def values(self) -> str:
-        """Return the possible values as a text for messages: choices, a range, or a type."""
+        """Describe the possible values in a text for messages, such as "a whole number from 1 to 8 or auto"."""
         kinds = [kind for kind in self.kinds if kind is not NoneType]
         texts = [self._describe_range(kind) if kind in (int, float) else KIND_NAMES.get(kind, "") for kind in kinds]
         return join_words([*texts, *map(str, self.words)])
 
     def _describe_range(self, kind: type) -> str:
-        """Return the possible numbers as a text, such as "a whole number from 1 to 8"."""
+        """Describe the possible numbers in a text, such as "a whole number from 1 to 8"."""
         low = f"above {_number(self.above)}" if self.least is None else _number(self.least)
         high = f"below {_number(self.below)}" if self.most is None else _number(self.most)
         if self.least is None and self.above is None:
@@ -115,7 +115,7 @@ class Setting:
         return f"{KIND_NAMES[kind]} {text} {self.unit}".strip()
 
     def check(self, value: Any) -> None:
-        """Raise ValueError, with the expected values, if a value is not allowed."""
+        """Raise ValueError if a value is not allowed; the message has the possible values."""
         if value is self.default:
             return
         if not self.is_list:
@@ -131,7 +131,7 @@ class Setting:
             raise ValueError(f"{self.name}: expected every value once, got {','.join(map(str, value))}")
 
     def _check_element(self, value: Any) -> None:
-        """Raise ValueError if a value that is no list, or an element of a list, is not allowed."""
+        """Raise ValueError if a value, or one element of a list, is not allowed."""
         if self._fits(value) and self._in_range(value):
             return
         hint = suggest_name(value, self.words)
@@ -139,12 +139,12 @@ class Setting:
 
 
 def setting(default: Any, help: str, more: str = "", **declared: Any) -> Any:
-    """Return a field of a :class:`Settings` class, which is a setting; ``declared`` are fields of :class:`Setting`."""
+    """Declare a field of a :class:`Settings` class as a setting; ``declared`` are fields of :class:`Setting`."""
     return field(default=default, metadata={"setting": Setting(help, more, default=default, **declared)})
 
 
 class Settings:
-    """Base class of frozen dataclasses whose fields are settings; invalid values raise ValueError."""
+    """Base class of frozen dataclasses whose fields are settings. Invalid values raise ValueError."""
 
     def __init_subclass__(cls) -> None:
         """Append the help of all fields to the docstring of the class."""
@@ -169,13 +169,15 @@ def settings_of(options: type) -> dict[str, Setting]:
     if options not in _declared:
         kinds = get_type_hints(options)
         entries = {f.name: f.metadata["setting"] for f in fields(options) if "setting" in f.metadata}
-        _declared[options] = {n: replace(entry, name=entry.name or n, kind=kinds[n]) for n, entry in entries.items()}
+        _declared[options] = {
+            name: replace(entry, name=entry.name or name, kind=kinds[name]) for name, entry in entries.items()
+        }
     return _declared[options]
 
 
 @cache
 def flat_settings(options: type) -> dict[str, Setting]:
-    """Return the declarations of all settings that users can give, by flat name, in place of the groups."""
+    """Return the declarations of all settings that users can give, also of those in groups, by flat name."""
     flat: dict[str, Setting] = {}
     for name, declared in settings_of(options).items():
         if not declared.internal:
@@ -184,7 +186,7 @@ def flat_settings(options: type) -> dict[str, Setting]:
 
 
 def change_settings(options: T, values: Mapping[str, Any]) -> T:
-    """Return ``options`` with new values of settings by flat name, also of those in groups."""
+    """Return ``options`` with new values of some settings, also of those in groups, by flat name."""
     changes: dict[str, Any] = {}
     for name, declared in settings_of(type(options)).items():
         names = flat_settings(declared.kind) if declared.is_group and not declared.internal else {name}
@@ -202,20 +204,22 @@ def join_words(words: Iterable[str]) -> str:
 
 
 def suggest_name(word: Any, names: Iterable[Any]) -> str:
-    """Return the end "; perhaps NAME" of a message about an unknown word, or an empty text if no name resembles it."""
+    """Return the end of a message about an unknown word: "; perhaps NAME", or nothing if no name resembles the word."""
     from difflib import get_close_matches
 
-    lower = {str(name).lower(): name for name in names}
-    return "".join(f"; perhaps {lower[match]}" for match in get_close_matches(str(word).lower(), lower, 1))
+    lower_names = {str(name).lower(): name for name in names}
+    return "".join(
+        f"; perhaps {lower_names[nearest]}" for nearest in get_close_matches(str(word).lower(), lower_names, 1)
+    )
 
 
 def _types(kind: Any) -> list[Any]:
-    """List the possible types of a value, or of the elements of a list."""
+    """Return the possible types of a value, or those of the elements if ``kind`` is a list."""
     if get_origin(kind) in (Union, UnionType):
         return [inner for member in get_args(kind) for inner in _types(member)]
     return _types(get_args(kind)[0]) if get_origin(kind) is tuple else [kind]
 
 
 def _number(value: float | None) -> str:
-    """Return a number as a text, without the zeros of a float."""
+    """Format a number; a float has no zeros at its end."""
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -71,17 +71,17 @@ class SegmentOptions(Settings):
             try:
                 parse_share(str(self.superpixels))
             except ValueError as error:
-                raise ValueError(f"superpixels: expected a number, or {str(error).partition(' ')[2]}") from None
+                raise ValueError(f"superpixels: expected a number, or {str(error).removeprefix('expected ')}") from None
 
     @property
     def per_view(self) -> int | None:
-        """Number of superpixels of each view; None if the option is a share of the pixels or "auto"."""
+        """Number of superpixels of each view, if the setting is a number; None for a share or "auto"."""
         text = str(self.superpixels)
         return int(text) if text.removeprefix("-").isdecimal() else None
 
     @property
     def share(self) -> float:
-        """Number of superpixels per pixel; the default share if the option is a number per view or "auto"."""
+        """Number of superpixels per pixel, if the setting is a share; the default share for a number or "auto"."""
         is_share = self.per_view is None and self.superpixels != AUTO
         return parse_share(str(self.superpixels) if is_share else SHARE)
 
@@ -109,7 +109,7 @@ class MatchOptions(Settings):
 
     @property
     def num_neighbors(self) -> int:
-        """Number of nearest neighbours in other views that each Feature Gaussian is compared with."""
+        """With how many nearest neighbours in other views each Feature Gaussian is compared."""
         return self.neighbors or MATCH_NEIGHBORS["aabb" if self.match == "aabb" else "overlap"]
 
 
@@ -137,13 +137,13 @@ class DecodeOptions(Settings):
 
     @property
     def mean_k(self) -> float:
-        """Mean number of Gaussians per group."""
+        """Mean number of Gaussians per superpixel or group of superpixels."""
         mixed = 1 + (100 - self.k_low + 2 * (100 - self.k_high)) / 100
         return mixed if self.k == MIXED else float(self.max_k)
 
     @property
     def max_k(self) -> int:
-        """Largest number of Gaussians per group."""
+        """Largest number of Gaussians per superpixel or group of superpixels."""
         return {MIXED: MIXED_COUNTS[-1], AUTO: USUAL_K}.get(str(self.k)) or int(self.k)
 
 
@@ -173,7 +173,7 @@ class CleanOptions(Settings):
 
     @property
     def drops(self) -> tuple[str, ...]:
-        """The kinds of Gaussians to leave out, by name."""
+        """Names of the kinds of Gaussians to leave out."""
         return () if self.drop is None else tuple(name.strip() for name in self.drop.split(","))
 
     @property
@@ -183,7 +183,7 @@ class CleanOptions(Settings):
 
     @property
     def visible_drops(self) -> list[str]:
-        """Names of the settings in use that leave out what photos show."""
+        """Names of the settings in use that leave out something that photos show, such as the sky."""
         return ["drop sky"] if "sky" in self.drops else []
 
 
@@ -210,7 +210,7 @@ def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
 
 @dataclass(frozen=True)
 class Engine(Settings):
-    """Settings that say where scenes or blocks are compacted; the result does not depend on them."""
+    """Settings that say on which machines scenes or blocks are compacted. The result does not depend on them."""
 
     engine: str = setting("local", "Where scenes or blocks are compacted. local: on this machine; ray: on a Ray "
         "cluster, which needs the package `ray`.", choices=("local", "ray"))  # fmt: skip
@@ -234,5 +234,5 @@ class BlockOptions(Settings):
 
     @property
     def asked(self) -> list[str]:
-        """The setting as a text for messages, if it is a number of blocks; otherwise empty."""
+        """Name and value of the setting for messages, if it is a number of blocks; otherwise empty."""
         return [f"blocks {self.blocks}"] if isinstance(self.blocks, int) else []

@@ -14,7 +14,14 @@ from messages import refuses
 
 import gsmerge
 from gsmerge import Gaussians, Scene, compact, pipeline, render
-from gsmerge.compaction.distance import DISTANCE_BLUR, DISTANCE_PIXELS, TWICE_DB, WRONG_DB, describe_far, is_far
+from gsmerge.compaction.distance import (
+    DISTANCE_BLUR,
+    DISTANCE_PIXELS,
+    TWICE_DB,
+    WRONG_DB,
+    describe_clear_loss,
+    is_clearly_worse,
+)
 from gsmerge.errors import TargetError
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.prepare import Prepared, prepare
@@ -60,13 +67,13 @@ def test_distances_are_those_of_a_slow_reference(prepared: Prepared) -> None:
     error = slow_psnr(own.images, scene.images[[0, 2]], own.alphas[..., 0] > 0.5)
     distance = slow_psnr(inputs.images, results.images, inputs.alphas[..., 0] > 0.5)
     assert distance < error - TWICE_DB
-    text = describe_far(result, prepared)
+    text = describe_clear_loss(result, prepared)
     assert text is not None
     assert [float(value) for value in re.findall(r"([\d.]+) dB", text)] == pytest.approx([distance, error], abs=0.3)
 
 
-def test_neither_the_input_nor_a_usual_result_is_far(room: Scene, prepared: Prepared) -> None:
-    assert describe_far(prepared.scene.gaussians, prepared) is None
+def test_the_input_and_usual_results_are_not_clearly_worse(room: Scene, prepared: Prepared) -> None:
+    assert describe_clear_loss(prepared.scene.gaussians, prepared) is None
     for settings in ({}, {"fit": "none"}, {"superpixels": "1%"}):
         assert not compact(room, effort="draft", **settings).report.is_far
 
@@ -76,10 +83,8 @@ def test_neither_the_input_nor_a_usual_result_is_far(room: Scene, prepared: Prep
     [(20, 20 - TWICE_DB - 0.1, True), (20, 20 - TWICE_DB + 0.1, False), (60, WRONG_DB + 0.1, False), (None, 3, False),
      (20, None, False), (float("nan"), 3, False)],
 )  # fmt: skip
-def test_a_result_is_far_at_twice_the_error_where_that_is_clearly_wrong(
-    before: float | None, after: float | None, expected: bool
-) -> None:
-    assert is_far(before, after) == expected
+def test_clearly_worse_is_twice_the_error(before: float | None, after: float | None, expected: bool) -> None:
+    assert is_clearly_worse(before, after) == expected
 
 
 def spoil_fits(monkeypatch: pytest.MonkeyPatch, *, merges: bool) -> None:

@@ -10,7 +10,7 @@ import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.left_out import LEAST_VIEWS, choose_left_out, leave_out, mark_seen, mean_seen
-from gsmerge.compaction.new_views import OWN, SPREAD, NewViews, Trial, shrink_scene
+from gsmerge.compaction.new_views import OWN_WEIGHT, SPREAD, NewViews, Trial, shrink_scene
 from gsmerge.facts.prepare import prepare
 from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_expected_scores
 from gsmerge.pages.page import describe_gain
@@ -32,7 +32,7 @@ def pictured(scene: Scene) -> PicturedScene:
 
 
 def test_the_expected_gain_lies_between_the_trial_and_own_photos_on_confirmed_depth() -> None:
-    gain = OWN * 0.9 * 20 + (1 - OWN) * 6
+    gain = OWN_WEIGHT * 0.9 * 20 + (1 - OWN_WEIGHT) * 6
     scores = (round(psnr, 2) for psnr in (18 + gain, 6 - SPREAD, 18 + SPREAD))  # between the trial and own photos
     assert TRIAL.predict(20, 40, 0.9) == NewViews(18, *scores, views=3)
     assert TRIAL.predict(20, 30, 0.5).gain == 5
@@ -46,7 +46,7 @@ def test_new_views_of_the_input_score_below_own_photos_by_what_the_trial_found()
 
 def test_no_gain_is_expected_where_the_trial_or_own_photos_lose() -> None:
     worse = Trial(20, 18, 16.5, 2)
-    assert worse.predict(20, 20, 1).gain == pytest.approx((1 - OWN) * -1.5)
+    assert worse.predict(20, 20, 1).gain == pytest.approx((1 - OWN_WEIGHT) * -1.5)
     assert worse.predict(20, 19, 0.5).high == SPREAD
     assert TRIAL.predict(20, 19, 1).gain == 0  # own photos lose: no gain is expected
 

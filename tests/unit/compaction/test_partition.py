@@ -13,11 +13,11 @@ from gsmerge.compaction.partition import (
     Block,
     Covisibility,
     count_factors,
+    mark_inside_and_seen,
     measure_covisibility,
     owning_views,
     partition_apart,
     partition_views,
-    see,
 )
 from gsmerge.plan import usual_blocks
 from gsmerge.types import Cameras, Scene
@@ -110,10 +110,10 @@ def test_hidden_points_are_not_seen() -> None:
     centre = scene.cameras.centres[0]
     behind = centre + 1.5 * (on_surface - centre)
     first = scene.cameras[[0]]
-    inside, seen = see(on_surface, first, covisibility.depths[:1])
+    inside, seen = mark_inside_and_seen(on_surface, first, covisibility.depths[:1])
     assert seen.mean() > 0.95
     assert inside.all()
-    inside, seen = see(behind, first, covisibility.depths[:1])
+    inside, seen = mark_inside_and_seen(behind, first, covisibility.depths[:1])
     assert seen.mean() < 0.1
     assert inside.all()
 
@@ -142,7 +142,7 @@ def test_owners_are_chosen_by_sight_then_by_picture_then_by_distance() -> None:
     cameras, depths = Cameras(viewmats, Ks, 44, 30), rng.uniform(0.5, 6, (30, 5, 7))
     depths[::4, 1, 1] = np.inf  # open sky
     points = rng.normal(0, 4, (3000, 3)) * rng.choice([0.2, 1, 4], (3000, 1))
-    inside, seen = see(points, cameras, depths)
+    inside, seen = mark_inside_and_seen(points, cameras, depths)
     squares = np.square(points - cameras.centres[:, None]).sum(-1)
     expected = (np.where(seen, 0, np.where(inside, 1e6, 1e12)) + squares).argmin(0)
     covisibility = Covisibility(cameras, depths, seen, points, np.zeros(len(points), int))
