@@ -22,7 +22,7 @@ from typing import Any
 from gsmerge.batch.find import main_file
 from gsmerge.batch.jobs import DISTINGUISH, BatchOptions, Job
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, prepare_folder, record
-from gsmerge.compaction.outputs import plan_outputs
+from gsmerge.compaction.outputs import name_outputs
 from gsmerge.errors import SceneError, error_line
 from gsmerge.io.atomic import atomic_output, describe_existing, remove_stale
 from gsmerge.io.jsonl import append_line
@@ -208,7 +208,7 @@ def _make_result(job: Job, run: Run, mark: Path) -> dict[str, Any]:
     refused = refusal(job, run.folder, known, key, overwrite=run.overwrite, begun=mark.exists())
     if refused:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
-    outputs = plan_outputs(run.folder / job.output, overwrite=True)
+    outputs = name_outputs(run.folder / job.output, overwrite=True)
     if (cameras := outputs.viewer_cameras) is not None:
         # A camera file of this name may be the input's, or may belong to a result of the same name in another format
         owns_cameras = known is not None and any(run.folder / file["path"] == cameras for file in known.files)

@@ -106,13 +106,13 @@ def _compact(
         from gsmerge.runtime.work import require_ray
 
         require_ray()
-    from gsmerge.compaction.outputs import plan_outputs
+    from gsmerge.compaction.outputs import name_outputs
 
-    outputs = plan_outputs(out, writing, overwrite=args.overwrite)
+    outputs = name_outputs(out, writing, overwrite=args.overwrite)
     settings = _choose_levels(args, settings, outputs)
     _check_outputs(args, source, settings, outputs)
     if args.dry_run:
-        print_plan(args, source, settings, outputs, hints)
+        print_estimate(args, source, settings, outputs, hints)
         return
     _warn_of_memory(source, settings, quiet=args.silent)
     from gsmerge.compaction.files import compact_files
@@ -193,12 +193,12 @@ def _decode(args: opt.Args, path: Path, out: Path) -> None:
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected Feature Gaussians as the only input, got {len(args.scenes)} inputs")
     args.refuse_options(FEATURE_OPTIONS, path)
-    from gsmerge.compaction.outputs import plan_outputs
+    from gsmerge.compaction.outputs import name_outputs
     from gsmerge.settings.stages import DecodeOptions
     from gsmerge.states.files import decode_file, decoding_line
 
     decoding, writing = args.make(DecodeOptions, FileOptions, columns="needed")
-    outputs = plan_outputs(out, writing, overwrite=args.overwrite)
+    outputs = name_outputs(out, writing, overwrite=args.overwrite)
     check_outputs(outputs.paths, (path,), overwrite=args.overwrite or args.dry_run)
     before = {"import": perf_counter() - args.start}
     document = decode_file(path, outputs, decoding, dry_run=args.dry_run, seconds_before=before)
@@ -255,12 +255,14 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
         say(problem, kind="warning", quiet=quiet)
 
 
-def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, outputs: Outputs, hints: ReadHints) -> None:
+def print_estimate(
+    args: opt.Args, files: SceneFiles, settings: CompactOptions, outputs: Outputs, hints: ReadHints
+) -> None:
     """Print an estimate of the result that ``compact`` would make."""
-    from gsmerge.compaction.estimate import plan_files, plan_lines
+    from gsmerge.compaction.estimate import dry_run_lines, estimate_files
     from gsmerge.compaction.files import read_input
 
     load = read_input(files, opacity=args.opacity, hints=hints)
     with opt.usage_errors():
-        document = plan_files(load, settings, outputs)
-    print_document(document, plan_lines(document), as_json=args.json)
+        document = estimate_files(load, settings, outputs)
+    print_document(document, dry_run_lines(document), as_json=args.json)

@@ -46,9 +46,9 @@ def convert(args: opt.Args) -> None:
     writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
     images = None if photos.images is None else opt.named_or_none(photos.images)
     named = [path for path in (args.cameras, images) if isinstance(path, Path)]
-    from gsmerge.compaction.outputs import plan_outputs
+    from gsmerge.compaction.outputs import name_outputs
 
-    outputs = plan_outputs(output_file(output, inputs[0].name), writing, overwrite=args.overwrite)
+    outputs = name_outputs(output_file(output, inputs[0].name), writing, overwrite=args.overwrite)
     check_outputs(outputs.paths, (*inputs, *named), overwrite=args.overwrite)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.io.formats.table import estimate_counts

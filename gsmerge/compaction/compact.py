@@ -10,15 +10,14 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from os import PathLike
 from typing import Any
-from weakref import ReferenceType, ref
+from weakref import ref
 
 import numpy as np
 
 from gsmerge.compaction.candidate import Candidate, make_candidate
 from gsmerge.compaction.costs import measure_costs
-from gsmerge.compaction.file_size import Rebuild, meet_bytes
+from gsmerge.compaction.file_size import meet_bytes
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import try_new_views
 from gsmerge.compaction.result import CompactResult, make_result
@@ -85,29 +84,30 @@ def compact(
         >>> len(result.gaussians)
         400
     """
-    result = compact_scene(scene, (options or CompactOptions()).with_settings(settings), progress)
+    options = (options or CompactOptions()).with_settings(settings)
+    with use_threads(options.threads), record_run(progress):
+        result = compact_scene(as_scene(scene), options)
+    if not isinstance(scene, Scene):
+        result = replace(result, scene=scene)
     for text in filter(None, [*result.report.doubts, result.report.unmet]):
         warnings.warn(text, DoubtWarning, stacklevel=3)  # the caller: above this function and its decorator
     return result
 
 
-def compact_scene(scene: Scene | StrPath, options: CompactOptions, progress: Progress | None = None) -> CompactResult:
-    """Replace a scene by a compact one as :func:`compact` does, but without Python warnings.
+def compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
+    """Replace a scene by a compact one as :func:`compact` does, within a run that the caller records.
 
-    The report has the doubts.
+    Nothing is checked, and doubts are in the report instead of Python warnings.
     """
-    with use_threads(options.threads), record_run(progress):
-        # a weak reference, so that the result does not keep the scene in memory
-        source: StrPath | ReferenceType[Scene] = scene if isinstance(scene, str | PathLike) else ref(scene)
-        scene = as_scene(scene)
-        if options.clean.crop is not None:
-            scene = crop_scene(scene.numpy(), options.clean.crop)
-        result = _compact_once(scene, options)
-        if result.report.is_far and options.scene_decides:
-            result = _compact_simpler(scene, options, result)
-        if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
-            result = result.to_single()
-        return replace(result, scene=source, names=scene.names)
+    source = ref(scene)  # a weak reference, so that the result does not keep the scene in memory
+    if options.clean.crop is not None:
+        scene = crop_scene(scene.numpy(), options.clean.crop)
+    result = _compact_once(scene, options)
+    if result.report.is_far and options.scene_decides:
+        result = _compact_simpler(scene, options, result)
+    if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
+        result = result.to_single()
+    return replace(result, scene=source, names=scene.names)
 
 
 def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult) -> CompactResult:
@@ -146,50 +146,43 @@ def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
             return compact_in_blocks(scene, options, choose_for_scene(size, options), blocks, covisibility)
     method = choose_method(options, scene)  # our own, or that of another package
     prepared = method.prepare(scene.numpy(), options.prepare)  # adds the frame, corrected photos and poses
-    return compact_prepared(prepared, method, options).to(scene.gaussians.device)
+    return compact_in_one_piece(prepared, method, options).to(scene.gaussians.device)
 
 
-def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
+def compact_in_one_piece(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
     """Compact a prepared scene with a method, in one piece.
 
     A search finds the number of Gaussians, unless the options state it, and builds the result. Then its coarser levels
     are built, a trial measures what new views gain, and the input is scored for the report.
     """
     plan = add_target(make_plan(prepared, options), prepared)  # from here on, the plan replaces the options
-
-    def rebuild(count: int | None) -> Candidate:
-        """Build a count from all views after the search, and add its seconds to those of the run."""
-        candidate = build_scored(method.build, prepared, plan, count)
-        add_seconds(candidate.record.seconds)
-        return candidate
-
     costs = measure_costs(prepared, plan)
     expect_parts(costs.all_parts(plan.limits, plan.limits.default))
     search = search_count(prepared, plan, method.build)
-    best = run_search(search, method.build, rebuild, prepared)
-    best = meet_bytes(best, rebuild, prepared, plan)
+    best = run_search(search, method.build, prepared)
+    best = meet_bytes(best, partial(build_again, method.build, prepared, plan), prepared, plan)
     num_best = len(best.gaussians)
     coarser_counts = level_counts(num_best, plan.levels, plan.limits.min_count)
     expect_parts(costs.end_parts(num_best, coarser_counts))
     # coarser levels keep the cameras that the result has
     level_start = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
-    levels = [build_scored(method.build, *level_start, count) for count in coarser_counts]
+    levels = [build_candidate(method.build, *level_start, count) for count in coarser_counts]
     trial = try_new_views(prepared, plan, method.build, num_best)
     begin_part()  # the last part, which scores the input
     return make_result(best, levels, prepared, plan, search.facts(best), trial)
 
 
-def run_search(search: CountSearch, build: Build, rebuild: Rebuild, prepared: Prepared) -> Candidate:
+def run_search(search: CountSearch, build: Build, prepared: Prepared) -> Candidate:
     """Run a search for the number of Gaussians; return its best candidate, built from all views and cleaned up."""
     plan = search.plan
     if search.left_out is not None:  # its candidates lack views, so the best count is built again
         search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)))
-        return rebuild(search.count)
+        return build_again(build, prepared, plan, search.count)
     if plan.keeps_fidelity and plan.clean.asked:  # what clean-up leaves out would count as errors in the search
         uncleaned = replace(plan, clean=CleanOptions())
-        search.run(partial(build_scored, build, prepared, uncleaned))
+        search.run(partial(build_candidate, build, prepared, uncleaned))
         return clean_best(search.best, prepared, plan)
-    search.run(partial(build_scored, build, prepared, plan))
+    search.run(partial(build_candidate, build, prepared, plan))
     return search.best
 
 
@@ -202,16 +195,22 @@ def find_count(scene: Scene, options: CompactOptions) -> int:
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
         plan = add_target(make_plan(prepared, options), prepared)
-        rebuild = partial(build_scored, method.build, prepared, plan)
-        best = run_search(search_count(prepared, plan, method.build), method.build, rebuild, prepared)
+        best = run_search(search_count(prepared, plan, method.build), method.build, prepared)
     return len(best.gaussians)
 
 
 @record_part()
-def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
+def build_candidate(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
     begin_part()
     return make_candidate(count, build_cleaned(build, prepared, plan, count), prepared, plan)
+
+
+def build_again(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
+    """Build a candidate after the search, and add its seconds to those of the run."""
+    candidate = build_candidate(build, prepared, plan, count)
+    add_seconds(candidate.record.seconds)
+    return candidate
 
 
 @record_part()

@@ -128,7 +128,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
+def estimate_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Return the document of ``--dry-run``: what :func:`gsmerge.compaction.files.compact_files` would make."""
     scene, out, settings = load.scene, outputs.result, with_output_name(settings, outputs)
     notes = [*load.notes, *views_notes(scene)]
@@ -151,8 +151,8 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     }
 
 
-def plan_lines(document: Mapping[str, Any]) -> list[str]:
-    """Describe the document of :func:`plan_files` in lines of text."""
+def dry_run_lines(document: Mapping[str, Any]) -> list[str]:
+    """Describe the document of :func:`estimate_files` in lines of text."""
     scene, out = document["input"], document["output"]["path"]
     number, size = scene["num_views"], f"{scene['width']} x {scene['height']}"
     inside = find_format(out).levels == "inside"

@@ -19,7 +19,7 @@ BUILD_SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems 
 MOST_MEASURED = 8  # most files that are measured to choose how many Gaussians are dropped
 MAX_REBUILDS = 2  # most builds after the first one
 
-Rebuild = Callable[[int | None], Candidate]  # build a count of Gaussians from all views, clean up and score them
+BuildCandidate = Callable[[int | None], Candidate]  # build a count of Gaussians from all views, clean up and score them
 
 
 def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: Sequence[str] = ()) -> int:
@@ -35,7 +35,7 @@ def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: S
     return len(file.encode(gaussians, comments))
 
 
-def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan: Plan) -> Candidate:
+def meet_bytes(candidate: Candidate, build_again: BuildCandidate, prepared: Prepared, plan: Plan) -> Candidate:
     """Make the file of a candidate nearly as large as a budget in bytes allows.
 
     The candidate is rebuilt with other counts until its file is about that large. Then the faintest Gaussians are
@@ -63,7 +63,7 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
         is_small_enough = next_count >= (1 - most_dropped) * count
         return None if (is_large_enough and is_small_enough) or len(built) > MAX_REBUILDS else next_count
 
-    candidate = build_in_turn(rebuild, candidate, choose_next)[-1]
+    candidate = build_in_turn(build_again, candidate, choose_next)[-1]
     gaussians = drop_to_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names, base_bytes)
     return candidate if len(gaussians) == len(candidate.gaussians) else rescore(candidate, gaussians, prepared, plan)
 

@@ -21,7 +21,8 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.io.scene_files import SceneFiles, result_cameras, scene_title
 from gsmerge.measure.documents import file_sha256
 from gsmerge.runtime.memory import release_memory
-from gsmerge.runtime.record import Progress
+from gsmerge.runtime.record import Progress, record_run
+from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.content_hash import doubt_changed, list_changed, read_stats
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.read import Loaded, load_files
@@ -62,7 +63,8 @@ def compact_files(
         if cameras_path is not None and cameras_path.exists() and not outputs.overwrite:  # fail before the long work
             refuse_to_replace_cameras(cameras_path, load.scene.cameras[views], names, moved=True)
         read_at = perf_counter()
-        result = compact_scene(load.scene, settings, progress)
+        with use_threads(settings.threads), record_run(progress):
+            result = compact_scene(load.scene, settings)
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that remains after merging"
             raise SceneError(files.ply, problem, "check its scales and opacities")

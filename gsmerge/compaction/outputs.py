@@ -46,7 +46,7 @@ class Outputs:
         return [self.result] if beside is None else [self.result, beside]
 
 
-def plan_outputs(result: Path, options: FileOptions | None = None, *, overwrite: bool = False) -> Outputs:
+def name_outputs(result: Path, options: FileOptions | None = None, *, overwrite: bool = False) -> Outputs:
     """Return the paths of the files of an output. Cameras get a file of their own if the format cannot hold them.
 
     Raises UsageError if the name has no ending that can be written, or if the options do not fit the format.

@@ -12,7 +12,7 @@ from weakref import ReferenceType
 from gsmerge.compaction.candidate import Candidate, rescore, with_moved_views
 from gsmerge.compaction.distance import describe_clear_loss, is_clearly_worse
 from gsmerge.compaction.new_views import SPREAD, TRIAL_PIXELS, NewViews, Trial
-from gsmerge.compaction.outputs import plan_outputs, write_outputs
+from gsmerge.compaction.outputs import name_outputs, write_outputs
 from gsmerge.compaction.report import CompactReport, compared_psnr
 from gsmerge.compaction.scores import PartScores, measure_parts, score_input
 from gsmerge.compaction.search import SearchFacts
@@ -90,7 +90,7 @@ class CompactResult:
             'small.sog'
         """
         cameras, levels = self.cameras.numpy(), [level.gaussians.numpy() for level in (self, *self.coarser)]
-        outputs = plan_outputs(Path(path), overwrite=overwrite)
+        outputs = name_outputs(Path(path), overwrite=overwrite)
         names, comments = self.names or number_views(len(cameras)), result_comments(self.report.new_views)
         write_outputs(outputs, Contents(levels, comments, cameras, names, outputs.result.stem))
         return outputs.result

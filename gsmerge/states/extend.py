@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.cameras import check_cameras
-from gsmerge.compaction.compact import compact_prepared
+from gsmerge.compaction.compact import compact_in_one_piece
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
 from gsmerge.errors import SceneError
@@ -87,7 +87,7 @@ def extend(
             world = compare_worlds(before.gaussians, batch_views, prepared.input_scene.gaussians.means)
             refuse_other_world(world, extend_options)
             parts = [before.gaussians]
-        result = compact_prepared(prepared, method, options)
+        result = compact_in_one_piece(prepared, method, options)
     # A note that the result is worse than its input is for final results
     notes = [text for text in result.report.notes if text != result.report.worse]
     notes += [NOT_COMPARED] if before is not None and world == UNKNOWN_WORLD else []

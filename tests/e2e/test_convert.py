@@ -17,7 +17,7 @@ from sweeps import sweep
 
 import gsmerge
 from gsmerge.compaction.convert import ConvertOptions, convert_files, join_gaussians
-from gsmerge.compaction.outputs import plan_outputs
+from gsmerge.compaction.outputs import name_outputs
 from gsmerge.compaction.placement import find_placement, rotation_between
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry.transforms import covariances
@@ -61,7 +61,7 @@ def test_every_format_is_written_with_the_cameras(
     result: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
-    document = convert_files(ConvertOptions([result], plan_outputs(tmp_path / "new" / name)))
+    document = convert_files(ConvertOptions([result], name_outputs(tmp_path / "new" / name)))
     written = read(tmp_path / "new" / name)
     assert document["output"]["num_gaussians"] == len(written) == 400
     files = [path for path in (tmp_path / "new").rglob("*") if path.is_file()]
@@ -71,7 +71,7 @@ def test_every_format_is_written_with_the_cameras(
     )
     assert [str(path) for path in beside] == [document["viewer_cameras"]]
     assert gsmerge.read_cameras(beside[0]).names == gsmerge.read_cameras(tmp_path / "in.cameras.json").names
-    again = convert_files(ConvertOptions([tmp_path / "new" / name], plan_outputs(tmp_path / "again.ply")))
+    again = convert_files(ConvertOptions([tmp_path / "new" / name], name_outputs(tmp_path / "again.ply")))
     assert again["output"]["num_gaussians"] == 400
 
 
@@ -80,7 +80,7 @@ def test_streamed_levels_have_a_quarter_of_the_gaussians_each(
 ) -> None:
     run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
     out = tmp_path / "new" / "lod-meta.json"
-    convert_files(ConvertOptions([result], plan_outputs(out)))
+    convert_files(ConvertOptions([result], name_outputs(out)))
     assert read_index(out).counts == [400, 100, 25]
     whole, coarse = read(out), read_level(out, 1).gaussians
     assert (np.ptp(coarse.means, axis=0) > 0.7 * np.ptp(whole.means, axis=0)).all()
@@ -98,7 +98,7 @@ def test_a_moved_scene_looks_the_same_from_its_moved_cameras(
     result: Path, tmp_path: Path, options: PlacementOptions
 ) -> None:
     """The harmonics turn with the Gaussians."""
-    convert_files(ConvertOptions([result], plan_outputs(tmp_path / "out.ply"), placement=options))
+    convert_files(ConvertOptions([result], name_outputs(tmp_path / "out.ply"), placement=options))
     cameras = [gsmerge.to_cameras(gsmerge.read_cameras(tmp_path / f"{name}.cameras.json")) for name in ("in", "out")]
     before, after = (
         gsmerge.render(read(tmp_path / name), cams).images
@@ -136,7 +136,7 @@ def test_turns_are_the_smallest(tmp_path: Path) -> None:
 def test_several_files_are_joined(result: Path, tmp_path: Path) -> None:
     flat = replace(read(result), shN=np.zeros((400, 0, 3), np.float32))
     gsmerge.write_ply(tmp_path / "flat.ply", flat)
-    document = convert_files(ConvertOptions([result, tmp_path / "flat.ply"], plan_outputs(tmp_path / "both.ply")))
+    document = convert_files(ConvertOptions([result, tmp_path / "flat.ply"], name_outputs(tmp_path / "both.ply")))
     both = read(tmp_path / "both.ply")
     assert [entry["num_gaussians"] for entry in document["inputs"]] == [400, 400]
     assert (len(both), both.sh_degree) == (800, 3)
@@ -155,7 +155,7 @@ def test_columns_of_the_users_own_stay_with_their_rows(result: Path, tmp_path: P
     rows["x"][3] = np.nan
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "own.ply"))
     crop = "sphere:" + ",".join(f"{np.nanmedian(rows[name]):.6f}" for name in "xyz") + ",2"
-    cut = ConvertOptions([tmp_path / "own.ply"], plan_outputs(tmp_path / "cut.ply"), clean=CleanOptions(crop=crop))
+    cut = ConvertOptions([tmp_path / "own.ply"], name_outputs(tmp_path / "cut.ply"), clean=CleanOptions(crop=crop))
     document = convert_files(replace(cut, placement=PlacementOptions(scale=2.0)))
     written = PlyData.read(str(tmp_path / "cut.ply"))["vertex"].data
     assert 0 < len(written) < len(rows) - 1
@@ -166,13 +166,13 @@ def test_columns_of_the_users_own_stay_with_their_rows(result: Path, tmp_path: P
     assert noted(document["notes"], "not moved: vx")
 
     both = convert_files(
-        ConvertOptions([tmp_path / "own.ply", tmp_path / "cut.ply"], plan_outputs(tmp_path / "both.ply"))
+        ConvertOptions([tmp_path / "own.ply", tmp_path / "cut.ply"], name_outputs(tmp_path / "both.ply"))
     )
     joined = PlyData.read(str(tmp_path / "both.ply"))["vertex"].data
     np.testing.assert_array_equal(joined["label"][len(rows) - 1 :], written["label"])
     assert not noted(both["notes"], "left out")
     for inputs, out in (([tmp_path / "own.ply", result], "less.ply"), ([tmp_path / "own.ply"], "own.spz")):
-        lost = convert_files(ConvertOptions(inputs, plan_outputs(tmp_path / out)))
+        lost = convert_files(ConvertOptions(inputs, name_outputs(tmp_path / out)))
         assert noted(lost["notes"], "left out", "label, confidence, vx")
 
 
@@ -181,25 +181,25 @@ def test_parts_are_kept_or_left_out(result: Path, tmp_path: Path) -> None:
     low, high = np.percentile(whole.means, (25, 75), axis=0)
     box = "box:" + ",".join(f"{value:.6f}" for value in (*low, *high))
     inside = ((whole.means >= low) & (whole.means <= high)).all(1).sum()
-    document = convert_files(ConvertOptions([result], plan_outputs(tmp_path / "a.ply"), clean=CleanOptions(crop=box)))
+    document = convert_files(ConvertOptions([result], name_outputs(tmp_path / "a.ply"), clean=CleanOptions(crop=box)))
     assert document["dropped"] == {"cropped": 400 - len(read(tmp_path / "a.ply"))}
     assert abs(len(read(tmp_path / "a.ply")) - inside) <= 2
     turned = convert_files(
-        ConvertOptions([result], plan_outputs(tmp_path / "b.ply"), clean=CleanOptions(crop=f"{box},0,0,180"))
+        ConvertOptions([result], name_outputs(tmp_path / "b.ply"), clean=CleanOptions(crop=f"{box},0,0,180"))
     )
     assert turned["output"]["num_gaussians"] == document["output"]["num_gaussians"]
     faint = replace(whole, opacities=np.where(np.arange(400) < 30, np.float32(0.002), whole.opacities))
     gsmerge.write_ply(tmp_path / "faint.ply", faint)
     clean = CleanOptions(drop="transparent,floaters")
-    document = convert_files(ConvertOptions([tmp_path / "faint.ply"], plan_outputs(tmp_path / "c.ply"), clean=clean))
+    document = convert_files(ConvertOptions([tmp_path / "faint.ply"], name_outputs(tmp_path / "c.ply"), clean=clean))
     assert document["dropped"]["transparent"] >= 30
     assert sum(document["dropped"].values()) == 400 - len(read(tmp_path / "c.ply"))
     with refuses(SceneError, "in.ply", "400", "inspect"):
         convert_files(
-            ConvertOptions([result], plan_outputs(tmp_path / "d.ply"), clean=CleanOptions(crop="sphere:99,99,99,0.1"))
+            ConvertOptions([result], name_outputs(tmp_path / "d.ply"), clean=CleanOptions(crop="sphere:99,99,99,0.1"))
         )
     with refuses(UsageError, "--drop sky", "images"):
-        convert_files(ConvertOptions([result], plan_outputs(tmp_path / "d.ply"), clean=CleanOptions(drop="sky")))
+        convert_files(ConvertOptions([result], name_outputs(tmp_path / "d.ply"), clean=CleanOptions(drop="sky")))
     assert not (tmp_path / "d.ply").exists()
 
 
@@ -210,21 +210,21 @@ def test_what_no_view_shows_is_left_out(result: Path, tmp_path: Path) -> None:
     gsmerge.write_ply(tmp_path / "both.ply", gsmerge.Gaussians.concat([whole, behind]))
     cameras = viewer_cameras_path(result)
     document = convert_files(
-        ConvertOptions([tmp_path / "both.ply"], plan_outputs(tmp_path / "a.ply"), cameras=cameras, clean=clean)
+        ConvertOptions([tmp_path / "both.ply"], name_outputs(tmp_path / "a.ply"), cameras=cameras, clean=clean)
     )
     assert document["dropped"]["unseen"] >= 400
     assert noted(document["notes"], "in.cameras.json", "those of this scene")  # more than half
-    bare = convert_files(ConvertOptions([result], plan_outputs(tmp_path / "b.ply"), cameras="none", clean=clean))
+    bare = convert_files(ConvertOptions([result], name_outputs(tmp_path / "b.ply"), cameras="none", clean=clean))
     assert bare["output"]["num_gaussians"] == 400 - bare["dropped"]["unseen"] > 200
     assert any("placed" in note for note in bare["notes"])
-    again = convert_files(ConvertOptions([result], plan_outputs(tmp_path / "a.ply", overwrite=True), cameras="none"))
+    again = convert_files(ConvertOptions([result], name_outputs(tmp_path / "a.ply", overwrite=True), cameras="none"))
     assert noted(again["notes"], "a.cameras.json", "of an earlier file")
 
 
 def test_scales_and_shapes_stay_exact(result: Path, tmp_path: Path) -> None:
     convert_files(
         ConvertOptions(
-            [result], plan_outputs(tmp_path / "out.ply"), placement=PlacementOptions(scale=2, rotate="0,0,90")
+            [result], name_outputs(tmp_path / "out.ply"), placement=PlacementOptions(scale=2, rotate="0,0,90")
         )
     )
     before, after = read(result), read(tmp_path / "out.ply")

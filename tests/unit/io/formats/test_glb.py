@@ -14,7 +14,7 @@ import scenes
 from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
-from gsmerge.compaction.outputs import plan_outputs, write_outputs
+from gsmerge.compaction.outputs import name_outputs, write_outputs
 from gsmerge.errors import list_doubts
 from gsmerge.geometry.transforms import multiply_quats, project, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
@@ -70,7 +70,7 @@ def save_glb(
 
 def write_scene(path: Path, scene: Scene, *, overwrite: bool = False) -> None:
     """Write Gaussians and cameras of a scene as a result."""
-    outputs = plan_outputs(path, overwrite=overwrite)
+    outputs = name_outputs(path, overwrite=overwrite)
     write_outputs(outputs, Contents([scene.gaussians], cameras=scene.cameras, names=scene.names))
 
 

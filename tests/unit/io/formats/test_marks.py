@@ -10,7 +10,7 @@ import pytest
 from slow_readers import corners
 
 from gsmerge.compaction.convert import ConvertOptions, convert_files
-from gsmerge.compaction.outputs import plan_outputs
+from gsmerge.compaction.outputs import name_outputs
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians, write_ply
 from gsmerge.settings.placement import PlacementOptions
 
@@ -64,13 +64,13 @@ def test_gaussians_of_two_scales_are_marked_as_flat(tmp_path: Path) -> None:
 
 def test_marks_that_not_all_files_have_are_left_out_of_a_join(tmp_path: Path) -> None:
     inputs = [write_marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z"), write_marked(tmp_path / "b.ply")]
-    document = convert_files(ConvertOptions(inputs, plan_outputs(tmp_path / "both.ply")))
+    document = convert_files(ConvertOptions(inputs, name_outputs(tmp_path / "both.ply")))
     assert [note for note in document["notes"] if note.startswith("not all files have the mark")] == [
         "not all files have the mark 'SplatRenderMode: mip', so the joined file has not",
         "not all files have the mark 'Vertical axis: z', so the joined file has not",
     ]
     assert read_marks(tmp_path / "both.ply") == []
-    convert_files(ConvertOptions([inputs[0], inputs[0]], plan_outputs(tmp_path / "same.ply")))
+    convert_files(ConvertOptions([inputs[0], inputs[0]], name_outputs(tmp_path / "same.ply")))
     assert read_marks(tmp_path / "same.ply") == ["SplatRenderMode: mip", "Vertical axis: z"]
 
 
@@ -83,22 +83,22 @@ def test_marks_that_not_all_files_have_are_left_out_of_a_join(tmp_path: Path) ->
 )  # fmt: skip
 def test_marks_that_a_format_cannot_store_are_noted(ending: str, lost: list[str], tmp_path: Path) -> None:
     path = write_marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z")
-    notes = convert_files(ConvertOptions([path], plan_outputs(tmp_path / f"b{ending}")))["notes"]
+    notes = convert_files(ConvertOptions([path], name_outputs(tmp_path / f"b{ending}")))["notes"]
     assert [note for note in notes if "mark" in note] == [f"{ending} cannot store the mark {mark!r}" for mark in lost]
 
 
 def test_the_marked_vertical_axis_of_a_file_is_turned_upward(tmp_path: Path) -> None:
     path = write_marked(tmp_path / "a.ply", "Vertical axis: z")
-    convert_files(ConvertOptions([path], plan_outputs(tmp_path / "y.ply"), placement=PlacementOptions(up="y")))
+    convert_files(ConvertOptions([path], name_outputs(tmp_path / "y.ply"), placement=PlacementOptions(up="y")))
     before, after = (read_gaussians(file).gaussians.means for file in (path, tmp_path / "y.ply"))
     assert abs(after[:, 1] - before[:, 2]).max() < 1e-5
-    convert_files(ConvertOptions([path], plan_outputs(tmp_path / "z.ply"), placement=PlacementOptions(up="z")))
+    convert_files(ConvertOptions([path], name_outputs(tmp_path / "z.ply"), placement=PlacementOptions(up="z")))
     assert abs(read_gaussians(tmp_path / "z.ply").gaussians.means - before).max() < 1e-5
 
 
 def test_a_turned_file_has_no_axis_of_the_former_frame(tmp_path: Path) -> None:
     path = write_marked(tmp_path / "a.ply", "Vertical axis: z")
     convert_files(
-        ConvertOptions([path], plan_outputs(tmp_path / "turned.ply"), placement=PlacementOptions(rotate="90,0,0"))
+        ConvertOptions([path], name_outputs(tmp_path / "turned.ply"), placement=PlacementOptions(rotate="90,0,0"))
     )
     assert read_marks(tmp_path / "turned.ply") == []

@@ -13,7 +13,7 @@ from messages import noted, refuses
 
 from gsmerge import Gaussians, read_gaussians, write_gaussians
 from gsmerge.compaction.convert import ConvertOptions, convert_files
-from gsmerge.compaction.outputs import Outputs, frame_notes, plan_outputs
+from gsmerge.compaction.outputs import Outputs, frame_notes, name_outputs
 from gsmerge.errors import SceneError
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.io.formats.tileset import globe_matrix, most_bytes
@@ -68,7 +68,7 @@ def test_a_place_on_the_globe_is_the_transform_of_a_tileset(room: Gaussians, tmp
     unplaced = json.loads(convert(room, tmp_path / "b").read_text())["root"]["transform"]
     np.testing.assert_array_equal(unplaced, np.diag([-1, -1, 1, 1]).reshape(-1))
     again = convert_files(
-        ConvertOptions([tmp_path / "web" / "tileset.json"], plan_outputs(tmp_path / "copy" / "tileset.json"))
+        ConvertOptions([tmp_path / "web" / "tileset.json"], name_outputs(tmp_path / "copy" / "tileset.json"))
     )
     assert noted(again["notes"], "place", "kept")
 
