@@ -53,7 +53,7 @@ def test_rooms_are_the_folders_and_modules_of_the_package() -> None:
     assert len(listed) == len(inside)
 
 
-def test_the_drawing_has_rooms_alone() -> None:
+def test_drawing_names_rooms_alone() -> None:
     """In its left column; small rooms may be left out."""
     drawing = ARCHITECTURE.read_text("utf-8").partition("A room may import")[2].partition("One run, from top")[0]
     lines = [line for line in drawing.splitlines() if line.startswith("    ")]
@@ -68,13 +68,13 @@ def arrows() -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
 
 
-def test_arrows_are_those_of_the_first_line() -> None:
+def test_table_of_arrows_follows_the_line_from_files_to_ply() -> None:
     first = re.search(r"^    files -> scene -> (.+) -> ply$", ARCHITECTURE.read_text("utf-8"), re.MULTILINE)
     assert first is not None
     assert [row[0] for row in arrows()] == first[1].split(" -> ")
 
 
-def test_functions_of_arrows_are_in_their_files() -> None:
+def test_functions_in_the_table_of_arrows_are_in_the_files_beside_them() -> None:
     for _, functions, files in arrows():
         modules = [import_module("gsmerge." + name.replace("/", ".")) for name in re.findall(r"`([\w/]+)`", files)]
         names = re.findall(r"`(\w+)`", functions)
@@ -84,7 +84,7 @@ def test_functions_of_arrows_are_in_their_files() -> None:
             assert any(hasattr(owner, name) for owner in owners), name
 
 
-def test_each_file_of_cameras_says_what_it_serves() -> None:
+def test_table_of_cameras_has_each_file_of_that_folder() -> None:
     cells = "".join(line.split("|")[1] for line in section("Cameras").splitlines() if line.startswith("| `"))
     files = [path for path in (PACKAGE / "cameras").iterdir() if not path.name.startswith("_")]
     names = {path.stem if path.is_file() else f"{path.name}/" for path in files}
@@ -111,7 +111,7 @@ def is_there(name: str) -> bool:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_paths_lead_to_files(page: Path) -> None:
+def test_paths_on_a_page_lead_to_files(page: Path) -> None:
     folders = set.union(*top())
     paths = [span for span in code_spans(page) if re.fullmatch(r"[\w.-]+(/[\w.-]+)+/?", span)]
     own = [path for path in paths if path.split("/")[0] in folders and path.rstrip("/") not in MADE | FOREIGN]
@@ -128,7 +128,7 @@ def words_of_sources() -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_names_are_in_the_code(page: Path) -> None:
+def test_names_on_a_page_are_names_of_the_code(page: Path) -> None:
     """Names with an underscore or a capital inside, which are those of definitions, settings and keys."""
     spans = [re.sub(r"^--(hint|set) ", "", span) for span in code_spans(page)]
     names = {name for span in spans for name in re.findall(r"\b(?:[A-Za-z]+_\w+|[A-Z][a-z]+[A-Z]\w+)\b", span)}

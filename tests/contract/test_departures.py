@@ -112,17 +112,17 @@ CHECKS: dict[str, Callable[[], None]] = {
 }  # fmt: skip
 
 
-def test_the_table_has_a_row_for_every_departure() -> None:
+def test_table_has_a_row_for_every_departure() -> None:
     assert [row[0] for row in rows()] == list(CHECKS)
     assert all(len(row) == 5 and all(row) for row in rows())
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_every_departure_is_as_the_table_says(name: str) -> None:
+def test_recipe_departs_from_the_paper_as_the_table_says(name: str) -> None:
     CHECKS[name]()
 
 
-def test_all_else_is_the_paper_s() -> None:
+def test_recipe_has_the_paper_s_values_besides_the_departures() -> None:
     """The recipe's settings, and those of its networks."""
     assert RECIPES["paper"] == {
         "superpixels": "5.3%", "segmentation": "bass-st", "match": "aabb", "fit": "none", "min_contribution": 0.0,

@@ -99,7 +99,9 @@ def test_the_source_archive_can_be_built_again(built: Path) -> None:
     assert {"setup.py", "pyproject.toml", "README.md", "LICENSE"} <= names
 
 
-def test_metadata(built: Path, root: Path, project: dict[str, Any]) -> None:
+def test_metadata_of_the_wheel_name_version_types_and_requirements(
+    built: Path, root: Path, project: dict[str, Any]
+) -> None:
     (wheel,) = (built / "dist").glob("*.whl")
     with zipfile.ZipFile(wheel) as file:
         metadata: Message = email.message_from_bytes(

@@ -23,7 +23,7 @@ def sources():
     return re.sub(r"\s+", " ", re.sub(r"\brestrict ", "", text))
 
 
-def test_declarations_are_those_of_the_sources():
+def test_declarations_match_the_functions_of_the_c_sources():
     text = sources()
     missing = {name: prototype for name, prototype in prototypes().items() if f"API {prototype} {{" not in text}
     assert not missing

@@ -48,7 +48,7 @@ def run(site: Path, *commands: list[str]) -> tuple[list[int], str, str]:
 
 
 @pytest.mark.slow
-def test_the_example_works(site: Path, small_scene: Path, tmp_path: Path) -> None:
+def test_example_of_the_page_adds_its_method_and_command(site: Path, small_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     compact = ["compact", str(small_scene), "--set", "method=nth", "--budget", "200", "-o", str(out), "-q"]
     codes, printed, errors = run(site, compact, ["count", str(out)], ["--help"])
@@ -59,7 +59,7 @@ def test_the_example_works(site: Path, small_scene: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_broken_package_stops_no_other(site: Path, small_scene: Path) -> None:
+def test_broken_plugin_stops_no_other(site: Path, small_scene: Path) -> None:
     (site / "gsmerge_nth.py").write_text("import no_such_module\n")
     dry = ["compact", str(small_scene), "--set", "method=nth", "--dry-run"]
     codes, printed, errors = run(site, ["--help"], dry)
