@@ -57,7 +57,7 @@ def test_views_are_spread_and_held_out_ones_midway() -> None:
 
 
 @pytest.mark.slow
-def test_a_capture_is_read_by_its_export(capture: Path, tmp_path: Path) -> None:
+def test_capture_is_exported_with_its_depths_and_context_views(capture: Path, tmp_path: Path) -> None:
     document = json.loads((capture / "transforms.json").read_text())
     roles = [frame["role"] for frame in document["frames"]]
     assert roles == ["context", "target", "context", "target", "context"]
@@ -81,7 +81,7 @@ def test_a_capture_is_read_by_its_export(capture: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("style", ["da3", "depthsplat", "anysplat"])
-def test_every_style_is_read(style: str, capture: Path, tmp_path: Path) -> None:
+def test_export_in_every_style_is_read_as_a_scene(style: str, capture: Path, tmp_path: Path) -> None:
     loaded = load_scene(script("captures").write_export(capture, tmp_path / style, style))
     assert len(loaded.scene.cameras) == 3
     assert loaded.scene.has_own_pixels == (style != "anysplat")

@@ -71,7 +71,7 @@ def test_full_fit_beats_the_merge_alone(
     floor(full - none)
 
 
-def test_plain_merging_without_photos(
+def test_plain_merging_reaches_the_floor(
     compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:
     result, actual = compacted(superpixels=256, fit="none")
@@ -79,7 +79,7 @@ def test_plain_merging_without_photos(
     floor(actual)
 
 
-def test_photos_help(
+def test_gain_over_the_input_reaches_the_floor(
     compacted: Callable[..., tuple[CompactResult, float]], made_scene: Path, floor: Callable[..., None]
 ) -> None:
     floor(compacted(superpixels=256)[1] - target_psnr(made_scene / "targets", made_scene / "scene.ply"))

@@ -25,12 +25,12 @@ def generated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_scenes_are_made_and_counted(generated: Path) -> None:
+def test_generate_prints_the_number_of_scenes_that_it_writes(generated: Path) -> None:
     assert (generated.parent / "said.txt").read_text() == f"{generated}: 1 scene\n"
     assert [path.name for path in generated.iterdir()] == ["scene_0000"]
 
 
-def test_other_commands_read_the_scenes(generated: Path, tmp_path: Path, run: Run) -> None:
+def test_other_commands_read_generated_scenes(generated: Path, tmp_path: Path, run: Run) -> None:
     made = Path(shutil.copytree(generated, tmp_path / "made"))
     actual = json.loads(run("inspect", made / "scene_0000", "--json").out)
     assert (actual["exporter"], actual["num_views"], actual["num_missing"], actual["notes"]) == ("gsmerge", 3, 0, [])

@@ -49,7 +49,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_sound_files(sound: Path, run: Run) -> None:
+def test_inspect_calls_sound_files_ok(sound: Path, run: Run) -> None:
     before = listing(sound)
     done = run("inspect", *(sound / name for name in (*FORMATS, *OTHERS)), code=0)
     assert [line.split(": ")[0] for line in done.out.splitlines()] == [
@@ -61,7 +61,7 @@ def test_sound_files(sound: Path, run: Run) -> None:
     assert listing(sound) == before
 
 
-def test_a_document_of_all(sound: Path, run: Run, tmp_path: Path) -> None:
+def test_json_of_inspect_describes_sound_and_missing_files(sound: Path, run: Run, tmp_path: Path) -> None:
     done = run("inspect", sound / "scene.ply", tmp_path / "none.spz", "--json")
     assert done.code == 3
     document = json.loads(done.out)
@@ -110,7 +110,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_files(case: str, sound: Path, tmp_path: Path, run: Run) -> None:
+def test_inspect_names_the_cause_of_a_wrong_file(case: str, sound: Path, tmp_path: Path, run: Run) -> None:
     name, spoil, place, *found = WRONG[case]
     path = Path(shutil.copy(sound / name, tmp_path))
     spoil(path)
@@ -137,7 +137,7 @@ def test_a_scene_that_shows_nothing_is_refused(
     run("compact", scene, "-o", tmp_path / "out.ply", "-q", code=code)
 
 
-def test_what_no_view_shows_is_counted_in_results_alone(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_gaussians_that_no_view_shows_are_counted_in_results_alone(small_scene: Path, tmp_path: Path, run: Run) -> None:
     """Rows of pixels hide each other where views overlap: their cameras show them all the same."""
     out = tmp_path / "compact.ply"
     run("compact", small_scene, "-o", out, "--fit", "none", code=0)

@@ -40,7 +40,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_name_is_no_program(
+def test_page_runs_no_program_in_a_name(
     name: str, smallest_scene: Path, result: Path, tmp_path: Path, run: Run, tab: Browser
 ) -> None:
     """Of a folder, its file, its photos and a result."""

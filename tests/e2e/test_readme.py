@@ -35,7 +35,7 @@ def find_block(root: Path, words: str, page: str = "README.md") -> str:
     return block
 
 
-def test_one_minute_and_then_python(root: Path, project: Path) -> None:
+def test_demo_of_the_readme_makes_the_scene_of_the_python_guide(root: Path, project: Path) -> None:
     run(find_block(root, "tasks.py demo"), project)
     assert (project / "demo" / "preview.png").exists()
     guide = (root / "docs" / "guide" / "python.md").read_text()
@@ -44,7 +44,7 @@ def test_one_minute_and_then_python(root: Path, project: Path) -> None:
     assert (project / "demo" / "small.ply").exists()
 
 
-def test_install_and_then_every_command(root: Path, project: Path, tmp_path: Path) -> None:
+def test_every_command_of_the_readme_runs_after_its_install(root: Path, project: Path, tmp_path: Path) -> None:
     """In the folder that the project is cloned into, where ``gsmerge`` is not the package."""
     run(f'"{sys.executable}" -m venv venv', tmp_path)
     path = f"{tmp_path / 'venv' / 'bin'}:{os.environ['PATH']}"

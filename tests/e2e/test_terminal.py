@@ -72,7 +72,7 @@ def in_terminal(
     return code, output
 
 
-def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
+def test_compact_ends_with_a_table_of_its_result(small_copy: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
     sizes = ("--set", "superpixels=200", "--set", "fit_steps=20")
     code, output = in_terminal("-m", "gsmerge", "compact", small_copy, "-o", out, *sizes)
@@ -92,7 +92,7 @@ def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["", "dumb", "unknown", "xterm"])
 @pytest.mark.parametrize("words", ["--help", "compact --help", "lab --help", "compact", "inspect {scene}"])
-def test_a_narrow_terminal_of_any_kind(kind: str, words: str, small_scene: Path) -> None:
+def test_lines_fit_a_narrow_terminal_of_any_kind(kind: str, words: str, small_scene: Path) -> None:
     """Nothing is wider than it, and one without a known name gets no escape sequences."""
     given = words.format(scene=small_scene).split()
     code, output = in_terminal("-m", "gsmerge", *given, kind=kind, columns=40)
@@ -124,7 +124,7 @@ def test_lines_are_wrapped_between_words() -> None:
 
 
 @pytest.mark.slow
-def test_a_compact_scene_is_known_again(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_inspect_recognises_a_compact_scene(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out, words = tmp_path / "small.ply", ("--fit", "none", "--set", "superpixels=200")
     assert "already" not in run("compact", small_scene, "-o", out, *words).err
     views = ("--cameras", small_scene / "transforms.json", "--images", small_scene / "images")

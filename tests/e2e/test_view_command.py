@@ -17,7 +17,7 @@ def sources(page: Path) -> list[tuple[str, str | None]]:
     return [(one["name"], one["splats"]) for one in data["sources"]]
 
 
-def test_a_page_is_replaced_and_nothing_else(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_view_replaces_its_own_page_alone(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     page = tmp_path / "page.html"
     call = ("view", smallest_scene, "--no-open", "-o", page)
     run(*call, code=0)

@@ -106,7 +106,7 @@ def picture(tab: Browser) -> np.ndarray:
 @pytest.mark.parametrize(
     "views", [slice(1), pytest.param(slice(1, None), marks=pytest.mark.slow)], ids=["the first view", "all other views"]
 )
-def test_3d_is_what_we_render_at_every_input_view(views: slice, page: tuple[Browser, Any]) -> None:
+def test_3d_shows_every_input_view_as_render_does(views: slice, page: tuple[Browser, Any]) -> None:
     """The browser draws without a GPU."""
     tab, (scene, small, _) = refreshed(page)
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo')")
@@ -126,7 +126,7 @@ def test_3d_is_what_we_render_at_every_input_view(views: slice, page: tuple[Brow
 
 
 @pytest.mark.slow
-def test_a_gaussian_reaches_in_from_outside(page: tuple[Browser, Any]) -> None:
+def test_gaussian_reaches_into_the_picture_from_outside(page: tuple[Browser, Any]) -> None:
     tab, (scene, small, wide) = refreshed(page)
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); set('solid', '1'); set('other', false)")
     name = scene.names[0].rpartition("/")[2].removesuffix(".png")
@@ -166,7 +166,7 @@ def test_step_back_shows_the_side_without_photos(page: tuple[Browser, Any]) -> N
     assert tab.run("view().outside") is False
 
 
-def test_what_cannot_be_seen_from_here_gives_way(page: tuple[Browser, Any]) -> None:
+def test_side_in_stills_alone_gives_way_once_the_camera_moves(page: tuple[Browser, Any]) -> None:
     """Without a GPU a large scene is in stills alone: once the camera has moved, both sides show the result."""
     tab, _ = refreshed(page)
     tab.run("set('mode', 'swipe'); set('solid', '1'); jump(0)")
@@ -184,7 +184,7 @@ def test_what_cannot_be_seen_from_here_gives_way(page: tuple[Browser, Any]) -> N
     assert tab.run("[state.atCamera, id('back').hidden, solid.camera.matrix.equals(solid.poses[0])]") == [True] * 3
 
 
-def test_another_result_brings_its_figures(page: tuple[Browser, Any]) -> None:
+def test_choosing_a_result_changes_picture_and_figures(page: tuple[Browser, Any]) -> None:
     """By the slider, from the smallest, or the table: picture, figures and 3D."""
     tab, _ = refreshed(page)
     assert tab.run("data.sizes") == [2, 3]  # one Gaussian more
@@ -209,7 +209,7 @@ def test_another_result_brings_its_figures(page: tuple[Browser, Any]) -> None:
     assert counts[0] in tab.run("id('figures').textContent")  # of the one on the right
 
 
-def test_the_speed_of_this_device_is_in_the_headline(page: tuple[Browser, Any]) -> None:
+def test_headline_has_the_speed_of_this_device(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run("[solid.frameTime, solid.software] = [source => source === 1 ? 18 : 2, false]; measureSpeed()")
     assert tab.run("id('speed').textContent").replace("\u00a0", " ") == ", about 9 \u00d7 faster to draw"
@@ -222,7 +222,7 @@ def test_the_speed_of_this_device_is_in_the_headline(page: tuple[Browser, Any]) 
     tab.run("solid.software = true")
 
 
-def test_swipe_shows_each_on_its_side(page: tuple[Browser, Any]) -> None:
+def test_swipe_shows_each_scene_on_its_side(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run(f"{BARE} jump(0); set('solid', ''); set('other', false); set('mode', 'blink'); set('pixels', 'photo')")
     left = picture(tab)
@@ -248,7 +248,7 @@ def test_a_difference_of_a_scene_with_itself_is_black(page: tuple[Browser, Any])
         tab.run("set('left', state.right - 1)")
 
 
-def test_keys(page: tuple[Browser, Any]) -> None:
+def test_keys_move_the_swipe_and_choose_view_mode_and_3d(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run("jump(0); set('solid', ''); set('mode', 'swipe'); swipeTo(0.5)")
     for key in ("ArrowLeft", "ArrowDown", "2", "v"):
@@ -257,7 +257,7 @@ def test_keys(page: tuple[Browser, Any]) -> None:
     assert tab.run("[...id('strip').children].filter(one => one.ariaCurrent === 'true').length") == 1
 
 
-def test_grey_controls_say_why(page: tuple[Browser, Any]) -> None:
+def test_disabled_controls_say_why(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run("jump(data.views.findIndex(view => view.outside)); set('solid', '')")
     grey = "[...document.querySelectorAll('button:disabled, input:disabled')].filter(one => one.checkVisibility())"
@@ -271,7 +271,7 @@ def test_grey_controls_say_why(page: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_full_screen(page: tuple[Browser, Any]) -> None:
+def test_full_screen_shows_the_whole_picture(page: tuple[Browser, Any]) -> None:
     """Where the buttons take two lines as well."""
     tab, _ = refreshed(page)
     for width in (1280, 520):
@@ -356,7 +356,7 @@ def test_a_phone(page: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_the_colours_follow_the_system_and_the_switch(page: tuple[Browser, Any]) -> None:
+def test_colours_follow_the_system_unless_the_switch_is_set(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     grounds = []
     for system, scheme in (("dark", ""), ("light", ""), ("light", "dark"), ("dark", "light")):
@@ -428,7 +428,7 @@ def test_fingers_zoom_stills(page: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_moving_framing_and_turning_about_a_point(page: tuple[Browser, Any]) -> None:
+def test_keys_and_clicks_move_frame_and_turn_the_camera(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run("delete solid.request; set('mode', 'blink'); choose(2); set('left', 2); set('solid', '1')")
     tab.wait(SETTLED)
