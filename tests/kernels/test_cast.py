@@ -173,7 +173,7 @@ def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type:
     assert (lit > 0).any()
 
 
-def test_no_shapes_and_no_points() -> None:
+def test_kernels_take_no_pixels_and_no_points() -> None:
     shapes = pack_shapes([random_shape(BOX, np.random.default_rng(0))])
     assert run(shapes, 0, 0, 1.0)[0].shape == (0, 0)
     empty = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32), np.empty((0, 3, 3)), np.zeros(3), 1.0

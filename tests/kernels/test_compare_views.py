@@ -92,7 +92,7 @@ def test_pairs_are_those_of_the_formula_bit_for_bit(seed: int) -> None:
         assert (flow == 0) == (a == 3)  # too few pixels
 
 
-def test_a_view_that_is_not_there_and_too_little_room_are_refused() -> None:
+def test_missing_view_or_too_little_room_is_refused() -> None:
     views = Views(0)
     with pytest.raises(ValueError, match="compare_views"):
         views.compare(np.array([[0, 1], [1, VIEWS]]))

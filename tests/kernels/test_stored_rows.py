@@ -56,7 +56,7 @@ def test_rows_from_an_odd_one_on_are_taken_by_columns(name: str, value: float, r
 
 
 @pytest.mark.parametrize("size", [0, 1e-20, 1e-16, 1e-14])
-def test_rotations_of_zero_and_tiny_ones(size: float) -> None:
+def test_rows_of_zero_or_tiny_rotations_are_taken_by_columns(size: float) -> None:
     rows = make_rows(0)
     for name in arrays.QUATS:
         rows[name][70] *= np.float32(size)

@@ -55,7 +55,7 @@ def cut(gaussians: Gaussians, normals: np.ndarray, offsets: np.ndarray, *spans: 
 
 
 @pytest.mark.parametrize(("count", "views", "seed"), [(300, 1, 0), (300, 5, 1), (200, 12, 2), (0, 3, 3), (1, 2, 4)])
-def test_same_as_formulas(count: int, views: int, seed: int) -> None:
+def test_cut_gaussians_match_the_truncated_normal_distribution(count: int, views: int, seed: int) -> None:
     gaussians, planes = random_gaussians(count, seed, size=-2.0), make_planes(views, seed)
     means, covars, is_cut = cut(gaussians, *planes)
     whole = covariances(gaussians.quats.astype(np.float64), gaussians.scales.astype(np.float64))
@@ -68,7 +68,7 @@ def test_same_as_formulas(count: int, views: int, seed: int) -> None:
     assert count < 200 or 0.1 < is_cut.mean() < 0.9
 
 
-def test_pieces_are_as_the_whole() -> None:
+def test_gaussians_cut_in_pieces_are_those_cut_at_once() -> None:
     gaussians, planes = random_gaussians(100, 5), make_planes(3, 5)
     for whole, pieces in zip(
         cut(gaussians, *planes), cut(gaussians, *planes, (0, 33), (33, 33), (33, 100)), strict=True
@@ -106,7 +106,7 @@ def cut_once(mean: np.ndarray, covar: np.ndarray, normal: np.ndarray, offset: fl
     return mean - across / sigma * hazard, covar - np.outer(across, across) * hazard * (hazard + room) / sigma**2
 
 
-def test_inside_and_far_outside_stay() -> None:
+def test_gaussians_inside_or_far_outside_stay_uncut() -> None:
     normals, offsets = make_planes(1, 8)
     offsets = np.zeros_like(offsets)
     gaussians = random_gaussians(2, 8)

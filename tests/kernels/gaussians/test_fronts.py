@@ -60,7 +60,7 @@ def weigh(gaussians: Gaussians, view: int) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("view", [0, 1, 2])
-def test_weights_pixels_and_fronts(case: tuple[int, int, float, float], view: int) -> None:
+def test_weights_pixels_and_fronts_match_a_loop(case: tuple[int, int, float, float], view: int) -> None:
     n, seed, opacity, size = case
     gaussians = random_gaussians(n, seed, opacity=opacity, size=size)
     ids, pixels, weights, fronts = weigh(gaussians, view)
@@ -72,7 +72,7 @@ def test_weights_pixels_and_fronts(case: tuple[int, int, float, float], view: in
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_best_of_all_views(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pixel_is_in_the_view_of_largest_weight(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pixels_module, "choose_level", lambda *_: 0)  # cells of one pixel
     gaussians = random_gaussians(300, seed, size=-2.5)
     pixels = find_pixels(Scene(gaussians, CAMERAS, None, None, tuple("abc"))).homes
@@ -96,7 +96,7 @@ def test_of_equal_views_the_first_and_of_equal_depths_the_first_row() -> None:
     assert fronts.reshape(-1)[pixels].tolist() == [0, 0]
 
 
-def test_what_is_behind_the_camera_has_no_pixel() -> None:
+def test_gaussian_behind_the_camera_has_no_pixel() -> None:
     gaussians = random_gaussians(50, 0)
     behind = replace(gaussians, means=-np.abs(gaussians.means))
     ids, _, _, fronts = weigh(behind, 0)

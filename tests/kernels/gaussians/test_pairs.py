@@ -77,7 +77,7 @@ def run(cloud: dict[str, np.ndarray], order: np.ndarray, starts: np.ndarray, lea
     return pairs, costs
 
 
-def test_the_cheapest_pair_is_merged_again_and_again() -> None:
+def test_cheapest_pair_is_merged_until_the_wanted_share_is_left() -> None:
     cloud, order = cloud_of(33), np.random.default_rng(1).permutation(33)
     starts = np.array([0, 12, 13, 13, 33])
     pairs, costs = run(cloud, order, starts, 0.25)
@@ -125,7 +125,7 @@ def test_merged_rows_have_the_moments_of_all() -> None:
     assert np.array_equal(sh[3], before[3])
 
 
-def test_what_points_outside_is_refused() -> None:
+def test_ranges_and_pairs_outside_are_refused() -> None:
     cloud, order = cloud_of(CELL + 1), np.arange(CELL + 1)
     with refuses(ValueError, "agglomerate", "indices"):
         run(cloud, order, np.array([0, CELL + 1]), 0.5)  # more than a cell holds
@@ -141,7 +141,7 @@ def test_what_points_outside_is_refused() -> None:
         merge_pairs(np.array([[0, -1]], np.int32), *moments, sh, sizes)
 
 
-def test_numbers_that_are_none_end_a_cell() -> None:
+def test_cell_with_infinite_costs_ends() -> None:
     cloud = cloud_of(8)
     cloud["means"][3] = 1e300
     pairs, costs = run(cloud, np.arange(8), np.array([0, 8]), 0.1)

@@ -39,7 +39,7 @@ CASES = [(300, 0, 0.5, -3.5, 90), (80, 1, 0.5, -1.0, 200), (400, 2, 3.0, -2.5, 4
 
 
 @sweep("case", CASES, often=2)
-def test_dominant_labels(case: tuple[int, int, float, float, int]) -> None:
+def test_owner_is_the_superpixel_of_the_largest_sum_of_weights(case: tuple[int, int, float, float, int]) -> None:
     n, seed, opacity, size, count = case
     gaussians, labels = random_gaussians(n, seed, opacity=opacity, size=size), some_labels(count)
     tiled = tile_view(make_splats(gaussians), np.eye(4), K, WIDTH, HEIGHT)
@@ -54,7 +54,7 @@ def test_dominant_labels(case: tuple[int, int, float, float, int]) -> None:
     assert (actual[seen] == sums[seen].argmax(1)).mean() > 0.98
 
 
-def test_pairs_beyond_the_first_room() -> None:
+def test_owners_are_right_where_pairs_outgrow_their_arrays() -> None:
     """Every pixel its own superpixel, and Gaussians over the whole picture: pairs outgrow their arrays."""
     gaussians = random_gaussians(400, 7, opacity=3.0, size=0.3)
     gaussians = replace(gaussians, opacities=0.01 + 0.03 * gaussians.opacities)
@@ -81,7 +81,7 @@ def test_equal_sums_go_to_the_smaller_label() -> None:
 
 
 @sweep("seed", [0, 1])
-def test_the_best_of_all_views(seed: int) -> None:
+def test_owner_is_in_the_view_of_the_largest_sum(seed: int) -> None:
     gaussians = random_gaussians(150, seed, size=-2.5)
     viewmats = np.stack([np.eye(4)] * 3)
     viewmats[1, 0, 3], viewmats[2, 2, 3] = 0.7, 1.0
@@ -96,7 +96,7 @@ def test_the_best_of_all_views(seed: int) -> None:
     assert len(seen) > 100
 
 
-def test_of_equal_views_the_first() -> None:
+def test_owner_is_in_the_first_of_equal_views() -> None:
     gaussians = random_gaussians(100, 3, size=-3.5)
     cameras = Cameras(np.stack([np.eye(4)] * 4), np.stack([K] * 4), WIDTH, HEIGHT)
     labels = np.stack([some_labels(30)] * 4)

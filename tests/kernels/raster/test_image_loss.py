@@ -92,7 +92,7 @@ def test_error_is_the_weighted_square(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
-def test_no_gradient_at_the_photo(ssim_lambda: float) -> None:
+def test_gradient_is_zero_where_the_image_is_the_photo(ssim_lambda: float) -> None:
     _, photo, weight = pictures((16, 16))
     assert np.abs(image_gradient(photo, photo, weight, ssim_lambda, 1.2)[0]).max() < 1e-5
 

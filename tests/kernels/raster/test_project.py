@@ -29,7 +29,7 @@ def slow_footprints(gaussians: Gaussians, viewmat: np.ndarray, K: np.ndarray, *s
     return tuple(t.numpy() for t in footprints(*columns, torch.from_numpy(viewmat), torch.from_numpy(K), *size))
 
 
-def test_footprints() -> None:
+def test_footprints_match_the_slow_renderer() -> None:
     """Position, precision and rows of what a tiled view holds; a row is listed if a pixel column could reach 1/255."""
     n, width, height = 300, 60, 40
     gaussians = random_gaussians(n, 0, spread=0.6, depth=3, sizes=1.0)

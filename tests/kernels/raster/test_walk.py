@@ -37,7 +37,7 @@ def conics_of(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["near", "far", "huge"])
 @sweep("seed", range(20), often=4)
-def test_rows_and_columns_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
+def test_rows_and_columns_of_a_gaussian_are_those_where_it_shows(kind: str, seed: int) -> None:
     """None that shows is left out, and at most one beside them is kept."""
     conics = conics_of(kind, np.random.default_rng(seed))
     parts = parts_of(conics)

@@ -11,7 +11,7 @@ from regions_of_noise import COMPACTNESS, features, squared_error, total_error
 from gsmerge.kernels.superpixels import kd
 
 
-def test_integral_image(pixels: np.ndarray) -> None:
+def test_integral_image_sums_the_pixels_above_and_left(pixels: np.ndarray) -> None:
     expected = np.zeros((18, 24, 3))
     expected[1:, 1:] = pixels.astype(np.float64).cumsum(0).cumsum(1)
     assert kd.integral_image(pixels) == pytest.approx(expected.reshape(-1, 3))
@@ -68,7 +68,7 @@ def greedy_rectangles(pixels: np.ndarray, count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 20, 200, 391])
-def test_rectangles_are_nearly_the_greedy_ones(pixels: np.ndarray, count: int) -> None:
+def test_rectangles_have_nearly_the_error_of_greedy_cuts(pixels: np.ndarray, count: int) -> None:
     padded, num_regions = kd.split_rectangles(pixels, count, 32, COMPACTNESS)
     actual = padded[1:-1, 1:-1]
     assert num_regions == count == len(np.unique(actual))

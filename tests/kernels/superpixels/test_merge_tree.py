@@ -92,7 +92,7 @@ def merge_reference(view: View, max_extent: float) -> tuple[list[int], list[floa
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_sums_of_the_leaves(seed: int) -> None:
+def test_sums_of_leaves_match_their_pixels(seed: int) -> None:
     view = View(seed)
     rows, colour_error = view.rows()
     masks = [view.labels == i for i in range(COUNT)]
@@ -103,7 +103,7 @@ def test_sums_of_the_leaves(seed: int) -> None:
 
 @pytest.mark.parametrize("max_extent", [1e9, 9.0])
 @sweep("seed", range(3))
-def test_order_of_merges(seed: int, max_extent: float) -> None:
+def test_merges_match_a_slow_twin(seed: int, max_extent: float) -> None:
     view = View(seed)
     parents, heights, growths = view.merges(max_extent)
     expected = merge_reference(view, max_extent)
@@ -131,6 +131,6 @@ def test_regions_without_pixels_cost_nothing() -> None:
         ([True] * 4, [0] * 5),
     ],
 )
-def test_cut_labels(keep: list[bool], expected: list[int]) -> None:
+def test_cut_of_a_tree_numbers_its_leaves_by_branch(keep: list[bool], expected: list[int]) -> None:
     parents = np.array([5, 5, 7, 6, 6, 7, 8, 8, -1], np.int32)  # ((0 1) 2) (3 4)
     assert kernels.cut_labels(parents, np.array(keep), 5).tolist() == expected

@@ -51,7 +51,9 @@ def greedy_merge(pixels: np.ndarray, labels: np.ndarray, count: int) -> np.ndarr
 
 
 @pytest.mark.parametrize("count", [1, 2, 8, 15, 29, 30])
-def test_merging_is_nearly_greedy(pixels: np.ndarray, labels: np.ndarray, count: int) -> None:
+def test_merged_regions_have_nearly_the_error_of_greedy_merges(
+    pixels: np.ndarray, labels: np.ndarray, count: int
+) -> None:
     merged = ward.merge_regions(pad_labels(labels), pixels, 30, count, SPREAD)[1:-1, 1:-1]
     assert len(np.unique(merged)) == merged.max() + 1 == count
     for k in range(30):
