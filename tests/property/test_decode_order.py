@@ -34,7 +34,7 @@ def random_group(rng: np.random.Generator, count: int) -> tuple[FeatureGaussians
 
 @FEW
 @given(seeds, st.integers(1, 60), st.sampled_from([2, 3, 4, 8]))
-def test_order_of_members(seed: int, count: int, k: int) -> None:
+def test_children_do_not_depend_on_the_order_of_members(seed: int, count: int, k: int) -> None:
     rng = np.random.default_rng(seed)
     feature, members = random_group(rng, count)
     shuffled = replace(feature, members=rng.permutation(count))

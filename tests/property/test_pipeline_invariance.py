@@ -18,14 +18,14 @@ ROOM = scenes.make_scene(scenes.room(), scenes.arc(4, 32, 24), noise=0.005)
 
 @FEW
 @given(st.permutations(range(4)), st.sampled_from([1, 2]))
-def test_order_of_views(order: list[int], k: int) -> None:
+def test_result_does_not_depend_on_the_order_of_views(order: list[int], k: int) -> None:
     one, other = scenes.plain(ROOM, k=k), scenes.plain(scenes.take_views(ROOM, order), k=k)
     scenes.assert_same_set(one, other, atol=1e-4)
 
 
 @FEW
 @given(st.integers(0, 1000), st.floats(-4, 4), st.sampled_from([{}, {"match": "none"}, {"k": 2}]))
-def test_similarity(seed: int, exponent: float, options: dict) -> None:
+def test_result_moves_with_a_similarity_of_the_scene(seed: int, exponent: float, options: dict) -> None:
     rng = np.random.default_rng(seed)
     factor = 10.0**exponent
     transform = scenes.random_rotation(seed), factor, factor * rng.uniform(-10, 10, 3)

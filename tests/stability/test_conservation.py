@@ -62,7 +62,7 @@ def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
 
 
 @sweep("settings", [{}, {"k": 4}, {"match": "none"}])
-def test_photos_keep_coverage_and_brightness(scene: Scene, settings: dict) -> None:
+def test_result_keeps_coverage_and_brightness(scene: Scene, settings: dict) -> None:
     """What is not merged across views loses 1.1 % over four seeds, the rest half of that."""
     before = coverage(scene.gaussians, scene)
     after = coverage(compacted(scene, superpixels="4.4%", **settings).gaussians, scene)
@@ -114,7 +114,7 @@ def test_faint_scenes_keep_their_coverage(clean: Scene, match: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_pass_neither_blurs_nor_darkens(scene: Scene) -> None:
+def test_second_pass_neither_blurs_nor_darkens(scene: Scene) -> None:
     once = compacted(scene, superpixels="4.4%").gaussians
     unaligned = Scene(once, scene.cameras, scene.images, None, scene.names)
     twice = compact(unaligned, budget=len(once)).gaussians

@@ -41,13 +41,13 @@ def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
 
 
 @sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}])
-def test_a_budget_of_everything(room: Scene, settings: dict[str, Any]) -> None:
+def test_budget_of_all_gaussians_keeps_the_input_s_quality(room: Scene, settings: dict[str, Any]) -> None:
     result = scenes.compacted(room, superpixels="auto", budget="100%", fill=True, match="none", **settings)
     assert len(result.gaussians) == room.num_gaussians
     assert scenes.psnr_of(result.gaussians, room) > scenes.psnr_of(room.gaussians, room) - 0.1
 
 
-def test_a_budget_of_every_unaligned_gaussian_changes_none(room: Scene) -> None:
+def test_budget_of_every_unaligned_gaussian_changes_none(room: Scene) -> None:
     result = compact(unaligned(room), budget="100%", **PLAIN)
     assert scenes.identical(result.gaussians, compact(unaligned(room), budget=room.num_gaussians, **PLAIN).gaussians)
     np.testing.assert_allclose(result.gaussians.means, room.gaussians.means, atol=1e-6)
@@ -66,7 +66,7 @@ def test_budgets_without_a_fit_are_met(room: Scene, budget: int, settings: dict[
 
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}])
-def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
+def test_scene_of_four_hundred_tiny_views_is_compacted(settings: dict[str, Any]) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(400, 8, 6))
     result = scenes.compacted(scene, **settings)
     assert 400 * 8 * 6 * 0.001 < len(result.gaussians) < 400 * 8 * 6 * 0.2
@@ -76,7 +76,7 @@ def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
 
 @sweep("size", LONG, ids=[f"{width} x {height}" for width, height in LONG])
 @sweep("settings", [PLAIN, {"fit_steps": 10}])
-def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
+def test_views_of_a_long_side_are_covered_to_their_ends(size: tuple[int, int], settings: dict[str, Any]) -> None:
     width, height = size
     cameras = scenes.arc(2, *size)
     if height > width:

@@ -106,7 +106,9 @@ CASES: dict[str, tuple[Change, float, tuple[str, ...]]] = {
 
 
 @sweep(("change", "loss", "note"), CASES.values(), ids=list(CASES), often=2)
-def test_photos_are_mended(room: Scene, usual: float, change: Change, loss: float, note: tuple[str, ...]) -> None:
+def test_changed_photos_are_mended_or_left_out(
+    room: Scene, usual: float, change: Change, loss: float, note: tuple[str, ...]
+) -> None:
     changed = replace(room, images=change(room.images))
     result = compact(changed, **FIT)
     assert noted(result.report.notes, *note)
@@ -115,7 +117,7 @@ def test_photos_are_mended(room: Scene, usual: float, change: Change, loss: floa
 
 
 @sweep("change", [half, linear], ids=["photos half as bright", "photos in linear light"])
-def test_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Change) -> None:
+def test_changed_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Change) -> None:
     unaligned = Scene(room.gaussians, room.cameras, room.images, None, room.names)
     right, mended = (compact(replace(unaligned, images=images), **FIT) for images in (room.images, change(room.images)))
     assert novel_psnr(mended.gaussians) > novel_psnr(right.gaussians) - 1
@@ -123,7 +125,7 @@ def test_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Chan
     assert "photos_changed" not in right.report.choices
 
 
-def test_sound_photos_stay_as_they_are(room: Scene, sound: CompactResult) -> None:
+def test_sound_photos_stay_unchanged(room: Scene, sound: CompactResult) -> None:
     prepared = prepare(room)
     assert prepared.scene.images is room.images
     assert prepared.scene.masks is None

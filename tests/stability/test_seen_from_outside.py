@@ -82,7 +82,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
-def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
+def test_default_fit_leaves_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
     """After the default fit; the floor is of the share of emptiness that is left, far from the outline."""
     scene = SCENES[name]()
     result = scenes.compacted(scene)
@@ -96,7 +96,7 @@ def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
 
 
 @sweep("settings", [{"effort": "draft"}, {"effort": "fast"}, {"k": 4}, {"budget": "20%"}])
-def test_every_effort_and_size(settings: dict[str, object]) -> None:
+def test_no_effort_or_size_leaves_fog_or_holes(settings: dict[str, object]) -> None:
     scene = room()
     result = scenes.compacted(scene, **settings)
     fog = measure_fog(scene.gaussians, {"result": result.gaussians}, scene.cameras)["result"]["all"]
