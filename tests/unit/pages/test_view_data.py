@@ -126,7 +126,7 @@ def test_a_page_opens_on_the_middle_view(actual: ViewData) -> None:
     assert replace(inputs, views=tuple(some)).start == 0  # the one with every figure
 
 
-def test_one_scene_alone(small: Scene) -> None:
+def test_scene_alone_is_scored_against_its_photos(small: Scene) -> None:
     alone = collect_page_data("room", small, {}, (300,))
     assert [side.name for side in alone.sides] == ["input"]
     assert alone.notes == ()
@@ -142,7 +142,7 @@ def test_the_worst_view_comes_first(actual: ViewData) -> None:
     assert values == sorted(values, key=lambda value: value or 0)
 
 
-def test_stills_are_our_renders(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
+def test_stills_are_what_render_draws(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
     for view in actual.views:
         split, i = (held_out, view.place - 3) if view.held_out else (scene, view.place)
         renders = [
@@ -153,7 +153,7 @@ def test_stills_are_our_renders(actual: ViewData, scene: Scene, half: Gaussians,
             assert psnr(decoded(still), picture) > 31  # 41 where pictures are not as small and colourful
 
 
-def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) -> None:
+def test_view_from_outside_is_drawn_without_photo_or_scores(actual: ViewData, scene: Scene, half: Gaussians) -> None:
     camera, distance = outside_camera(scene.cameras, scene.gaussians.means)
     for some, still in zip((scene.gaussians, half), actual.outside.stills, strict=False):
         assert psnr(decoded(still), render(some, camera, near=near_plane(scene)).images[0].clip(0, 1)) > 30
@@ -164,7 +164,7 @@ def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) 
     assert actual.outside not in actual.views
 
 
-def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: Scene) -> None:
+def test_cameras_and_gaussians_share_one_frame(actual: ViewData, half: Gaussians, scene: Scene) -> None:
     """What a view sees in the world it sees in the page's frame."""
     head, columns = unpacked(actual.sides[1].splats)
     drawn = half.means[half.opacities >= splats.LEAST_OPACITY]
@@ -284,7 +284,7 @@ def test_without_photos_results_are_compared_with_the_input(small: Scene) -> Non
         ((), []),
     ],
 )
-def test_short_names(names: tuple[str, ...], short: list[str]) -> None:
+def test_short_names_leave_out_folder_and_suffix_unless_they_collide(names: tuple[str, ...], short: list[str]) -> None:
     assert short_names(names) == short
 
 

@@ -47,7 +47,7 @@ def block(page: str, name: str) -> str:
     return found[1]
 
 
-def test_it_loads_nothing(page: str) -> None:
+def test_page_loads_nothing_from_outside(page: str) -> None:
     addresses = re.findall(r"""(?:src|href)=["']([^"']+)["']|url\(([^)]+)\)""", _written(page))
     assert len(addresses) >= 3
     assert all(one.startswith(("data:", '"${')) for pair in addresses for one in pair if one)
@@ -56,7 +56,7 @@ def test_it_loads_nothing(page: str) -> None:
     assert "default-src &#x27;none&#x27;" in page
 
 
-def test_its_own_scripts_and_styles_alone_may_run(page: str) -> None:
+def test_policy_lets_the_page_s_own_scripts_and_styles_run_alone(page: str) -> None:
     """The policy names them by their hashes, and nothing needs more: no attribute holds a style or a script."""
     check_policy(page)
 
@@ -66,7 +66,7 @@ def _written(page: str) -> str:
     return re.sub(r'(<script type="text/plain" id="[\w-]+">)[^<]*', r"\1", re.sub(r"base64,[\w+/=]+", "base64,", page))
 
 
-def test_names_are_escaped(page: str) -> None:
+def test_names_in_the_page_are_escaped(page: str) -> None:
     text = _written(page)
     assert "<b onload" not in text
     assert "<i>" not in text
@@ -74,7 +74,7 @@ def test_names_are_escaped(page: str) -> None:
     assert text.count("<script") == text.count("</script>")
 
 
-def test_what_the_script_reads(page: str, data: ViewData) -> None:
+def test_page_holds_the_data_that_its_script_reads(page: str, data: ViewData) -> None:
     read = json.loads(block(page, "data"))
     assert [source["name"] for source in read["sources"]] == ["photo", "input", EVIL]
     assert [view["name"] for view in read["views"]] == [view.name for view in data.shown]
@@ -103,7 +103,7 @@ def with_three_results(data: ViewData) -> ViewData:
     return replace(data, sides=(scene, half, tenth, replace(tenth, name="least", num_gaussians=10)))
 
 
-def test_a_table_over_all_results(data: ViewData) -> None:
+def test_page_has_a_table_of_all_results(data: ViewData) -> None:
     three = with_three_results(data)
     head, rows = results_table(three)
     assert head == ["", "File", "PSNR (dB)", "SSIM", "LPIPS", "Gaussians", "Share"]
@@ -118,7 +118,7 @@ def test_a_table_over_all_results(data: ViewData) -> None:
     assert page.count('<button class="link"') == 3
 
 
-def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
+def test_each_result_has_its_headline_and_figures(data: ViewData) -> None:
     page = page_of(replace(with_three_results(data), reference="renders of the input"))
     half, tenth, least = json.loads(block(page, "data"))["results"]
     assert half["figures"] == [["500", ""], ["2.0 kB", ""], ["25.00 dB", "up"], ["0.750", "up"]]
@@ -129,7 +129,7 @@ def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
     assert '<select id="result"' not in page
 
 
-def test_new_views_come_before_own_photos_which_never_count_as_better(data: ViewData) -> None:
+def test_gain_of_new_views_comes_before_scores_of_own_photos(data: ViewData) -> None:
     three = with_three_results(data)
     gains = (None, (2.0, 4.5), (-1.0, 1.5), None)
     sides = tuple(replace(side, new_gain=gain) for side, gain in zip(three.sides, gains, strict=True))
@@ -142,7 +142,7 @@ def test_new_views_come_before_own_photos_which_never_count_as_better(data: View
     assert "No photo was held out: scores are those of photos that fits have seen." in page
 
 
-def test_the_slider_is_over_sizes(data: ViewData) -> None:
+def test_slider_chooses_among_sizes(data: ViewData) -> None:
     """From the smallest to the largest; it begins at the first result, and one result has none."""
     page = page_of(with_three_results(data))
     read = json.loads(block(page, "data"))
@@ -163,7 +163,7 @@ def test_the_slider_is_over_sizes(data: ViewData) -> None:
         (0.03, 0.03, ""),
     ],
 )
-def test_how_much_faster_it_draws(before: float, after: float, words: str, data: ViewData) -> None:
+def test_headline_says_how_much_faster_a_result_draws(before: float, after: float, words: str, data: ViewData) -> None:
     timed = replace(
         data, sides=tuple(replace(side, seconds=one) for side, one in zip(data.sides, (before, after), strict=True))
     )
@@ -224,7 +224,7 @@ def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:
     assert len(page) < 200_000
 
 
-def test_without_photos(data: ViewData) -> None:
+def test_page_without_photos_offers_no_photo_to_compare(data: ViewData) -> None:
     page = page_of(replace(data, views=tuple(replace(view, photo=None) for view in data.views)))
     assert [source["name"] for source in json.loads(block(page, "data"))["sources"]] == ["input", EVIL]
     assert "overlay-share" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
@@ -257,11 +257,11 @@ def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> N
     assert page_of(alone).count('data-set="mode"') == 4
 
 
-def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
+def test_unpaired_surrogates_in_names_become_question_marks(data: ViewData) -> None:
     assert "odd?" in page_of(replace(data, title="odd\udcff"))
 
 
-def test_the_renderer_is_the_one_that_was_vendored() -> None:
+def test_page_has_the_vendored_renderer() -> None:
     """Who changes it runs tools/vendor_viewer.py, which writes down where it came from."""
     vendor = files("gsmerge.pages").joinpath("vendor")
     sources = json.loads(vendor.joinpath("SOURCES.json").read_text())

@@ -137,7 +137,7 @@ def test_grey_photos_are_those_without_hues(change: Change, is_grey: bool) -> No
     assert (vary_in_hue(photos[0].reshape(-1, 3), weights) < 0.01) == is_grey
 
 
-def test_hues_are_taken_and_brightness_stays() -> None:
+def test_change_that_keeps_brightness_takes_hues_alone() -> None:
     photos = shrunk(cut_views(1), 96) * np.float32(0.5) + np.float32(0.25)
     dark = grey(photos[0]) * np.float32(0.9)
     cover = np.full(dark.shape[:2], True)
@@ -148,7 +148,7 @@ def test_hues_are_taken_and_brightness_stays() -> None:
     np.testing.assert_array_equal(changed[:5], dark[:5])
 
 
-def test_red_and_blue_that_are_exchanged_are_told_from_other_maps() -> None:
+def test_exchanged_red_and_blue_are_told_from_other_maps() -> None:
     assert are_exchanged(pair(lambda photos: photos[..., ::-1], noise=0.02))
     for change in (mix, gamma, half_grey):
         assert not are_exchanged(pair(change, noise=0.02))

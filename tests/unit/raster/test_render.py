@@ -33,7 +33,7 @@ def value(image: np.ndarray, x: int, y: int) -> float:
     return float(image[0, y, x, 0])
 
 
-def test_one_gaussian_by_hand() -> None:
+def test_one_gaussian_has_the_values_computed_by_hand() -> None:
     # 0.02 wide, 1 away: 2 px; its centre is that of pixel (10, 5); dilation adds 0.3 px^2
     images = render(balls((0, 0, 1, 0.02, 0.8, 1.0)), camera()).images
     assert value(images, 10, 5) == pytest.approx(0.8, abs=1e-6)
@@ -41,7 +41,7 @@ def test_one_gaussian_by_hand() -> None:
     assert value(images, 10, 3) == pytest.approx(0.8 * math.exp(-0.5 * 4 / 4.3), abs=1e-6)
 
 
-def test_there_is_no_farthest_depth() -> None:
+def test_gaussians_at_any_depth_are_drawn() -> None:
     near, huge = (render(balls((0, 0, s, 0.02 * s, 0.8, 1.0)), camera(), near=0.01 * s) for s in (1, 4e13))
     np.testing.assert_allclose(huge.images, near.images, atol=1e-6)
     assert value(huge.images, 10, 5) > 0.7
@@ -79,7 +79,7 @@ def test_left_out_ones_and_other_opacities() -> None:
     assert contributions(fainter)[1].tolist() == pytest.approx([0.25, 0.375], abs=1e-5)
 
 
-def test_nothing_is_copied_that_need_not_be(torch: Any) -> None:
+def test_arrays_are_not_copied_before_drawing(torch: Any) -> None:
     gaussians = balls((0, 0, 1, 0.02, 0.8, 1.0), (1, 1, 0, 0.02, 0.8, 1.0))
     for given in (gaussians, gaussians.to("cpu")):
         splats = make_splats(given)
@@ -89,7 +89,7 @@ def test_nothing_is_copied_that_need_not_be(torch: Any) -> None:
 
 @pytest.mark.parametrize("with_depths", [False, True])
 @pytest.mark.parametrize("count", [0, 2])
-def test_arrays_give_arrays_and_tensors_tensors(with_depths: bool, count: int, torch: Any) -> None:
+def test_render_gives_tensors_where_an_input_is_one(with_depths: bool, count: int, torch: Any) -> None:
     """Of equal values, also where only the Gaussians or only the cameras are tensors."""
     gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0), (0.01, 0, 1.2, 0.03, 0.5, 0.2)), camera(count=2)[:count]
     options = {"antialiased": True, "near": 0.1, "far": 5.0, "with_depths": with_depths}
@@ -137,7 +137,7 @@ def test_every_view_has_its_own_image() -> None:
     assert np.abs(images[1] - images[0]).max() > 0.5
 
 
-def test_messages() -> None:
+def test_render_refuses_arguments_that_do_not_fit() -> None:
     gaussians, splats, K = (
         balls((0, 0, 1, 0.02, 0.8, 1.0)),
         make_splats(balls((0, 0, 1, 0.02, 0.8, 1.0))),

@@ -10,7 +10,7 @@ import pytest
 from gsmerge.runtime import memory
 
 
-def test_values_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_stay_when_pages_are_freed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "MAPPED_BYTES", 1)
     array = memory.make_array((300, 5), np.float32)
     array[:] = np.arange(1500).reshape(300, 5)
@@ -26,7 +26,7 @@ def test_private_pages_of_others_stay(tmp_path: Path) -> None:
     assert (array == 1).all()
 
 
-def test_rows_are_gathered_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_gathered_in_parts_are_those_of_indexing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "MAPPED_BYTES", 64)
     array = memory.make_array((5, 4, 3), np.float32)
     array[:] = np.arange(60).reshape(5, 4, 3)
@@ -43,7 +43,7 @@ def test_a_block_takes_less_memory_than_the_whole_and_harmonics_count_once() -> 
     assert 4 * 72 * 10**7 <= degree4 - plain <= 5 * 72 * 10**7
 
 
-def test_what_does_not_fit_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_is_named_with_what_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     for available, fits in ((None, True), (30 * 10**9, True), (24 * 10**9, False)):
         monkeypatch.setattr(memory, "machine_memory", lambda available=available: available)
         assert (memory.memory_problem(30 * 10**9) is None) == fits

@@ -125,7 +125,7 @@ def load(tmp_path: Path, kind: str, make: Callable[[Path], None]) -> Loaded:
         (below, "COLMAP/sparse/0", "COLMAP/images", ("COLMAP/sparse/0 (3 images)", "--cameras")),
     ],
 )
-def test_what_is_found(
+def test_cameras_and_photos_in_odd_places_are_found_with_a_note(
     tmp_path: Path, kind: str, make: Callable[[Path], None], cameras: str, images: str, said: tuple[str, ...]
 ) -> None:
     loaded = load(tmp_path, kind, make)
@@ -159,7 +159,7 @@ def test_cameras_below_that_no_photo_confirms_are_named(tmp_path: Path) -> None:
     assert noted(load_scene(tmp_path).notes, "several folders", f"--cameras {tmp_path}/COLMAP/sparse/0")
 
 
-def test_one_model_in_its_place_has_no_note(tmp_path: Path) -> None:
+def test_model_in_its_usual_place_gets_no_note(tmp_path: Path) -> None:
     def one(folder: Path) -> None:
         write_images(folder / "images", SMOOTH)
         write_colmap_binary(folder / "sparse/0", SMOOTH)

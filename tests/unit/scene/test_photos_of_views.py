@@ -75,7 +75,7 @@ def test_right_names_are_used_without_a_word(folder: Path, truth: np.ndarray) ->
 
 
 @pytest.mark.parametrize("tagged", [True, False])
-def test_photos_that_lie_on_their_side(folder: Path, truth: np.ndarray, tagged: bool) -> None:
+def test_photos_that_lie_on_their_side_are_turned(folder: Path, truth: np.ndarray, tagged: bool) -> None:
     """As a phone writes them, with a tag that says how to hold them, or without."""
     for path, quarters in zip(photos_in(folder), (3, 0, 1, 2), strict=True):
         exif = Image.Exif()
@@ -88,7 +88,7 @@ def test_photos_that_lie_on_their_side(folder: Path, truth: np.ndarray, tagged: 
     assert any("are turned" in text and "3 of 4 photos" in text for text in loaded.notes) is not tagged
 
 
-def test_photos_that_are_mirrored(folder: Path, truth: np.ndarray) -> None:
+def test_mirrored_photos_are_mirrored_back(folder: Path, truth: np.ndarray) -> None:
     for path in photos_in(folder):
         Image.fromarray(np.ascontiguousarray((read(path) * 255).round().astype(np.uint8)[:, ::-1])).save(path)
     loaded = load_scene(folder)
@@ -96,7 +96,7 @@ def test_photos_that_are_mirrored(folder: Path, truth: np.ndarray) -> None:
     assert any("or mirrored" in text and "4 of 4 photos" in text for text in loaded.notes)
 
 
-def test_tags_of_photos_that_are_upright(folder: Path, truth: np.ndarray) -> None:
+def test_wrong_tags_of_upright_photos_are_undone(folder: Path, truth: np.ndarray) -> None:
     """A program has turned the pixels, and kept the tag."""
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -152,7 +152,7 @@ def test_a_photo_whose_content_is_in_a_format_that_is_not_read(folder: Path, sta
 
 
 @pytest.mark.parametrize("sizes", ["apart", "of all"])
-def test_one_photo_of_another_shape(folder: Path, truth: np.ndarray, sizes: str) -> None:
+def test_photo_of_another_shape_is_left_out(folder: Path, truth: np.ndarray, sizes: str) -> None:
     """A portrait among landscapes: its view is left out with its Gaussians' pixels, and the others are used."""
     path, file = photos_in(folder)[3], folder / "transforms.json"
     picture = (read(path)[:, 42:150] * 255).astype(np.uint8)
@@ -215,7 +215,7 @@ def test_views_without_gaussians_are_not_there_where_cameras_are_estimated(
     assert right_ones(load_scene(folder), np.delete(truth, view, 0)) == [True] * 3
 
 
-def test_smaller_copies_alone(folder: Path, truth: np.ndarray) -> None:
+def test_smaller_copies_of_photos_are_used_where_they_are_alone(folder: Path, truth: np.ndarray) -> None:
     (folder / "images").rename(folder / "images_4")
     loaded = load_scene(folder)
     assert right_ones(loaded, truth) == [True] * VIEWS
@@ -232,7 +232,9 @@ def dangle(path: Path) -> None:
     [os.unlink, lambda path: path.write_bytes(b""), lambda path: path.write_bytes(path.read_bytes()[:20_000]), dangle],
     ids=["missing", "empty", "cut off", "a link to nothing"],
 )
-def test_one_photo_that_is_not_there(folder: Path, truth: np.ndarray, spoil: Callable[[Path], object]) -> None:
+def test_missing_or_damaged_photo_leaves_out_its_view_alone(
+    folder: Path, truth: np.ndarray, spoil: Callable[[Path], object]
+) -> None:
     path = photos_in(folder)[1]
     spoil(path)
     loaded = load_scene(folder)
@@ -242,7 +244,7 @@ def test_one_photo_that_is_not_there(folder: Path, truth: np.ndarray, spoil: Cal
     assert names(str(loaded.doubts), "photos of 1 of 4 views are left out", path.name)
 
 
-def test_names_that_were_given_to_other_photos(folder: Path, truth: np.ndarray) -> None:
+def test_photos_under_names_of_others_are_matched_by_content(folder: Path, truth: np.ndarray) -> None:
     """As where a film's frames were numbered anew."""
     paths = photos_in(folder)
     contents = [path.read_bytes() for path in paths]
@@ -253,7 +255,7 @@ def test_names_that_were_given_to_other_photos(folder: Path, truth: np.ndarray) 
     assert any("matched with views by their content" in text and ": photo " in text for text in loaded.notes)
 
 
-def test_numbers_of_which_names_say_nothing(folder: Path, truth: np.ndarray) -> None:
+def test_photos_of_other_numbers_are_matched_by_content(folder: Path, truth: np.ndarray) -> None:
     """Files 8 to 11, newest first, for cameras that name others."""
     for view, path in enumerate(photos_in(folder)):
         path.rename(path.with_name(f"{11 - view}.png"))

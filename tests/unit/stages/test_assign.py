@@ -39,7 +39,7 @@ def groups() -> Groups:
     return segment(make_room().images, SegmentOptions(), 40)
 
 
-def test_middle_pixels() -> None:
+def test_middle_pixel_of_a_superpixel_is_nearest_to_its_mean() -> None:
     labels = np.array([[0, 0, 0, 2], [0, 0, 0, 2], [0, 0, 0, 2]], np.int32)
     assert middle_pixels(labels, 4).tolist() == [5, 0, 7, 0]
 
@@ -139,7 +139,7 @@ def test_placed_cameras_see_most(room: Scene) -> None:
     assert (owners.values > 0).mean() > 0.8
 
 
-def test_nothing_seen_at_all(room: Scene) -> None:
+def test_scene_that_no_camera_sees_is_refused(room: Scene) -> None:
     scene = replace(unaligned_scenes.without_order(room), gaussians=unaligned_scenes.far_behind(room.gaussians, 500))
     with refuses(UsageError, "", "none of 3", 500):
         compact(scene)

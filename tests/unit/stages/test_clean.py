@@ -105,7 +105,7 @@ def test_curtains_are_floaters() -> None:
     assert not floaters(replace(given, scales=np.full_like(scales, 12))).any()  # all alike
 
 
-def test_the_faintest_go_first() -> None:
+def test_faintest_gaussians_are_dropped_first() -> None:
     given = wall(3)
     opacities = np.array([5, 1, 8, 2, 7, 3, 9, 4, 6], np.float32) / 10
     assert faintest_dropped(replace(given, opacities=opacities), 4).opacities.tolist() == pytest.approx(
@@ -123,7 +123,7 @@ def test_a_budget_is_met_after_the_crop(scene: Scene, share: float) -> None:
     assert sum("clean-up: " in note for note in result.report.notes) == 1
 
 
-def test_counts_fit_and_scores_are_of_the_inside(scene: Scene) -> None:
+def test_cropped_fit_shows_the_inside_better_than_cropping_afterwards(scene: Scene) -> None:
     """The same number of Gaussians shows the inside better than where all was fitted and then cut, over two seeds."""
     crop, fitted = sphere_in(scene, 0.5), QUICK | {"fit": "full", "fit_steps": 80}
     part = compact(scene, **fitted, crop=crop)
@@ -235,7 +235,7 @@ def test_what_no_view_shows_is_left_out(scene: Scene) -> None:
     assert len(clean(given[:0], options, None, None, lambda g: g)[0]) == 0
 
 
-def test_a_result_without_what_no_view_shows_has_its_count(scene: Scene) -> None:
+def test_result_without_unseen_gaussians_is_what_views_show(scene: Scene) -> None:
     result = compact(scene, budget=150, drop="unseen", **QUICK)
     assert (count_views(result.gaussians, scene.cameras) > 0).mean() > 0.9
     assert any("that no view shows" in note for note in result.report.notes)

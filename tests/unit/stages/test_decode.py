@@ -48,7 +48,7 @@ def assert_alike(a: Gaussians, b: Gaussians) -> None:
     np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-9)
 
 
-def test_one_child_is_the_feature(features: FeatureGaussians, members: Members) -> None:
+def test_single_child_is_the_feature(features: FeatureGaussians, members: Members) -> None:
     assert_alike(decode(features, members, DecodeOptions(k=1)), feature_to_gaussians(features))
 
 
@@ -95,7 +95,7 @@ def test_percentiles_out_of_range_are_refused(low: float, high: float) -> None:
         DecodeOptions(k="mixed", k_low=low, k_high=high)
 
 
-def test_single_members_stay_themselves(scene: Scene, members: Members) -> None:
+def test_groups_of_one_member_are_not_split(scene: Scene, members: Members) -> None:
     """Every pixel its own superpixel: K changes nothing."""
     labels = np.stack([np.arange(scene.pixels_per_view, dtype=np.int32).reshape(18, 24)] * 2)
     features = encode(scene, members, Groups(labels, (432, 432)))

@@ -30,7 +30,7 @@ def encoded(scene: Scene, groups: Groups, rule: str = "depth") -> FeatureGaussia
     return encode(scene, scene_members(scene), groups, rule=rule)
 
 
-def test_rows_of_the_groups(scene: Scene, groups: Groups) -> None:
+def test_member_rows_are_those_of_their_group_and_view(scene: Scene, groups: Groups) -> None:
     starts, ids, views = member_rows(scene, scene_members(scene), groups)
     assert np.diff(starts).tolist() == [16] * 12
     assert views.tolist() == [0] * 6 + [1] * 6
@@ -55,7 +55,7 @@ def test_invalid_pixels_are_left_out(scene: Scene, groups: Groups) -> None:
 
 
 @pytest.mark.parametrize("rule", ["depth", "paper"])
-def test_no_valid_pixel(scene: Scene, groups: Groups, rule: str) -> None:
+def test_scene_without_valid_pixels_has_no_features(scene: Scene, groups: Groups, rule: str) -> None:
     assert len(encoded(scenes.shown_in(scene, np.zeros_like(scene.pixels.shown)), groups, rule)) == 0
 
 
@@ -66,7 +66,7 @@ def test_views_may_have_different_counts(scene: Scene, groups: Groups) -> None:
     assert views.tolist() == [0] * 6 + [1]
 
 
-def test_sums_add_up(scene: Scene, groups: Groups) -> None:
+def test_features_keep_the_sums_of_weights_masses_and_extinctions(scene: Scene, groups: Groups) -> None:
     features = encoded(scene, groups)
     assert len(features) == 12
     assert float(features.weights.sum()) == pytest.approx(float(scene.gaussians.opacities.sum()), rel=1e-5)

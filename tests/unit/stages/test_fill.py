@@ -78,7 +78,7 @@ def test_only_what_is_enclosed_is_filled() -> None:
     assert not (new.means[:, 0] > 0.2).any()
 
 
-def test_between_is_a_line_from_one_to_another() -> None:
+def test_pixels_between_known_ones_of_a_row_or_column_lie_between() -> None:
     known = np.zeros((5, 7), bool)
     known[2, 1] = known[2, 4] = known[0, 6] = known[3, 6] = True
     expected = np.zeros((5, 7), bool)
@@ -102,7 +102,7 @@ def test_cameras_between_do_not_fill_the_same_twice() -> None:
 
 
 @pytest.mark.parametrize("most", [0, 7])
-def test_no_more_than_there_is_room_for(most: int) -> None:
+def test_no_more_gaussians_are_filled_in_than_there_is_room_for(most: int) -> None:
     assert len(fill_between(*slit(-0.6, 0.6), None, most)) == most
 
 
@@ -111,5 +111,5 @@ def test_what_each_view_shows_as_empty_stays_empty() -> None:
 
 
 @pytest.mark.parametrize("count", [1, MOST_FILLED_VIEWS + 1])
-def test_one_view_and_very_many_are_not_filled(count: int) -> None:
+def test_scenes_of_one_or_very_many_views_are_not_filled(count: int) -> None:
     assert len(fill(*slit(*np.linspace(-0.6, 0.6, count)))) == 0

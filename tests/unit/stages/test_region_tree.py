@@ -60,7 +60,7 @@ def slanted(num_views: int = 1) -> np.ndarray:
 # ---------------------------------------------------------------- merging regions
 
 
-def test_wall_is_cheap_and_texture_is_not() -> None:
+def test_noise_gets_nearly_all_regions_beside_a_plain_wall() -> None:
     """One view of a plain wall and one of noise: nearly all regions go to the noise."""
     images = np.concatenate([grey(), noise()])
     groups = cut_tree(tree_of(images, slanted(2), MAX_EXTENT=0.5), 200)
@@ -138,7 +138,7 @@ def test_strange_depths_do_no_harm() -> None:
     assert len(cut_tree(tree, 100)) == 100
 
 
-def test_front_depths() -> None:
+def test_front_depths_are_along_the_axis_of_the_camera() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 8, 6))
     depths = front_depths(scene)
     eyes = scene.cameras.centres.repeat(48, 0)
@@ -157,7 +157,7 @@ def test_front_depths() -> None:
         ("groups", Groups(np.ones((1, HEIGHT, WIDTH), np.int32), (1,)), ["1 superpixels", "view 0"]),
     ],
 )
-def test_arguments_that_do_not_fit(name: str, value: object, found: list[object]) -> None:
+def test_arguments_that_do_not_fit_are_refused(name: str, value: object, found: list[object]) -> None:
     good = {"images": grey(), "depths": slanted(), "groups": cut(grey(), 5), "valid": slanted() > 0}
     with refuses(ValueError, name, *found):
         region_tree(**good | {name: value})
@@ -171,7 +171,7 @@ def test_budget_below_the_number_of_views() -> None:
 # ---------------------------------------------------------------- the knee
 
 
-def test_knee_of_a_wall_and_of_a_texture() -> None:
+def test_knee_is_at_one_for_a_wall_and_far_up_for_a_texture() -> None:
     wall, texture = tree_of(grey(), slanted()), tree_of(noise(), slanted())
     assert knee(wall.counts, wall.distortions) == 1
     assert knee(texture.counts, texture.distortions) > 100
@@ -207,7 +207,7 @@ def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(floor: float, monke
     assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
 
 
-def test_knee_of_nothing() -> None:
+def test_knee_of_no_distortions_is_refused() -> None:
     with refuses(ValueError, "", "distortions", "(0,)"):
         knee(np.array([], int), np.array([]))
 
@@ -250,7 +250,7 @@ def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Mem
     assert counts.tolist() == [7 if group == 5 else 1 for group in range(24)]
 
 
-def test_a_first_step_that_only_pays_with_the_second() -> None:
+def test_gains_of_two_steps_are_averaged_where_only_the_second_pays() -> None:
     """Errors of 10, 9, 0: the two steps gain five each on average, so they come before a single gain of four."""
     from gsmerge.stages.decode import hull_gains
 
@@ -258,7 +258,7 @@ def test_a_first_step_that_only_pays_with_the_second() -> None:
     assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
 
 
-def test_splits_out_of_range(features: FeatureGaussians, members: Members) -> None:
+def test_split_counts_out_of_range_are_refused(features: FeatureGaussians, members: Members) -> None:
     with refuses(ValueError, "extra", 0, -1):
         split_counts(features, members, -1)
     with refuses(ValueError, "max_children", 1, 0):

@@ -3,7 +3,7 @@
 from gsmerge.values.words import count_words
 
 
-def test_only_one_is_singular() -> None:
+def test_count_of_one_is_singular() -> None:
     numbers = 0, 1, 2, 1200
     assert [count_words(number, "row") for number in numbers] == ["0 rows", "1 row", "2 rows", "1,200 rows"]
 

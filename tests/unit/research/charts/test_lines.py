@@ -15,7 +15,7 @@ from gsmerge.research.charts.lines import Results, line_key, line_names, mean_in
 PSNR = "psnr_target_visible"
 
 
-def test_lines_are_methods_with_their_settings() -> None:
+def test_each_method_with_its_settings_is_a_line() -> None:
     lines = Results(make_grid()).by_size("percent", PSNR)
     assert [line.name for line in lines] == ["gsmerge", "gsmerge, fit none", "greedy", "random"]
     assert [line.is_own for line in lines] == [True, True, False, False]
@@ -49,7 +49,7 @@ def test_means_are_over_the_same_scenes() -> None:
     assert {len(p.by_scene) for line in lines for p in line.points} == {3}
 
 
-def test_parts_and_metrics() -> None:
+def test_results_choose_the_views_and_metrics_that_most_runs_have() -> None:
     records = make_grid()
     assert (Results(records).part, Results(records).caveat) == ("target_visible", "")
     assert Results(records).metrics == ["psnr", "ssim", "lpips_vgg"]
@@ -60,13 +60,13 @@ def test_parts_and_metrics() -> None:
     assert Results([]).part == "context"
 
 
-def test_the_input_is_a_level() -> None:
+def test_level_of_the_input_is_its_mean_over_the_scenes() -> None:
     assert Results(make_grid()).input_mean(PSNR, SCENES) == pytest.approx(18 + (2 + 0 - 3) / 3 + 0.01)
     assert Results(make_grid()).input_mean(PSNR, ["unknown"]) is None
 
 
 @pytest.mark.parametrize(("count", "factor"), [(2, 12.706), (3, 4.303), (5, 2.776), (11, 2.228), (31, 2.042)])
-def test_t_factors_are_those_of_the_tables(count: int, factor: float) -> None:
+def test_confidence_interval_has_the_t_factors_of_the_tables(count: int, factor: float) -> None:
     values = [0.0, 1.0] + [0.5] * (count - 2)
     half = mean_interval(values).high - 0.5
     assert half * math.sqrt(count) / np.std(values, ddof=1) == pytest.approx(factor, abs=5e-4)

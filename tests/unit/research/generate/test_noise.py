@@ -90,7 +90,7 @@ def test_grain_and_drift_have_their_strengths() -> None:
     assert np.abs(np.diff(drift, axis=1)).mean() < 0.15 * drift.std()
 
 
-def test_edges_bleed_and_are_not_trusted() -> None:
+def test_depths_bleed_across_edges_with_low_confidence() -> None:
     given = seen(step=0.4)
     depth, confidence = predict_depth(given, replace(CLEAN, bleed=1.0, bleed_width=1.5), np.random.default_rng(0))
     off = np.abs(log(depth / given.depth))
@@ -119,7 +119,7 @@ def test_the_sky_is_as_far_as_the_network_can_say() -> None:
     assert np.isfinite(actual).all()
 
 
-def test_shares_are_met() -> None:
+def test_floaters_oversized_gaussians_and_patches_have_their_shares() -> None:
     noise = replace(CLEAN, floaters=0.1, oversized=0.1, oversize=8.0)
     gaussians = made(noise)
     ratio = seen_again(gaussians)[1] / seen().depth
@@ -141,7 +141,7 @@ def test_harmonics_show_the_photo_to_their_own_camera(degree: int) -> None:
     np.testing.assert_allclose(actual, seen().image.reshape(-1, 3), atol=1e-4)
 
 
-def test_what_is_drawn_lies_in_the_ranges() -> None:
+def test_drawn_noise_lies_in_its_ranges() -> None:
     options = NoiseOptions()
     drawn = [draw_noise(options, np.random.default_rng(s)) for s in range(200)]
     for f in fields(Noise):

@@ -74,7 +74,7 @@ def contexts(scene: Made, networks: Networks) -> tuple[NetworkContext, TrainingC
 
 
 @pytest.mark.parametrize("start", ["pooled", "first"])
-def test_every_stage_has_the_values_of_its_kernels(scene: Made, start: str) -> None:
+def test_tensors_of_every_stage_are_those_of_its_kernels(scene: Made, start: str) -> None:
     networks = noisy_networks(replace(SMALL, merger_start=start))
     plain, training = contexts(scene, networks)
     _, order, cuts = cluster_runs(pairs(scene.features))

@@ -60,13 +60,13 @@ def windows(example: Example, count: int, options: TrainOptions = PHOTO, novel: 
     return [sample_window(example, options.levels, options.window, options.most, novel, rng) for _ in range(count)]
 
 
-def test_subsets_of_views() -> None:
+def test_view_subsets_are_spread_over_the_scene() -> None:
     assert view_subsets(12, (3, 6, 0)) == [[0, 6, 11], [0, 2, 4, 7, 9, 11], list(range(12))]
     assert view_subsets(3, (3, 6, 0)) == [[0, 1, 2]]
     assert view_subsets(4, (9,)) == [[0, 1, 2, 3]]
 
 
-def test_photos_of_the_views_come_first_and_all_look_at_one_world(example: Example) -> None:
+def test_photos_of_the_input_views_come_first_in_one_world(example: Example) -> None:
     full = make_training_scene(scene(), [0, 3])
     photos = full.photos()
     images = scene().images
@@ -112,7 +112,7 @@ def test_views_cover_together_what_half_covers() -> None:
     np.testing.assert_array_equal(covered_pixels(covers), [[True, False, True, True]])
 
 
-def test_windows_lie_in_the_photo_and_hold_what_can_be_seen(example: Example) -> None:
+def test_windows_lie_in_the_photo_and_hold_all_that_shows_there(example: Example) -> None:
     for window in windows(example, 12):
         box = window.box
         assert 0 <= box.left <= box.left + box.width <= WIDTH // 2
@@ -155,7 +155,7 @@ def uniform_ssim(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
     return (above / ((ux**2 + uy**2 + 1e-4) * (xx - ux**2 + yy - uy**2 + 9e-4))).mean(-1)
 
 
-def test_losses_by_hand() -> None:
+def test_losses_match_their_formulas() -> None:
     rng = np.random.default_rng(0)
     photo, mask = rng.random((20, 24, 3), dtype=np.float32), rng.random((20, 24)) < 0.7
     image = np.clip(photo + rng.normal(0, 0.1, photo.shape), 0, 1).astype(np.float32)
