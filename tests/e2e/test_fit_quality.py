@@ -15,7 +15,6 @@ from sweeps import sweep
 import gsmerge
 from gsmerge.compaction.result import CompactResult
 
-Measure = Callable[[Path, Path], float]
 NUM_VIEWS = 5
 
 

@@ -30,7 +30,6 @@ from .conftest import Run, assert_refused, listing
 
 SMALL = ("--set", "superpixels=60", "--set", "checkpoint=none")
 PAPER = ("--set", "recipe=paper", "--set", "superpixels=60")
-PATIENCE = 120  # seconds, on a machine that is busy with other things
 
 
 def write_walks(folder: Path) -> list[Path]:

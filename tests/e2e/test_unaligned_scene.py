@@ -26,8 +26,6 @@ from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run
 
-Measure = Callable[[Path, Path], float]
-
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -287,13 +287,6 @@ def bare(gaussians: Gaussians) -> Scene:
     return Scene(gaussians, none, None, None, ())
 
 
-def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
-    """Photos of noise: nothing that is learned of one patch holds in another."""
-    rng = np.random.default_rng(0)
-    made = [rng.choice([0.0, 1.0], p.images.shape).astype(np.float32) for p in photos]
-    return replace(photos[0], images=made[0]), replace(photos[1], images=made[1])
-
-
 def psnr_of(gaussians: Gaussians, scene: Scene) -> float:
     """PSNR (dB) over all views of a scene with photos."""
     assert scene.images is not None

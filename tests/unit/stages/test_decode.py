@@ -6,18 +6,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry.pooling import Members, feature_to_gaussians, scene_members
 from gsmerge.geometry.transforms import covariances
 from gsmerge.kernels import elementary
 from gsmerge.settings.stages import DecodeOptions
-from gsmerge.stages.decode import deal_visible, decode, mixed_counts, split_counts
+from gsmerge.stages.decode import deal_visible, decode, hull_gains, mixed_counts, split_counts
 from gsmerge.stages.encode import encode
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import FeatureGaussians, Groups
 
-COUNT = 8  # so that no superpixel has fewer than 8 pixels
+COUNT = 12  # so that no superpixel has fewer than 8 pixels
 
 
 def make_scene() -> Scene:
@@ -140,3 +141,49 @@ def test_faint_gaussians_make_way_for_others(total: int, faint: int) -> None:
     actual = deal_visible(order, 4, total, 1 / 255, faint_division)
     assert len(actual) == min(total, 14)
     assert int((actual.opacities < 1 / 255).sum()) == faint
+
+
+def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, members: Members) -> None:
+    assert split_counts(features, members, 10_000).tolist() == [8] * 24
+    assert split_counts(features, members, 10_000, 3).tolist() == [3] * 24
+
+
+def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Members) -> None:
+    """Group 5 gets many colours, all others one each, on a plane."""
+    sh0, own = np.zeros_like(members.sh0), features.members[features.starts[5] : features.starts[6]]
+    sh0[own, 0] = np.random.default_rng(0).normal(size=(len(own), 3))
+    means = members.means.copy()
+    means[:, 2] = 0
+    counts = split_counts(features, replace(members, sh0=sh0, means=means), 6)
+    assert counts.tolist() == [7 if group == 5 else 1 for group in range(24)]
+
+
+def test_gains_of_two_steps_are_averaged_where_only_the_second_pays() -> None:
+    """Errors of 10, 9, 0: the two steps gain five each on average, so they come before a single gain of four."""
+    gains = hull_gains(np.array([[10.0, 9.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, np.nan], [1.0, np.nan, np.nan]]))
+    assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
+
+
+def test_split_counts_out_of_range_are_refused(features: FeatureGaussians, members: Members) -> None:
+    with refuses(ValueError, "extra", 0, -1):
+        split_counts(features, members, -1)
+    with refuses(ValueError, "max_children", 1, 0):
+        split_counts(features, members, 1, 0)
+
+
+def test_children_stand_in_the_order_of_their_groups(features: FeatureGaussians, members: Members) -> None:
+    counts = np.arange(24) % 3 + 1
+    children = decode(features, members, DecodeOptions(min_opacity=0), counts)
+    one = decode(features, members, DecodeOptions(min_opacity=0))
+    for group, (first, last) in enumerate(pairwise(np.append(0, np.cumsum(counts)))):
+        low, high = children.means[first:last].min(0), children.means[first:last].max(0)
+        assert (one.means[group] >= low - 1e-5).all()
+        assert (one.means[group] <= high + 1e-5).all()
+    whole = counts == 1
+    np.testing.assert_array_equal(children.means[np.repeat(whole, counts)], one.means[whole])
+
+
+@pytest.mark.parametrize("counts", [np.ones(3, int), np.zeros(24, int)])
+def test_decode_refuses_strange_counts(counts: np.ndarray, features: FeatureGaussians, members: Members) -> None:
+    with refuses(ValueError, "counts", 24):
+        decode(features, members, DecodeOptions(), counts)

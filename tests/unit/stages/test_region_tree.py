@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import itertools
-from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -9,13 +7,9 @@ import pytest
 import scenes
 from messages import refuses
 
-from gsmerge import Scene
 from gsmerge.facts.counts import CountLimits
-from gsmerge.geometry.pooling import Members, scene_members
-from gsmerge.settings.stages import DecodeOptions, SegmentOptions
+from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages import segment as module
-from gsmerge.stages.decode import decode, split_counts
-from gsmerge.stages.encode import encode
 from gsmerge.stages.segment import (
     RegionTree,
     SharedTree,
@@ -27,7 +21,7 @@ from gsmerge.stages.segment import (
     region_tree,
 )
 from gsmerge.stages.superpixels import segment
-from gsmerge.types import FeatureGaussians, Groups, PicturedScene
+from gsmerge.types import Groups, PicturedScene
 
 HEIGHT, WIDTH = 40, 60
 
@@ -210,74 +204,3 @@ def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(floor: float, monke
 def test_knee_of_no_distortions_is_refused() -> None:
     with refuses(ValueError, "", "distortions", "(0,)"):
         knee(np.array([], int), np.array([]))
-
-
-# ---------------------------------------------------------------- splitting groups
-
-
-def make_scene() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18))
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return make_scene()
-
-
-@pytest.fixture(scope="module")
-def members() -> Members:
-    return scene_members(make_scene())
-
-
-@pytest.fixture(scope="module")
-def features() -> FeatureGaussians:
-    scene = make_scene()
-    return encode(scene, scene_members(scene), cut(scene.images, 12))
-
-
-def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, members: Members) -> None:
-    assert split_counts(features, members, 10_000).tolist() == [8] * 24
-    assert split_counts(features, members, 10_000, 3).tolist() == [3] * 24
-
-
-def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Members) -> None:
-    """Group 5 gets many colours, all others one each, on a plane."""
-    sh0, own = np.zeros_like(members.sh0), features.members[features.starts[5] : features.starts[6]]
-    sh0[own, 0] = np.random.default_rng(0).normal(size=(len(own), 3))
-    means = members.means.copy()
-    means[:, 2] = 0
-    counts = split_counts(features, replace(members, sh0=sh0, means=means), 6)
-    assert counts.tolist() == [7 if group == 5 else 1 for group in range(24)]
-
-
-def test_gains_of_two_steps_are_averaged_where_only_the_second_pays() -> None:
-    """Errors of 10, 9, 0: the two steps gain five each on average, so they come before a single gain of four."""
-    from gsmerge.stages.decode import hull_gains
-
-    gains = hull_gains(np.array([[10.0, 9.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, np.nan], [1.0, np.nan, np.nan]]))
-    assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
-
-
-def test_split_counts_out_of_range_are_refused(features: FeatureGaussians, members: Members) -> None:
-    with refuses(ValueError, "extra", 0, -1):
-        split_counts(features, members, -1)
-    with refuses(ValueError, "max_children", 1, 0):
-        split_counts(features, members, 1, 0)
-
-
-def test_children_stand_in_the_order_of_their_groups(features: FeatureGaussians, members: Members) -> None:
-    counts = np.arange(24) % 3 + 1
-    children = decode(features, members, DecodeOptions(min_opacity=0), counts)
-    one = decode(features, members, DecodeOptions(min_opacity=0))
-    for group, (first, last) in enumerate(itertools.pairwise(np.append(0, np.cumsum(counts)))):
-        low, high = children.means[first:last].min(0), children.means[first:last].max(0)
-        assert (one.means[group] >= low - 1e-5).all()
-        assert (one.means[group] <= high + 1e-5).all()
-    whole = counts == 1
-    np.testing.assert_array_equal(children.means[np.repeat(whole, counts)], one.means[whole])
-
-
-@pytest.mark.parametrize("counts", [np.ones(3, int), np.zeros(24, int)])
-def test_decode_refuses_strange_counts(counts: np.ndarray, features: FeatureGaussians, members: Members) -> None:
-    with refuses(ValueError, "counts", 24):
-        decode(features, members, DecodeOptions(), counts)
