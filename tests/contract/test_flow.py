@@ -63,7 +63,10 @@ def test_no_code_beyond_io_asks_for_the_kind_of_a_scene() -> None:
         assert {PACKAGE / "io", PACKAGE / "scene"} & {*path.parents} or not call.search(text), path
 
 
-def test_prepared_facts_hold_few_fields_and_no_options() -> None:
+def test_prepared_facts_are_few() -> None:
     assert len(fields(Prepared)) <= 8
+
+
+def test_prepared_facts_hold_no_options() -> None:
     assert not {f.name for f in fields(Prepared)} & {f.name for f in fields(PrepareOptions)}
     assert all("Options" not in str(f.type) for f in fields(Prepared))

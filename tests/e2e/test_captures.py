@@ -48,10 +48,13 @@ def flat(views: list[Any], near: float, far: float) -> tuple[np.ndarray, np.ndar
     return np.full(shape, (near * far) ** 0.5), np.full(shape, 0.75)
 
 
-def test_views_are_spread_and_held_out_ones_midway() -> None:
+def test_input_views_are_spread_with_held_out_views_midway() -> None:
     inputs, held_out = script("make_capture").pick_views(50, 12)
     assert inputs == [0, 4, 9, 13, 18, 22, 27, 31, 36, 40, 45, 49]  # of the capture fox
     assert held_out == [2, 6, 11, 15, 20, 24, 29, 33, 38, 42, 47]
+
+
+def test_too_few_photos_for_the_views_are_refused() -> None:
     with pytest.raises(SystemExit, match="expected at least 7 photos for 4 views, found 6"):
         script("make_capture").pick_views(6, 4)
 

@@ -307,10 +307,15 @@ def test_the_picture_fits_the_window(size: tuple[int, int], page: tuple[Browser,
     assert tab.run("document.documentElement.scrollWidth") == size[0]
 
 
-def test_a_phone(page: tuple[Browser, Any]) -> None:
-    """The headline and the picture come first, with its controls in sight; the table begins with what matters most."""
+def on_phone(page: tuple[Browser, Any]) -> Browser:
+    """Return the page as it opens in a window of a phone, held upright."""
     tab, _ = refreshed(page)
     resize(tab, 390, 844)
+    return tab
+
+
+def test_phone_shows_headline_and_picture_first_with_its_controls_in_sight(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
     assert tab.box("headline")["y"] < 40
     assert 60 < tab.box("stage")["y"] < 844 / 3
     alts = tab.run("[id('left').alt, id('right').alt, id('canvas').getAttribute('aria-label')]")
@@ -318,6 +323,10 @@ def test_a_phone(page: tuple[Browser, Any]) -> None:
     assert alts[2].endswith(" in 3D")
     for control in ("id('left-source')", "id('right-source')"):  # in sight with the headline and the picture
         assert 0 < tab.box(control)["y"] < 844
+
+
+def test_phone_stacks_the_scenes_that_are_shown_side_by_side(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
     for mode, shown in {"swipe": 2, "side": 2, "blink": 1, "difference": 2}.items():
         side = mode == "side"
         expected = [[0, 0, 1, 0.5], [0, 0.5, 1, 0.5]] if side else [[0, 0, 1, 1]] * shown
@@ -333,6 +342,9 @@ def test_a_phone(page: tuple[Browser, Any]) -> None:
             assert np.allclose(tab.run("panes().map(pane => pane.box)"), expected)
             assert tab.run("stage.classList.contains('stacked')") is side
 
+
+def test_phone_shows_the_score_in_the_table_and_that_there_is_more(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
     heads = "[...document.querySelectorAll('.results th')]"
     assert tab.run(f"{heads}.map(one => one.textContent)")[:2] == ["File", "PSNR (dB)"]
     assert tab.run(f"{heads}[1].getBoundingClientRect().right") < 390
@@ -340,13 +352,19 @@ def test_a_phone(page: tuple[Browser, Any]) -> None:
     ground = tab.run("getComputedStyle(document.querySelector('.results .scroll')).backgroundAttachment")
     assert ground == "local, local, scroll, scroll"  # a shadow says that there is more
 
-    tab.run("set('solid', ''); zoomTo(2)")
+
+def test_controls_on_a_phone_are_large_enough_for_fingers(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
+    tab.run("set('mode', 'difference'); zoomTo(2)")
     small = "[...document.querySelectorAll('button, select, summary, input')].filter(one => one.checkVisibility())"
     small += ".map(one => [one.id || one.textContent, one.getBoundingClientRect()])"
     assert tab.run(f"{small}.length") > 20
     assert tab.run(f"{small}.filter(([, box]) => box.height < 44 || box.width < 44).map(([name]) => name)") == []
     assert tab.run("id('strip').scrollWidth > id('strip').clientWidth")
 
+
+def test_picture_fills_a_phone_that_is_turned(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
     tab.call("Emulation.setDeviceMetricsOverride", width=844, height=390, deviceScaleFactor=1, mobile=True)
     tab.wait("innerWidth === 844")
     tab.run("set('mode', 'swipe'); zoomTo(1); scrollTo(0, 0)")
@@ -464,11 +482,15 @@ def test_keys_and_clicks_move_frame_and_turn_the_camera(page: tuple[Browser, Any
     assert within > 0.8 * total
 
 
-def test_nothing_is_fetched_and_nothing_complains(page: tuple[Browser, Any]) -> None:
-    """After all that the others did."""
+def test_page_fetches_nothing(page: tuple[Browser, Any]) -> None:
+    """After all that the others did, as below."""
     tab, _ = refreshed(page)
     assert [url[:60] for url in tab.requests() if not url.startswith(("file:", "data:", "blob:"))] == []
     assert [url for url in tab.requests() if url.startswith("file:")][1:] == []
+
+
+def test_page_makes_the_browser_complain_of_nothing(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     assert [one for one in tab.complaints() if '"level": "warning"' not in one] == []  # of the driver, about its speed
     assert [event for event in tab.events if event.get("method") == "Runtime.consoleAPICalled"] == []
     assert tab.run("document.querySelectorAll('b b, select b').length") == 0

@@ -28,14 +28,19 @@ def unaligned(scene: Scene) -> Scene:
 
 
 @sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}])
-def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
-    """One Gaussian for each view: met, visible, in the colours of the scene; and one fewer is refused."""
+def test_budget_of_one_gaussian_for_each_view_is_met_in_the_scene_s_colours(
+    room: Scene, settings: dict[str, Any]
+) -> None:
     result = scenes.compacted(room, superpixels="auto", budget=VIEWS, **settings)
     assert len(result.gaussians) == VIEWS
     image, alpha = scenes.images_of(result.gaussians, room.cameras)
     assert alpha.mean() > 0.3
     shown = (image * alpha[..., None]).sum((0, 1, 2)) / alpha.sum()
     assert np.abs(shown - room.images.mean((0, 1, 2))).max() < 0.25
+
+
+@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}])
+def test_budget_below_one_gaussian_for_each_view_is_refused(room: Scene, settings: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="budget"):
         compact(room, budget=VIEWS - 1, **settings)
 

@@ -55,6 +55,13 @@ def right_ones(loaded: Loaded, truth: np.ndarray) -> list[bool]:
     return [bool(np.abs(a - b).mean() < 0.02) for a, b in zip(loaded.scene.images, truth, strict=True)]
 
 
+def load_with_right_photos(folder: Path, truth: np.ndarray) -> Loaded:
+    """Load a scene, and check that each view has its photo."""
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    return loaded
+
+
 def absent(loaded: Loaded) -> list[int]:
     return sorted({*range(VIEWS)} - {*loaded.scene.photo_views})
 
@@ -69,8 +76,7 @@ def name_frames(folder: Path, rename: Callable[[int, str], str]) -> None:
 
 
 def test_right_names_are_used_without_a_word(folder: Path, truth: np.ndarray) -> None:
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert not any("photo" in text for text in loaded.notes)
 
 
@@ -83,16 +89,14 @@ def test_photos_that_lie_on_their_side_are_turned(folder: Path, truth: np.ndarra
             exif[0x0112] = TAGS[quarters]
         lying = np.rot90((read(path) * 255).round().astype(np.uint8), -quarters)
         Image.fromarray(np.ascontiguousarray(lying)).save(path, exif=exif)
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any("are turned" in text and "3 of 4 photos" in text for text in loaded.notes) is not tagged
 
 
 def test_mirrored_photos_are_mirrored_back(folder: Path, truth: np.ndarray) -> None:
     for path in photos_in(folder):
         Image.fromarray(np.ascontiguousarray((read(path) * 255).round().astype(np.uint8)[:, ::-1])).save(path)
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any("or mirrored" in text and "4 of 4 photos" in text for text in loaded.notes)
 
 
@@ -102,8 +106,7 @@ def test_wrong_tags_of_upright_photos_are_undone(folder: Path, truth: np.ndarray
     exif[0x0112] = 6
     for path in photos_in(folder):
         Image.open(path).convert("RGB").save(path, exif=exif)
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any("4 of 4 photos are turned" in text for text in loaded.notes)
 
 
@@ -111,8 +114,7 @@ def test_a_photo_without_a_camera_is_named(folder: Path, truth: np.ndarray) -> N
     """As where a program could not place it; of a film whose frames mostly have none, nothing is said."""
     spare = photos_in(folder)[0]
     spare.with_name("spare.png").write_bytes(spare.read_bytes())
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any(names(text, "no camera", "1 of 5", "spare.png") for text in loaded.notes)
     for number in range(VIEWS):
         spare.with_name(f"frame {number}.png").write_bytes(spare.read_bytes())
@@ -217,8 +219,7 @@ def test_views_without_gaussians_are_not_there_where_cameras_are_estimated(
 
 def test_smaller_copies_of_photos_are_used_where_they_are_alone(folder: Path, truth: np.ndarray) -> None:
     (folder / "images").rename(folder / "images_4")
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert absent(loaded) == []
 
 
@@ -250,8 +251,7 @@ def test_photos_under_names_of_others_are_matched_by_content(folder: Path, truth
     contents = [path.read_bytes() for path in paths]
     for view, path in enumerate(paths):
         path.write_bytes(contents[(view + 1) % VIEWS])
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any("matched with views by their content" in text and ": photo " in text for text in loaded.notes)
 
 
@@ -272,6 +272,5 @@ def test_thumbnails_stand_for_no_photo(folder: Path, truth: np.ndarray) -> None:
         for place in (".thumbs", "thumbs", "images_2"):
             cv2.imwrite(str(path.parent / place / path.name), small)
     name_frames(folder, lambda _, name: Path(name).name)
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert absent(loaded) == []

@@ -197,26 +197,36 @@ def test_a_crop_leaves_what_shows_it(scene: Scene) -> None:
     assert whole.gaussians is scene.gaussians
 
 
-def test_levels_and_baselines_are_cropped(scene: Scene) -> None:
+def test_coarser_levels_are_cropped(scene: Scene) -> None:
     crop = sphere_in(scene, 0.5)
     result = compact(scene, **QUICK, crop=crop, budget=160, levels=2)
     assert [len(one.gaussians) for one in (result, *result.coarser)] == [160, 40]
     assert inside_crop(result.coarser[0].gaussians.means, crop).all()
+
+
+def test_baselines_are_cropped(scene: Scene) -> None:
+    crop = sphere_in(scene, 0.5)
     opaque = compact(scene, method="opacity", crop=crop, budget=100)
     assert len(opaque.gaussians) == 100
     assert inside_crop(opaque.gaussians.means, crop).all()
     assert not any("use" in note for note in opaque.report.notes)
 
 
-def test_what_cannot_be(scene: Scene) -> None:
+def test_crop_of_nothing_and_dropped_sky_with_a_target_are_refused(scene: Scene) -> None:
     with refuses(UsageError, "crop", "sphere:0,0,1e9,1", "none"):
         compact(scene, **QUICK, crop="sphere:0,0,1e9,1")
     with refuses(ValueError, "drop sky", "budget", "quality 30dB"):
         CompactOptions().with_settings({"drop": "sky", "quality": "30dB"})
+
+
+def test_budget_beyond_a_crop_is_noted(scene: Scene) -> None:
     few = sphere_in(scene, 0.002)
     result = compact(scene, **QUICK, crop=few, budget=5000)
     assert 0 < len(result.gaussians) < 5000
     assert noted(result.report.notes, "crop", f"{result.report.num_input} of 5,184")
+
+
+def test_crop_and_dropped_floaters_need_the_whole_scene() -> None:
     assert CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "drop": "floaters"}).whole_only == [
         "crop", "drop floaters",
     ]  # fmt: skip

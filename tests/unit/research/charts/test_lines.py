@@ -72,11 +72,17 @@ def test_confidence_interval_has_the_t_factors_of_the_tables(count: int, factor:
     assert half * math.sqrt(count) / np.std(values, ddof=1) == pytest.approx(factor, abs=5e-4)
 
 
-def test_one_value_has_a_mean_and_no_width() -> None:
+def test_confidence_interval_of_one_value_has_no_width() -> None:
     actual = mean_interval([21.5])
     assert (actual.mean, actual.low, actual.high, actual.count) == (21.5, 21.5, 21.5, 1)
+
+
+def test_confidence_interval_of_no_values_is_refused() -> None:
     with refuses(ValueError, "", "value", "none"):
         mean_interval([])
+
+
+def test_paired_intervals_of_one_scene_have_no_width_and_of_one_line_are_the_mean_s() -> None:
     assert [(i.low, i.high) for i in paired_intervals(np.array([[1.0, 2.0]]))] == [(1, 1), (2, 2)]
     assert paired_intervals(np.array([[1.0], [3.0]])) == [mean_interval([1.0, 3.0])]
 

@@ -95,11 +95,14 @@ def test_generate_keeps_scenes_that_are_there_and_adds_the_rest(folder: Path, fi
     assert contents(first / "scene_0001") == contents(folder / "scene_0001")
 
 
-def test_other_scenes_and_strangers_are_not_replaced(first: Path) -> None:
+def test_scene_of_another_seed_is_not_replaced(first: Path) -> None:
     before = contents(first)
     with refuses(UsageError, "scene_0000", "remove it"):
         generate(first, 1, TINY, seed=6)
     assert contents(first) == before
+
+
+def test_folder_of_other_files_is_not_replaced(first: Path) -> None:
     stranger = first / "scene_0001"
     stranger.mkdir()
     (stranger / "thesis.txt").write_text("years of work")
