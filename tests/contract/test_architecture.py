@@ -23,18 +23,18 @@ SOURCES = (".py", ".c", ".h", ".toml", ".js", ".html", ".yml", ".sh")
 
 
 def section(title: str, page: Path = ARCHITECTURE) -> str:
-    """The text of a section of a page, without its title."""
+    """Return the text of a section of a page, without its title."""
     return page.read_text("utf-8").partition(f"\n## {title}\n")[2].partition("\n## ")[0]
 
 
 def rooms(text: str) -> list[str]:
-    """The rooms of the list, in its order; what follows the colon of a line describes them."""
+    """Return the rooms of the list, in its order; what follows the colon of a line describes them."""
     heads = re.findall(r"^- (.+?):", text, re.MULTILINE)
     return [name for head in heads for name in re.findall(r"`([\w/]+)`", head)]
 
 
 def layers() -> list[str]:
-    """The rooms of the import contract, from the top; those of one layer in its order."""
+    """Return the rooms of the import contract, from the top; those of one layer in its order."""
     tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
     (contract,) = [one for one in contracts if one["name"] == "Imports flow down"]
@@ -63,7 +63,7 @@ def test_drawing_names_rooms_alone() -> None:
 
 
 def arrows() -> list[list[str]]:
-    """The cells of the table of arrows."""
+    """Return the cells of the table of arrows."""
     lines = [line for line in section("Arrows").splitlines() if line.startswith("| ")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
 
@@ -99,7 +99,7 @@ def code_spans(page: Path) -> Iterator[str]:
 
 @cache
 def top() -> tuple[set[str], set[str]]:
-    """The names of folders of the package, and of the repository."""
+    """Return the names of folders of the package, and of the repository."""
     return tuple({path.name for path in folder.iterdir() if path.is_dir()} for folder in (PACKAGE, ROOT))  # type: ignore
 
 
@@ -120,7 +120,7 @@ def test_paths_on_a_page_lead_to_files(page: Path) -> None:
 
 @cache
 def words_of_sources() -> set[str]:
-    """All identifiers of the repository's code, tests included, and the names of its files."""
+    """Return all identifiers of the repository's code, tests included, and the names of its files."""
     files = [path for name in ("gsmerge", "benchmarks", "docs", "tests", "tools", "examples", ".github")
              for path in (ROOT / name).rglob("*") if path.suffix in SOURCES and path != Path(__file__)]  # fmt: skip
     texts = [path.read_text("utf-8") for path in (*files, ROOT / "pyproject.toml")]

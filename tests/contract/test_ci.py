@@ -58,7 +58,7 @@ def test_block_of_the_tests_runs_as_a_whole(tmp_path: Path) -> None:
 
 
 def calls_of(*tasks: str) -> list[str]:
-    """The commands of tasks, as :func:`run_block` notes them."""
+    """Return the commands of tasks, as :func:`run_block` notes them."""
     calls = [call for task in tasks for call in load_script(ROOT / "tasks.py").TASKS[task]]
     return [" ".join(call).replace("python -m venv", "python3 -m venv") for call in calls]
 

@@ -43,7 +43,7 @@ def scene() -> gsmerge.Scene:
 
 
 def make_splat(*items: gsmerge.Gaussians) -> Splat:
-    """A batch as ComfyUI holds it."""
+    """Return a batch as ComfyUI holds it."""
     columns = [(g.means, g.scales, g.quats, g.opacities[:, None], np.concatenate([g.sh0, g.shN], 1)) for g in items]
     tensors = [[torch.from_numpy(np.ascontiguousarray(column)) for column in row] for row in columns]
     padded = [torch.nn.utils.rnn.pad_sequence(list(row), batch_first=True) for row in zip(*tensors, strict=True)]
@@ -51,7 +51,7 @@ def make_splat(*items: gsmerge.Gaussians) -> Splat:
 
 
 def make_cameras(cameras: gsmerge.Cameras) -> list[dict[str, Any]]:
-    """Cameras as ComfyUI holds them: y up, looking along -z."""
+    """Return cameras as ComfyUI holds them: y up, looking along -z."""
     out = []
     for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True):
         pose = np.linalg.inv(viewmat)

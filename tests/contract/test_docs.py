@@ -52,14 +52,14 @@ def read(page: str) -> str:
 
 
 def blocks_in(page: str) -> list[list[str]]:
-    """Every ``gsmerge ...`` call in each of a page's shell blocks."""
+    """Return every ``gsmerge ...`` call in each of a page's shell blocks."""
     blocks = re.findall(r"```(?:bash|console)\n(.*?)```", read(page), re.DOTALL)
     parts = [[part.strip() for line in block.splitlines() for part in line.split("&&")] for block in blocks]
     return [[re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)] for calls in parts]
 
 
 def calls_in(page: str) -> list[str]:
-    """Every ``gsmerge ...`` call in a page's shell blocks."""
+    """Return every ``gsmerge ...`` call in a page's shell blocks."""
     return [call for calls in blocks_in(page) for call in calls]
 
 
@@ -235,7 +235,7 @@ def test_constraints_pin_every_dependency(root: Path) -> None:
 
 
 def stability_rows(root: Path) -> list[tuple[str, str]]:
-    """Numbers and tests of every row of cases."""
+    """Return numbers and tests of every row of cases."""
     text = (root / "docs" / "internals" / "stability.md").read_text()
     return re.findall(r"^\| ([\d, ]+) \| .+ \| .+ \| (.+) \|$", text, re.MULTILINE)
 
@@ -273,7 +273,7 @@ def test_security_names_the_programs_that_commands_start() -> None:
 
 
 def functions_of(node: ast.AST) -> Iterator[ast.FunctionDef]:
-    """The functions in a node's statements, whose expressions hold none."""
+    """Return the functions in a node's statements, whose expressions hold none."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
             if isinstance(child, ast.FunctionDef):

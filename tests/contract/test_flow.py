@@ -18,7 +18,7 @@ STEPS = ("facts", "stages", "fit")
 
 @functools.cache
 def texts(*rooms: str) -> dict[Path, str]:
-    """The sources of the package, or of some of its folders."""
+    """Return the sources of the package, or of some of its folders."""
     paths = [path for room in rooms or ("",) for path in sorted((PACKAGE / room).rglob("*.py"))]
     return {path: path.read_text(encoding="utf-8") for path in paths}
 

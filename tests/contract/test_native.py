@@ -11,7 +11,7 @@ from gsmerge.kernels.signature import PROTOTYPES
 
 
 def prototypes():
-    """The declarations in C, by name, of everything that calls the library."""
+    """Return the declarations in C, by name, of everything that calls the library."""
     for module in pkgutil.walk_packages(gsmerge.kernels.__path__, "gsmerge.kernels."):
         if "-" not in module.name:  # a built library
             importlib.import_module(module.name)

@@ -27,7 +27,7 @@ FEW, OF_COMPACT = 138, 23  # options of all commands, of which each has --progre
 
 
 def shown(command: str, name: str) -> Any:
-    """Default of an option of a command: its own, or as help words the library's."""
+    """Return the default of an option of a command: its own, or as help words the library's."""
     (parameter,) = (p for p in COMMANDS[command].params if p.name == name)
     worded = isinstance(parameter.show_default, str)
     return parameter.show_default if worded else parameter.default

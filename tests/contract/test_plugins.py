@@ -21,7 +21,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "internals" / "plugins.md"
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
-    """A folder with the example's module and the metadata of its package."""
+    """Return a folder with the example's module and the metadata of its package."""
     text = PAGE.read_text(encoding="utf-8")
     blocks = dict(re.findall(r"```\w+\n# (\S+)\n(.*?)```", text, re.DOTALL))
     site = tmp_path / "site"
@@ -38,7 +38,7 @@ def site(tmp_path: Path) -> Path:
 
 
 def run(site: Path, *commands: list[str]) -> tuple[list[int], str, str]:
-    """Exit codes of commands one after the other in a process that finds the package; what they print."""
+    """Run commands one after the other in a process that finds the package; return exit codes and what they print."""
     path = os.pathsep.join([str(site), *sys.path])
     code = f"from gsmerge.cli import main\nprint([main(words) for words in {commands!r}])"
     command = [sys.executable, "-c", code]

@@ -36,7 +36,7 @@ ALLOWED = {
 
 
 def dotted(node: ast.expr) -> str:
-    """The name of an attribute with those in front of it, such as ``np.linalg.inv``."""
+    """Return the name of an attribute with those in front of it, such as ``np.linalg.inv``."""
     return f"{dotted(node.value)}.{node.attr}" if isinstance(node, ast.Attribute) else getattr(node, "id", "")
 
 
@@ -74,7 +74,7 @@ TWIN = "tests/kernels/test_elementary.py"  # compares NumPy's functions with our
 
 
 def statements(node: ast.AST) -> Iterator[ast.AST]:
-    """All nodes but those of assertions, where an expectation may have another last bit."""
+    """Return all nodes but those of assertions, where an expectation may have another last bit."""
     for child in ast.iter_child_nodes(node):
         name = dotted(child.func).rpartition(".")[2] if isinstance(child, ast.Call) else ""
         if not isinstance(child, ast.Assert) and not name.startswith("assert_") and name != "approx":
@@ -83,7 +83,7 @@ def statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def refused_data(tree: ast.AST) -> Iterator[str]:
-    """Elementary functions of NumPy and of the system, and sorts that leave ties in any order."""
+    """Return elementary functions of NumPy and of the system, and sorts that leave ties in any order."""
     elementary = {f"{module}.{name}" for module in ("np", "math") for name in ELEMENTARY.split()}
     elementary |= {f"math.{name}" for name in ("pow", "atan", "atan2", "acos", "asin")}
     for node in statements(tree):
@@ -98,7 +98,7 @@ def refused_data(tree: ast.AST) -> Iterator[str]:
 
 
 def python_files(root: Path, *places: str, having: str = "") -> Iterator[tuple[str, ast.AST]]:
-    """Names and trees of the files at some places in whose text a pattern is."""
+    """Return names and trees of the files at some places in whose text a pattern is."""
     for place in places:
         for path in sorted((root / place).rglob("*.py")) or [root / place]:
             text = path.read_text(encoding="utf-8")

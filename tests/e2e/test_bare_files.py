@@ -20,7 +20,7 @@ PLACED = ("no cameras", "--cameras", "--images", "cannot be better than its inpu
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file alone in its folder. Read only."""
+    """Return a file alone in its folder. Read only."""
     folder = tmp_path_factory.mktemp("bare")
     scene = gsmerge.read_scene(write_smallest(folder / "made"))
     path = folder / "alone" / "scene.ply"

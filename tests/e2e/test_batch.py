@@ -37,7 +37,7 @@ def write_rooms(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def rooms() -> Path:
-    """The folder of :func:`write_rooms`. Read only."""
+    """Return the folder of :func:`write_rooms`. Read only."""
     return make_once("bad-room", write_rooms)
 
 
@@ -47,7 +47,7 @@ def batch(run: Run, rooms: Path, out: Path, *options: object) -> Outcome:
 
 @pytest.fixture(scope="module", autouse=True)
 def _in_this_process() -> Iterator[None]:
-    """Processes are the subject of ``test_batch_faults.py``; each takes seconds to start."""
+    """Run batches in this process: those of ``test_batch_faults.py`` take seconds to start others."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
         yield
@@ -61,7 +61,7 @@ def compact_rooms(out: Path) -> None:
 
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
-    """A copy of what :func:`compact_rooms` leaves behind."""
+    """Return a copy of what :func:`compact_rooms` leaves behind."""
     return Path(shutil.copytree(make_once("bad-room-out", compact_rooms), tmp_path / "out"))
 
 

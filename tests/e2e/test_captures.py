@@ -43,7 +43,7 @@ def capture() -> Path:
 
 
 def flat(views: list[Any], near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """A wall in the middle of the range."""
+    """Return a wall in the middle of the range."""
     shape = views[0].image.shape[:2]
     return np.full(shape, (near * far) ** 0.5), np.full(shape, 0.75)
 

@@ -21,7 +21,7 @@ from .conftest import Outcome, Run, listing
 
 @pytest.fixture
 def copied(tmp_path: Path) -> Path:
-    """A copy of the charted scene that a test may spoil."""
+    """Return a copy of the charted scene that a test may spoil."""
     return Path(shutil.copytree(charted_scene(), tmp_path / "grid"))
 
 
@@ -37,7 +37,7 @@ def _inline(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def merges(monkeypatch: pytest.MonkeyPatch) -> list[object]:
-    """The budgets of every merge from now on; one of 3 % fails."""
+    """Return the budgets of every merge from now on; one of 3 % fails."""
     seen: list[object] = []
     compact = running.compact
 
@@ -52,7 +52,7 @@ def merges(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 
 def runs(folder: Path) -> dict[str, RunRecord]:
-    """All runs by their label."""
+    """Return all runs by their label."""
     return {record.label: record for record in read_runs(folder)}
 
 

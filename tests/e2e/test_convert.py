@@ -48,7 +48,7 @@ def make_result(folder: Path) -> None:
 
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
-    """The result of :func:`make_result`, in a folder of its own."""
+    """Return the result of :func:`make_result`, in a folder of its own."""
     return Path(shutil.copytree(make_once("result", make_result), tmp_path, dirs_exist_ok=True)) / "in.ply"
 
 

@@ -58,7 +58,7 @@ of_linux = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory 
 
 
 def limits(num_bytes: int) -> Limits:
-    """Far more than a reader of so many bytes may take."""
+    """Return limits far above what a reader of so many bytes may take."""
     seconds = SECONDS_MARGIN * (FREE_SECONDS + SECONDS_PER_BYTE * num_bytes)
     return Limits(MOST_MEMORY + min(MEMORY_PER_BYTE * num_bytes, MOST_MEMORY), min(seconds, MOST_SECONDS))
 

@@ -28,7 +28,7 @@ def make(folder: Path) -> None:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A copy of what :func:`make` writes, which a test may change."""
+    """Return a copy of what :func:`make` writes, which a test may change."""
     return Path(shutil.copytree(make_once("evaluated", make), tmp_path / "scene"))
 
 

@@ -47,12 +47,12 @@ PICTURES = {  # with their number
 
 @pytest.fixture
 def small_copy(tmp_path: Path) -> Path:
-    """A scene with held-out views, of 24 x 16, that a test may change."""
+    """Return a scene with held-out views, of 24 x 16, that a test may change."""
     return write_scene(tmp_path / "scene", num_views=VIEWS, width=24, height=16)
 
 
 def call(command: str, scene: Path) -> list[object]:
-    """The command with its scene, its output, and what makes it fast."""
+    """Return the command with its scene, its output, and what makes it fast."""
     targets = ["--targets", scene / "targets"]
     if command == "inspect":
         return [command, scene]
@@ -73,13 +73,13 @@ def call(command: str, scene: Path) -> list[object]:
 
 
 def all_texts(value: object) -> list[str]:
-    """The texts in a value of JSON, at any depth."""
+    """Return the texts in a value of JSON, at any depth."""
     parts = value if isinstance(value, list) else [*value, *value.values()] if isinstance(value, dict) else []
     return [value] if isinstance(value, str) else [text for part in parts for text in all_texts(part)]
 
 
 def spoil_rows(ply: Path) -> None:
-    """NaN in one row, a log scale of 40 in another, and every opacity between 0 and 1."""
+    """Put NaN in one row, a log scale of 40 in another, and every opacity between 0 and 1."""
     head, data = ply.read_bytes().split(b"end_header\n", 1)
     rows = np.frombuffer(data, "<f4").reshape(-1, 17).copy()
     rows[3, 0], rows[7, 10] = np.nan, 40

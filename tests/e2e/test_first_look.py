@@ -17,7 +17,7 @@ FAST = ("--budget", "5%", "--effort", "draft", "--fit", "none")
 
 @pytest.fixture(autouse=True)
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Pages that a browser was asked to open."""
+    """Return pages that a browser was asked to open."""
     pages: list[str] = []
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr("webbrowser.open", lambda address: not pages.append(address))

@@ -20,7 +20,7 @@ NUM_VIEWS = 5
 
 @pytest.fixture(scope="module")
 def compacted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[CompactResult, float]]:
-    """``compacted(k=2)``: the result, and its PSNR (dB) on the targets; each is made once."""
+    """Return ``compacted(k=2)``: the result, and its PSNR (dB) on the targets; each is made once."""
     folder = write_made(tmp_path_factory.mktemp("fit") / "scene")
     scene, out = gsmerge.read_scene(folder), folder / "small.ply"
 

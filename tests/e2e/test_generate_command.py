@@ -18,7 +18,7 @@ SMALL = ("--scenes", 1, "--views", "3", "--size", "24x16")  # a scene takes half
 
 @pytest.fixture(scope="module")
 def generated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene, and what the command said of it. Read only."""
+    """Return a scene, and what the command said of it. Read only."""
     folder = tmp_path_factory.mktemp("generate") / "made"
     with (folder.parent / "said.txt").open("w") as said, redirect_stdout(said):
         assert main(["lab", "generate", "-o", str(folder), *map(str, SMALL)]) == 0

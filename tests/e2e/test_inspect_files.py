@@ -32,7 +32,7 @@ Spoil = Callable[[Path], object]
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a sound file of every kind. Read only."""
+    """Return a folder with a sound file of every kind. Read only."""
     folder = write_smallest(tmp_path_factory.mktemp("sound") / "room")
     (folder / "away").mkdir()
     for name in FORMATS[1:]:
@@ -73,7 +73,7 @@ def test_json_of_inspect_describes_sound_and_missing_files(sound: Path, run: Run
 
 
 def flip(place: int) -> Spoil:
-    """One bit of the byte at a place, from the end where it is negative."""
+    """Flip one bit of the byte at a place, from the end where it is negative."""
 
     def spoil(path: Path) -> None:
         data = bytearray(path.read_bytes())
@@ -84,7 +84,7 @@ def flip(place: int) -> Spoil:
 
 
 def member_bit(path: Path) -> None:
-    """One bit in a file of an archive."""
+    """Flip one bit in a file of an archive."""
     with zipfile.ZipFile(path) as archive:
         info = archive.infolist()[-1]
     flip(info.header_offset + 30 + len(info.filename) + info.compress_size // 2)(path)

@@ -40,7 +40,7 @@ class Kind:
 
 
 def with_one_photo(folder: Path) -> None:
-    """Of several photos those that can be read are used."""
+    """Leave a folder with one photo: of several those that can be read are used."""
     for path in sorted((folder / "images").iterdir())[1:]:
         path.unlink()
 

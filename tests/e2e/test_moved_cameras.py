@@ -32,7 +32,7 @@ def enlarge_cameras(folder: Path) -> Path:
 
 @pytest.fixture
 def moved_scene(tmp_path: Path) -> Path:
-    """The small scene with the camera centres in larger units."""
+    """Return the small scene with the camera centres in larger units."""
     return enlarge_cameras(write_small(tmp_path / "scene"))
 
 

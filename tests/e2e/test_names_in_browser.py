@@ -32,7 +32,7 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the scene is made to under a usual name: each page of one scene is of a run with its name."""
+    """Return what the scene is made to under a usual name: each page of one scene is of a run with its name."""
     folder = tmp_path_factory.mktemp("result")
     small = folder / "small.ply"
     assert main(["compact", str(write_smallest(folder / "scene")), "-o", str(small), *QUICK, "-q"]) == 0

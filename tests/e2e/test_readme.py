@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt" or not shutil
 
 @pytest.fixture(scope="module")
 def project(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the project as it is cloned, in a path with a space."""
+    """Return a copy of the project as it is cloned, in a path with a space."""
     ignored = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "kernels-*", "demo")
     return Path(shutil.copytree(root, tmp_path_factory.mktemp("a b") / "gsmerge", ignore=ignored))
 

@@ -25,7 +25,7 @@ EXACT = "c861febcc6fe28c56361e2f0b94bd287"
 
 
 def plain() -> dict[str, str]:
-    """Settings of the libraries that take all that only some processors have from them."""
+    """Return settings of the libraries that take all that only some processors have from them."""
     return {
         "NPY_DISABLE_CPU_FEATURES": " ".join(np._core._multiarray_umath.__cpu_dispatch__),
         "OPENBLAS_CORETYPE": "Sandybridge",

@@ -23,7 +23,7 @@ FIT = ("--set", "fit_steps=30", "--budget", "700", "--threads", 1)
 
 @pytest.fixture(scope="module")
 def sharp(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``out/`` with two files, ``photos/`` with what they were made of, and a file of another place. Read only."""
+    """Return ``out/`` with two files, ``photos/`` that they were made of, and a file of another place. Read only."""
     folder = tmp_path_factory.mktemp("sharp")
     for name in ("out", "photos", "other"):
         (folder / name).mkdir()

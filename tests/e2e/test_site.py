@@ -72,7 +72,7 @@ def served() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """Of a small window: a processor draws its 3D."""
+    """Yield a browser with a small window: a processor draws its 3D."""
     flags = "--enable-unsafe-swiftshader", "--window-size=400,300"
     with browser(CHROMIUM, tmp_path_factory.mktemp("profile"), *flags) as opened:
         yield opened

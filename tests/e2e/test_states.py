@@ -47,7 +47,7 @@ def write_states(folder: Path) -> None:
 
 @pytest.fixture(scope="session")
 def walks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
-    """The scenes of :func:`write_walks`. Read only, which is checked."""
+    """Yield the scenes of :func:`write_walks`. Read only, which is checked."""
     folder = tmp_path_factory.mktemp("walks")
     scenes = write_walks(folder)
     before = digests(folder)
@@ -57,13 +57,13 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
 
 @pytest.fixture(scope="session")
 def states() -> list[Path]:
-    """The states of :func:`write_states`. Read only."""
+    """Return the states of :func:`write_states`. Read only."""
     return [make_once("states", write_states) / name for name in ("1.gsm", "2.gsm")]
 
 
 @pytest.fixture(scope="session")
 def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Feature Gaussians of two batches. Read only."""
+    """Return Feature Gaussians of two batches. Read only."""
     path = tmp_path_factory.mktemp("features") / "room.gsm"
     assert main(["extend", str(path), *map(str, write_walks(path.parent)), *PAPER, "--quiet"]) == 0
     return path
@@ -71,7 +71,7 @@ def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """A state of one batch that a test may spoil."""
+    """Return a state of one batch that a test may spoil."""
     (tmp_path / "work").mkdir()
     return Path(shutil.copy(make_once("states", write_states) / "1.gsm", tmp_path / "work" / "state.gsm"))
 

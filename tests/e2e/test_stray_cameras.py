@@ -21,13 +21,13 @@ FEW = ("--budget", "20%", "--fit", "none", "--effort", "draft", "--threads", 1)
 
 @pytest.fixture(autouse=True)
 def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process of a batch takes a second to start."""
+    """Run batches in this process: another takes a second to start."""
     monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
 
 
 @pytest.fixture
 def stray(tmp_path: Path) -> Path:
-    """A scene beside a damaged camera file."""
+    """Return a scene beside a damaged camera file."""
     folder = write_smallest(tmp_path / "room")
     shutil.rmtree(folder / "images")
     (folder / "transforms.json").write_text('{"frames": [')

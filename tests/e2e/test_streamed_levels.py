@@ -21,7 +21,7 @@ QUICK = ("--set", "superpixels=200", "--fit", "none", "--set", "checkpoint=none"
 
 @pytest.fixture(autouse=True)
 def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stand-in for splat-transform, in each test that does not take the program itself."""
+    """Put a stand-in for splat-transform in each test that does not take the program itself."""
     run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
 
 

@@ -21,7 +21,7 @@ COLUMNS, ROWS = 80, 50
 
 
 def screen(data: bytes) -> list[str]:
-    """The lines of a terminal after these bytes: cursor up, erase line, wrapping at the last column."""
+    """Return the lines of a terminal after these bytes: cursor up, erase line, wrapping at the last column."""
     lines, row, column = [""], 0, 0
     text = data.decode("utf-8")
     for match in re.finditer(r"\x1b\[([\d;?]*)([A-Za-z])|(.)", text, re.DOTALL):
@@ -46,7 +46,7 @@ def screen(data: bytes) -> list[str]:
 def in_terminal(
     *words: object, interrupt_at: bytes | None = None, kind: str = "xterm", columns: int = COLUMNS
 ) -> tuple[int, bytes]:
-    """Exit code and bytes of Python in a terminal; Ctrl-C is typed once ``interrupt_at`` has been printed."""
+    """Return exit code and bytes of Python in a terminal; type Ctrl-C once ``interrupt_at`` has been printed."""
     import fcntl
     import termios
 

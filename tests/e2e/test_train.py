@@ -37,7 +37,7 @@ PAPER = {
 
 
 def words(settings: dict[str, Any]) -> list[str]:
-    """``--set`` for every setting."""
+    """Return ``--set`` for every setting."""
     return [word for name, value in settings.items() for word in ("--set", f"{name}={json.dumps(value)}")]
 
 

@@ -29,7 +29,7 @@ from .conftest import Run
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The made scene as voxels."""
+    """Return the made scene as voxels."""
     folder = write_made(tmp_path_factory.mktemp("unaligned") / "scene")
     scene = gsmerge.read_scene(folder)
     gsmerge.write_ply(folder / "scene.ply", unaligned_scenes.voxels(scene, 0.03).gaussians, overwrite=True)

@@ -12,7 +12,7 @@ from .conftest import Run, assert_refused
 
 
 def sources(page: Path) -> list[tuple[str, str | None]]:
-    """Names of what a page shows, each with the place of its Gaussians."""
+    """Return names of what a page shows, each with the place of its Gaussians."""
     data = json.loads(re.findall('<script type="application/json" id="data">(.*?)</script>', page.read_text())[0])
     return [(one["name"], one["splats"]) for one in data["sources"]]
 

@@ -75,7 +75,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, An
 
 
 def with_one_from_outside(gaussians: gsmerge.Gaussians, camera: gsmerge.Cameras) -> gsmerge.Gaussians:
-    """With a long Gaussian that reaches into the camera's picture from three half pictures to its right.
+    """Add a long Gaussian that reaches into the camera's picture from three half pictures to its right.
 
     Another one is far behind the camera, where no view sees it.
     """
@@ -91,7 +91,7 @@ def with_one_from_outside(gaussians: gsmerge.Gaussians, camera: gsmerge.Cameras)
 
 
 def picture(tab: Browser) -> np.ndarray:
-    """``[h,w,3]`` what the stage shows, in [0, 1], once it is the same twice: a busy browser is late."""
+    """Return what the stage shows ``[h,w,3]``, in [0, 1], once it is the same twice: a busy browser is late."""
     tab.wait(f"({SETTLED}) || state.solid === '' && [...document.images].every(image => image.complete)")
     shown = np.empty(0)
     for _ in range(100):
@@ -310,7 +310,7 @@ def test_the_picture_fits_the_window(size: tuple[int, int], page: tuple[Browser,
 def on_phone(page: tuple[Browser, Any]) -> Browser:
     """Return the page as it opens in a window of a phone, held upright."""
     tab, _ = refreshed(page)
-    resize(tab, 390, 844)
+    resize(tab, 390, 844)  # CSS pixels of a common phone
     return tab
 
 
@@ -387,7 +387,7 @@ def test_colours_follow_the_system_unless_the_switch_is_set(page: tuple[Browser,
 
 
 def point(tab: Browser, x: float, y: float, kind: str = "mousePressed", **more: Any) -> None:
-    """An event of the mouse at a place of the stage, in shares of it."""
+    """Send an event of the mouse at a place of the stage, in shares of it."""
     box = tab.box("stage")
     place = {"x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"]}
     tab.call("Input.dispatchMouseEvent", type=kind, **place, **more)

@@ -28,7 +28,7 @@ CLOSE = 0.3  # dB between a result fitted to photos and one fitted to colours th
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene without its photos. Read only."""
+    """Return a scene without its photos. Read only."""
     folder = write_smallest(tmp_path_factory.mktemp("bare") / "scene")
     shutil.rmtree(folder / "images")
     return folder

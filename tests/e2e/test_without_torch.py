@@ -59,7 +59,7 @@ def make_work(folder: Path) -> None:
 
 @pytest.fixture
 def call(tmp_path: Path) -> Call:
-    """``call("-m", "gsmerge", ...)`` runs Python in a copy of that folder, as if there were no torch.
+    """Return ``call("-m", "gsmerge", ...)``, which runs Python in a copy of that folder, as if there were no torch.
 
     Nor is there in the processes that it starts.
     """
@@ -78,7 +78,7 @@ def call(tmp_path: Path) -> Call:
 
 
 def write_lpips_weights(folder: Path) -> None:
-    """Weights of no meaning, where the package of them would be."""
+    """Write weights of no meaning where the package of them would be."""
     rng, inputs = np.random.default_rng(0), 3
     trunk, tree = {}, {}
     for i, conv in enumerate(lpips._ARCHITECTURES["alex"].convs):

@@ -27,7 +27,7 @@ SAID = "worse"
 
 @pytest.fixture(scope="module")
 def one_photo(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """The second of three views alone."""
+    """Return the second of three views alone."""
     folder = write_scene(tmp_path_factory.mktemp("three") / "scene", num_views=3, width=60, height=40)
     return subset(gsmerge.read_scene(folder), [1])
 

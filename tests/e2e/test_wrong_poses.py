@@ -28,12 +28,12 @@ FAST = ("--effort", "fast", "--set", "fit_steps=20", "--json")
 
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Large enough that what cameras are turned by is more than a pixel and a half. Read only."""
+    """Return a scene in which what cameras are turned by is more than a pixel and a half. Read only."""
     return write_scene(tmp_path_factory.mktemp("poses") / "scene", num_views=3, width=108, height=72)
 
 
 def turn_cameras(folder: Path, degrees: float, only: int | None = None) -> None:
-    """The cameras of a scene, or one of them, turned about their centres."""
+    """Turn the cameras of a scene, or one of them, about their centres."""
     path, rng = folder / "transforms.json", np.random.default_rng(0)
     with edited_json(path) as data:
         for i, frame in enumerate(data["frames"]):

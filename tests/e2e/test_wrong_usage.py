@@ -185,7 +185,7 @@ NEED_THE_SCENE = {  # to be known as wrong: refused by the plan, all others befo
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that the calls are run in. Read only."""
+    """Return the folder that the calls are run in. Read only."""
     folder = tmp_path_factory.mktemp("prepared") / "work"
     room = write_small(folder / "room")
     write_without_grid(room / "scene.ply", folder / "alone.ply")
@@ -246,7 +246,7 @@ def test_help_as_a_word_prints_what_the_option_prints(run: Run) -> None:
 
 
 def commands(command: Any, *words: str) -> Iterator[tuple[list[str], Any]]:
-    """Each command with the words that call it, its arguments among them."""
+    """Return each command with the words that call it, its arguments among them."""
     needed = [f"{param.name}.ply" for param in command.params if param.param_type_name == "argument" and param.required]
     yield [*words, *needed], command
     for word, inner in getattr(command, "commands", {}).items():

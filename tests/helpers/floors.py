@@ -27,7 +27,7 @@ LEAST_SD = 0.02  # what ten runs may not show of the spread; dB for most
 
 
 def nudged(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians, in runs that measure floors moved by a thousandth of their size."""
+    """Return the Gaussians, in runs that measure floors moved by a thousandth of their size."""
     seed = int(os.environ.get(NUDGE, "0"))
     if seed == 0:
         return gaussians

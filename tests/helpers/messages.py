@@ -39,7 +39,7 @@ def says(text: str, place: object, *values: object) -> bool:
 
 @contextmanager
 def refuses(kind: type[BaseException], place: object, *values: object) -> Iterator[pytest.ExceptionInfo[Any]]:
-    """A block that ends in an error of a kind whose message is one line with a place and values, as :func:`says`."""
+    """Check that a block ends in an error of a kind, in one line with a place and values, as :func:`says`."""
     with pytest.raises(kind) as raised:
         yield raised
     text = str(raised.value)

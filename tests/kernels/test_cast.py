@@ -22,7 +22,7 @@ def rotation(rng: np.random.Generator) -> np.ndarray:
 
 
 def random_shape(kind: int, rng: np.random.Generator) -> Shape:
-    """Around (0, 0, 4), about 1 large, in any attitude."""
+    """Draw a shape around (0, 0, 4), about 1 large, in any attitude."""
     waves = NO_WAVES
     if kind == BLOB:
         numbers = rng.normal(0, 2, (4, 3))
@@ -32,7 +32,7 @@ def random_shape(kind: int, rng: np.random.Generator) -> Shape:
 
 
 def sides(shape: Shape, points: np.ndarray) -> np.ndarray:
-    """On which side of the surface points in its frame are; the surface is where that changes."""
+    """Return on which side of the surface points in its frame are; the surface is where that changes."""
     (x, y, z), (a, b, c, taper) = points.T, shape.size
     number, phase, height = shape.waves[:, :3], shape.waves[:, 3], shape.waves[:, 4]
     if shape.kind == BOX:

@@ -44,7 +44,7 @@ class Views:
         return x / z, y / z, z, K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2], world
 
     def compared(self, pair: int) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """Curvature, slope, cost and flow of one pair, by arrays."""
+        """Return curvature, slope, cost and flow of one pair, by arrays."""
         a, b = PAIRS[pair]
         x, y, z, u, v, world = self.places(self.viewmats, a, b)
         inside = (z > NEAR) & (u > BORDER) & (u < WIDTH - BORDER) & (v > BORDER) & (v < HEIGHT - BORDER)

@@ -17,7 +17,7 @@ N = 300
 
 
 def numbers(moved: np.ndarray) -> np.ndarray:
-    """Sums of differences ``[c,m]`` whose sign is the lowest bit."""
+    """Return sums of differences ``[c,m]`` whose sign is the lowest bit."""
     wide = moved.astype(np.int64)
     return np.cumsum((wide >> 1) ^ -(wide & 1), axis=1)
 

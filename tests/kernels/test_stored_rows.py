@@ -17,7 +17,7 @@ ODD = {
 
 
 def make_rows(num_higher: int, seed: int = 0) -> np.ndarray:
-    """Rows of plain Gaussians with two columns beside what is used, all columns in a mixed order."""
+    """Make rows of plain Gaussians with two columns beside what is used, all columns in a mixed order."""
     rng = np.random.default_rng(seed)
     names = [*arrays.REQUIRED_COLUMNS, *arrays.NORMALS[:2], *(f"f_rest_{i}" for i in range(3 * num_higher))]
     rows = np.empty(N, [(name, "<f4") for name in rng.permutation(names)])

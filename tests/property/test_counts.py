@@ -20,7 +20,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def random_tree(seed: int, num_views: int, colours: int) -> RegionTree:
-    """Small views; few colours and depths make ties, some pixels do not count."""
+    """Draw a tree of small views; few colours and depths make ties, some pixels do not count."""
     rng = np.random.default_rng(seed)
     height, width = rng.integers(3, 16, 2)
     shape = (num_views, height, width)
@@ -58,7 +58,7 @@ def test_cuts_have_exact_counts_that_nest(seed: int, num_views: int, colours: in
 
 
 def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:
-    """Up to 12 groups of up to 20 members, some of them alike."""
+    """Draw up to 12 groups of up to 20 members, some of them alike."""
     rng = np.random.default_rng(seed)
     sizes = rng.integers(1, 20, rng.integers(1, 12))
     n, g = int(sizes.sum()), len(sizes)

@@ -21,7 +21,7 @@ def novel_psnr(gaussians: Gaussians, surfaces: list[scenes.Surface], start: floa
 
 
 def painted(scene: Scene, images: np.ndarray) -> Scene:
-    """With other photos, and Gaussians of their colours."""
+    """Return the scene with other photos, and Gaussians of their colours."""
     sh0 = ((images.reshape(-1, 1, 3) - 0.5) / SH_C0).astype(np.float32)
     return replace(scene, images=images.astype(np.float32), gaussians=replace(scene.gaussians, sh0=sh0))
 
@@ -68,7 +68,7 @@ def test_photos_of_noise_make_few_gaussians(room: Scene, segmentation: str) -> N
 
 
 def shiny(scene: Scene, strength: float) -> Scene:
-    """Degree 3, the same strong harmonics everywhere, photos rendered from the Gaussians."""
+    """Return the scene with the same strong harmonics of degree 3 everywhere, and photos rendered from them."""
     coefficients = np.random.default_rng(1).normal(0, strength, (1, 15, 3)).astype(np.float32)
     shN = coefficients.repeat(len(scene.gaussians), 0)
     made = replace(scene, gaussians=replace(scene.gaussians, shN=shN))

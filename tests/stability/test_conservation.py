@@ -24,18 +24,18 @@ def build(name: str, noise: float) -> Scene:
 
 @pytest.fixture(scope="module", params=EACH)
 def scene(request: pytest.FixtureRequest) -> Scene:
-    """With the depth noise of a network."""
+    """Return a scene with the depth noise of a network."""
     return build(request.param, 0.02)
 
 
 @pytest.fixture(scope="module", params=EACH)
 def clean(request: pytest.FixtureRequest) -> Scene:
-    """With hardly any, so that groups are thin."""
+    """Return a scene with hardly any noise, so that groups are thin."""
     return build(request.param, 0.005)
 
 
 def coverage(gaussians: Gaussians, scene: Scene) -> tuple[float, float]:
-    """Mean alpha and luma over all views."""
+    """Return the mean alpha and luma over all views."""
     images, alphas = scenes.images_of(gaussians, scene.cameras)
     return float(alphas.mean()), float((images @ np.array([0.299, 0.587, 0.114])).mean())
 

@@ -96,7 +96,7 @@ def test_order_of_views_does_not_matter_to_the_choice_of_start(room: Scene) -> N
 
 
 def misplaced(scene: Scene, degrees: float) -> Scene:
-    """Views 1 and 2 with their Gaussians turned about their own eyes, one to either side."""
+    """Turn views 1 and 2 with their Gaussians about their own eyes, one to either side."""
     means, viewmats = scene.gaussians.means.copy().reshape(3, -1, 3), scene.cameras.viewmats.copy()
     for view, sign in ((1, 1), (2, -1)):
         angle = np.deg2rad(sign * degrees)

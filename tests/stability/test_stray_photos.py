@@ -26,7 +26,7 @@ FIT = {"superpixels": 50, "fit_steps": 30, "checkpoint": "none", "poses": "fixed
 
 
 def only(view: int, change: Callable[[Photos], Photos], photos: Photos) -> Photos:
-    """The change in one photo alone."""
+    """Change one photo alone."""
     return np.where(np.arange(VIEWS)[:, None, None, None] == view, change(photos), photos)
 
 
@@ -133,7 +133,7 @@ def tinted(photos: Photos) -> Photos:
 
 
 def shifted(photos: Photos) -> Photos:
-    """By a pixel, as where the cameras are not exact."""
+    """Shift photos by a pixel, as where the cameras are not exact."""
     return np.roll(photos, 1, 2)
 
 

@@ -23,7 +23,7 @@ def room() -> Scene:
 
 
 def compacted(scene: Scene, **settings: Any) -> CompactResult:
-    """A tenth of the pixels, with what must hold of every result checked."""
+    """Compact to a tenth of the pixels, and check what must hold of every result."""
     result = compact(scene, **{"superpixels": "10%", "fit_steps": 10, **settings})
     for name in scenes.FIELDS:
         assert np.isfinite(getattr(result.gaussians, name)).all(), name

@@ -65,7 +65,7 @@ class Case:
         return self.starts, self.ids, self.means, self.sh, self.opacities, self.centres, self.footprints
 
     def children(self, count: int | np.ndarray) -> list[list[frozenset[int]]]:
-        """The children of every group."""
+        """Return the children of every group."""
         starts, ids, parents = bisect(*self.arrays(), count)
         assert (np.diff(starts) > 0).all()
         actual: list[list[frozenset[int]]] = [[] for _ in self.groups]
@@ -81,7 +81,7 @@ class Case:
         return np.maximum(self.opacities[rows].astype(float), 1e-3)
 
     def error(self, group: int, parts: list[frozenset[int]]) -> float:
-        """Weighted squared error of all children of a group."""
+        """Return the weighted squared error of all children of a group."""
         rows = [np.array(sorted(p)) for p in parts]
         return sum(np.trace(scatter(self.features(group, r), self.weights(r))) for r in rows)
 

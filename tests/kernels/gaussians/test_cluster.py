@@ -34,7 +34,7 @@ def overlap(a: Gaussian, b: Gaussian) -> float:
 
 
 def overlap_reference(a: Gaussian, b: Gaussian) -> float:
-    """exp(-D_B), Bhattacharyya 1943."""
+    """Return exp(-D_B), Bhattacharyya 1943."""
     middle, delta = (a[1] + b[1]) / 2, b[0] - a[0]
     distance = delta @ np.linalg.solve(middle, delta) / 8
     dets = [np.linalg.det(c) for c in (middle, a[1], b[1])]

@@ -20,7 +20,7 @@ from gsmerge.types import SH_C0, Cameras, Scene
 def slowly(
     means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras, most: int | None = None
 ) -> np.ndarray:
-    """``[g,7]``: a loop over points and views."""
+    """Return the statistics ``[g,7]`` by a loop over points and views."""
     distances = camera_distances(cameras)
     places, depths = project(means, cameras)
     actual = np.zeros((len(means), 7))

@@ -16,7 +16,7 @@ REACH = 2.0
 
 
 def make_planes(views: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Planes of cameras near the origin that look along z, each with a frustum of its own."""
+    """Make planes of cameras near the origin that look along z, each with a frustum of its own."""
     random = np.random.default_rng(seed)
     left, right, top, bottom = random.uniform([-0.9, 0.2, -0.7, 0.1], [-0.2, 0.9, -0.1, 0.7], (views, 4)).T
     zero, one = np.zeros(views), np.ones(views)
@@ -27,7 +27,7 @@ def make_planes(views: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cut_slowly(mean: np.ndarray, covar: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Mean and covariance of one Gaussian after two cuts at most, and whether it is cut."""
+    """Return mean and covariance of one Gaussian after two cuts at most, and whether it is cut."""
     is_cut = False
     for _ in range(2):
         sigmas = np.array([[sqrt(n @ covar @ n) for n in view] for view in normals])
@@ -45,7 +45,7 @@ def cut_slowly(mean: np.ndarray, covar: np.ndarray, normals: np.ndarray, offsets
 
 
 def cut(gaussians: Gaussians, normals: np.ndarray, offsets: np.ndarray, *spans: tuple[int, int]) -> tuple:
-    """The kernel's means, covariances and marks."""
+    """Return the kernel's means, covariances and marks."""
     means, num = gaussians.means.astype(np.float32), len(gaussians)
     covars, is_cut = np.full((num, 3, 3), np.nan), np.zeros(num, np.uint8)
     columns = gaussians.quats.astype(np.float32), gaussians.scales.astype(np.float32)
@@ -98,7 +98,7 @@ def test_moments_are_those_of_the_part_inside() -> None:
 
 
 def cut_once(mean: np.ndarray, covar: np.ndarray, normal: np.ndarray, offset: float) -> tuple[np.ndarray, np.ndarray]:
-    """Moments of what lies inside of one plane."""
+    """Return moments of what lies inside of one plane."""
     sigma = sqrt(normal @ covar @ normal)
     room = (offset - normal @ mean) / sigma
     hazard = exp(-room * room / 2) / sqrt(2 * pi) / (0.5 + 0.5 * erf(room / sqrt(2)))

@@ -23,7 +23,7 @@ CASES = [(400, 0, 0.5, -3.5), (150, 1, 3.0, -1.5), (60, 2, 0.1, -0.5), (0, 3, 0.
 
 
 def slowly(gaussians: Gaussians, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weights ``[n]``, pixels ``[n]`` and fronts ``[h,w]`` of a view."""
+    """Return weights ``[n]``, pixels ``[n]`` and fronts ``[h,w]`` of a view."""
     places, depths = project(gaussians.means.astype(np.float64), CAMERAS[[view]])
     weights, pixels = np.zeros(len(gaussians)), np.full(len(gaussians), -1)
     passing, most, fronts = np.ones((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH)), np.full((HEIGHT, WIDTH), -1)
@@ -50,7 +50,7 @@ def slowly(gaussians: Gaussians, view: int) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def weigh(gaussians: Gaussians, view: int) -> tuple[np.ndarray, ...]:
-    """The kernel's rows, pixels, weights and fronts."""
+    """Return the kernel's rows, pixels, weights and fronts."""
     fronts = np.empty((HEIGHT, WIDTH), np.int32)
     columns = (np.ascontiguousarray(column, np.float32) for column in (gaussians.means, gaussians.scales))
     opacities = gaussians.opacities.astype(np.float32)

@@ -72,7 +72,7 @@ def make_run(count: int, seed: int = 0) -> Run:
 
 
 def gradients(count: int, seed: int, share: float = 0.6, size: float = 1.0) -> Wanted:
-    """Of a part of the rows."""
+    """Return random gradients of a part of the rows."""
     rng = np.random.default_rng(seed)
     ids = np.flatnonzero(rng.random(count) < share).astype(np.int32)
 
@@ -94,7 +94,7 @@ def step_kernel(run: Run, g: Wanted, step: int, pieces: list[int] | None = None,
 
 
 def step_slowly(run: Run, g: Wanted, step: int) -> None:
-    """The textbook (Kingma and Ba, 2015; Dozat, 2016), row by row in float64, with what the kernel's docstring says."""
+    """Step as the textbook (Kingma and Ba, 2015; Dozat, 2016) and the kernel's docstring say, row by row in float64."""
     for k, i in enumerate(g.ids):
         alpha = run.opacities[i]
         row = np.concatenate([

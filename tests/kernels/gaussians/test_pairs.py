@@ -31,7 +31,7 @@ def cloud_of(count: int, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def merge_two(first: tuple, second: tuple) -> tuple:
-    """Mean, covariance, mass, colour and weight of two."""
+    """Return the mean, covariance, mass, colour and weight of two."""
     share = second[2] / (first[2] + second[2])
     apart = second[0] - first[0]
     covar = (1 - share) * first[1] + share * second[1] + share * (1 - share) * np.outer(apart, apart)
@@ -40,7 +40,7 @@ def merge_two(first: tuple, second: tuple) -> tuple:
 
 
 def cost_of(first: tuple, second: tuple) -> float:
-    """Runnalls' bound per mass, and the distance of the colours, times both weights."""
+    """Return Runnalls' bound per mass, and the distance of the colours, times both weights."""
     both = merge_two(first, second)
     logs = [np.linalg.slogdet(one[1])[1] for one in (both, first, second)]
     lost = 0.5 * (logs[0] - (first[2] * logs[1] + second[2] * logs[2]) / both[2])
@@ -48,7 +48,7 @@ def cost_of(first: tuple, second: tuple) -> float:
 
 
 def agglomerate_slowly(cloud: dict[str, np.ndarray], rows: np.ndarray, least: int) -> tuple[list, list[float]]:
-    """Pairs and costs of one cell: every pair is measured anew before every merge."""
+    """Return pairs and costs of one cell; measure every pair anew before every merge."""
     means, masses = cloud["means"][rows], cloud["masses"][rows].astype(float)
     covars = np.zeros((len(rows), 3, 3))
     covars[:, UPPER[0], UPPER[1]] = covars[:, UPPER[1], UPPER[0]] = cloud["covars"][rows]

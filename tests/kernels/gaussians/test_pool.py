@@ -17,7 +17,7 @@ def rotation(quat: np.ndarray) -> np.ndarray:
 
 
 def pool_reference(members: dict[str, np.ndarray], rows: list[int], own: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The 13 numbers and the harmonics of one group, from the formulas in docs of the kernel."""
+    """Return the 13 numbers and the harmonics of one group, from the formulas in docs of the kernel."""
     means, scales = members["means"][rows].astype(float), members["scales"][rows].astype(float)
     opacities = np.minimum(members["opacities"][rows].astype(float), 0.995)
     footprints = members["footprints"][rows].astype(float)

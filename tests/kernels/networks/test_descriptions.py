@@ -56,7 +56,7 @@ def logit(opacity: float) -> float:
 
 
 def slow_group(features: GroupFeatures, row: int, viewmat: np.ndarray) -> list[float]:
-    """The first 19 numbers of a group, see the kernel."""
+    """Return the first 19 numbers of a group, see the kernel."""
     f, base = features.features, features.base
     mean, pixel, size = (np.float64(x[row]) for x in (base.means, f.footprints, features.sizes))
     frame, count = slow_frame(mean, viewmat), int(np.diff(f.starts)[row])
@@ -69,7 +69,7 @@ def slow_group(features: GroupFeatures, row: int, viewmat: np.ndarray) -> list[f
 
 
 def slow_part(features: GroupFeatures, parts: Gaussians, part: int, owner: int) -> list[float]:
-    """The numbers of a part relative to a group, as a member."""
+    """Return the numbers of a part relative to a group, as a member."""
     base, frame = features.base, features.frames[owner].astype(np.float64)
     size, pixel = float(features.sizes[owner]), float(features.footprints[owner])
     offset = frame.T @ (parts.means[part].astype(np.float64) - base.means[owner])

@@ -46,7 +46,7 @@ def some(*shape: int, seed: int = 0) -> np.ndarray:
 
 
 def activate(values: np.ndarray, activation: int) -> np.ndarray:
-    """A dense layer that changes nothing, and its activation."""
+    """Return a dense layer that changes nothing, and its activation."""
     out = np.empty((len(values), 1), np.float32)
     dense(
         values.reshape(-1, 1),
@@ -166,7 +166,7 @@ def test_sizes_that_do_not_go_together_are_refused() -> None:
 
 
 def inputs_of(name: str, options: NetworkOptions, count: int) -> tuple[np.ndarray, ...]:
-    """Random inputs of a network: some tokens do not count."""
+    """Return random inputs of a network: some tokens do not count."""
     kind, _, slots = name.partition(".")
     width, tokens = {
         "encoder": (MEMBER_COLUMNS, options.members), "merger": (PART_COLUMNS + options.latent, 5),

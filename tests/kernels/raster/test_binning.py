@@ -30,7 +30,7 @@ def test_depth_order_is_a_stable_sort(values: np.ndarray) -> None:
 
 
 def random_boxes(count: int, tile_height: int, tile_width: int) -> np.ndarray:
-    """First and exclusive last column and row; every fifth one empty."""
+    """Draw first and exclusive last column and row; every fifth one is empty."""
     x, y = (
         np.sort(RNG.integers(0, tile_width + 1, (count, 2)), 1),
         np.sort(RNG.integers(0, tile_height + 1, (count, 2)), 1),

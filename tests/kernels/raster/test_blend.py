@@ -31,7 +31,7 @@ def reference(gaussians: Gaussians, cameras: Cameras, **options: object) -> Refe
 
 
 def assert_alike(image: object, expected: object, most: float = 0.02) -> None:
-    """Equal up to rounding but for single pixels where a threshold or a depth tie falls the other way."""
+    """Check for equality up to rounding but for single pixels where a threshold or a depth tie falls the other way."""
     error = np.abs(np.asarray(image, np.float64) - np.asarray(expected))
     assert error.max() < most
     assert np.quantile(error, 0.99) < 2e-5

@@ -26,7 +26,7 @@ def some_labels(count: int, seed: int = 0) -> np.ndarray:
 
 
 def superpixel_sums(gaussians: Gaussians, labels: np.ndarray, viewmat: np.ndarray | None = None) -> np.ndarray:
-    """``[n,labels]`` every Gaussian's weights, one pixel after the other, float64."""
+    """Return every Gaussian's weights ``[n,labels]``, one pixel after the other, float64."""
     weights = render_arrays(gaussians, np.eye(4) if viewmat is None else viewmat, K, WIDTH, HEIGHT).weights
     sums = np.zeros((labels.max() + 1, len(gaussians)))
     np.add.at(sums, labels.reshape(-1), weights.reshape(len(gaussians), -1).T)

@@ -17,7 +17,7 @@ SIZES = [(20, 17), (7, 7), (3, 5), (1, 9)]
 
 
 def pictures(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render, photo, weights of the pixels (a part of them zero)."""
+    """Return a render, a photo and weights of the pixels (a part of them zero)."""
     rng = np.random.default_rng(seed)
     photo = rng.uniform(0, 1, (*size, 3))
     image = photo + rng.normal(size=photo.shape) * 0.2
@@ -26,12 +26,12 @@ def pictures(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarr
 
 
 def box(images: torch.Tensor) -> torch.Tensor:
-    """Means over 7 x 7 windows of ``[h,w,3]``, zero beyond the border."""
+    """Return means over 7 x 7 windows of ``[h,w,3]``, zero beyond the border."""
     return avg_pool2d(images.permute(2, 0, 1)[None], 7, 1, 3, count_include_pad=True)[0].permute(1, 2, 0)
 
 
 def similarity(image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
-    """SSIM ``[h,w,3]`` (Wang et al., 2004)."""
+    """Return the SSIM ``[h,w,3]`` (Wang et al., 2004)."""
     mx, my = box(image), box(photo)
     xx, yy, xy = box(image * image) - mx * mx, box(photo * photo) - my * my, box(image * photo) - mx * my
     c1, c2 = float(C1), float(C2)

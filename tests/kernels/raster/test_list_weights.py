@@ -30,7 +30,7 @@ def tile_and_weigh(gaussians: Gaussians) -> tuple[TiledView, ViewWeights]:
 
 
 def entry_pixels(weights: ViewWeights) -> np.ndarray:
-    """Row-major pixel of the image of every entry."""
+    """Return the row-major pixel of the image of every entry."""
     tiles = np.repeat(np.arange(len(weights.isect_offsets) - 1), np.diff(weights.isect_offsets))
     tiles = np.repeat(tiles, np.diff(weights.starts))
     y = tiles // weights.tile_width * 16 + weights.lanes // 16
@@ -41,7 +41,7 @@ def entry_pixels(weights: ViewWeights) -> np.ndarray:
 
 
 def dense(weights: ViewWeights, count: int) -> np.ndarray:
-    """``[pixels,n]``."""
+    """Return the weights as a matrix ``[pixels,n]``."""
     matrix, pixels = np.zeros((HEIGHT * WIDTH, count)), entry_pixels(weights)
     for i, member in enumerate(weights.flatten_ids):
         entries = slice(weights.starts[i], weights.starts[i + 1])

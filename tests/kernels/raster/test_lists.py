@@ -24,7 +24,7 @@ M, N, SIDE = 3, 5, 20
 
 
 def lists(**changes: Any) -> dict[str, Any]:
-    """Three Gaussians in the first and the last of four tiles."""
+    """Return lists of three Gaussians in the first and the last of four tiles."""
     conics = np.tile(np.array([8, 8, 0.2, 0, 0.04, -1, 0, SIDE], np.float32), (M, 1))
     flatten_ids, isect_offsets = np.array([0, 1, 2, 0, 1], np.int32), np.array([0, 3, 3, 3, 5])
     lists = {"conics": conics, "flatten_ids": flatten_ids, "isect_offsets": isect_offsets, "tile_width": 2}
@@ -32,7 +32,7 @@ def lists(**changes: Any) -> dict[str, Any]:
 
 
 def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
-    """Calls of all walks with the same lists."""
+    """Return calls of all walks with the same lists."""
     colors, image, left = (
         np.ones((M, 3), np.float32),
         np.empty((SIDE, SIDE, 3), np.float32),

@@ -26,7 +26,7 @@ def normal(*shape: int) -> np.ndarray:
 
 
 def columns_of(n: int, num: int = 3, *, hostile: bool = False) -> Columns:
-    """Gaussians in front of the camera; every third number is a hostile one if that is asked for."""
+    """Return Gaussians in front of the camera; every third number is a hostile one if that is asked for."""
     columns = {
         "means": normal(n, 3) + np.float32([0, 0, 3]), "quats": normal(n, 4), "scales": exp(normal(n, 3) - 3),
         "opacities": RNG.random(n, dtype=np.float32), "sh0": normal(n, 1, 3), "shN": normal(n, num, 3),
@@ -38,7 +38,7 @@ def columns_of(n: int, num: int = 3, *, hostile: bool = False) -> Columns:
 
 
 def camera_of(antialiased: bool = False) -> np.ndarray:
-    """A camera of 60 x 40 pixels at the origin."""
+    """Return a camera of 60 x 40 pixels at the origin."""
     camera = np.zeros(project.CAMERA, np.float32)
     camera[: project.SHIFT] = np.eye(3).ravel()
     camera[project.FX : project.NEAR] = 50, 50, 30, 20, 60, 40
@@ -114,7 +114,7 @@ def colors_of(c: Columns) -> list[np.ndarray]:
 
 
 def plain(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The arrays with one NaN for all: its sign goes with the order of operands, which compilers choose."""
+    """Return the arrays with one NaN for all: its sign goes with the order of operands, which compilers choose."""
     return [np.where(np.isnan(array), np.float32(np.nan), array) for array in arrays]
 
 

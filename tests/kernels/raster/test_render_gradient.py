@@ -62,7 +62,7 @@ def test_antialiased_gradients_match_autograd(seed: int) -> None:
 
 
 def border(g: Gaussians) -> Gaussians:
-    """Their centres beyond the clamp of the viewing direction, reaching into the image."""
+    """Move Gaussians' centres beyond the clamp of the viewing direction, so that they reach into the image."""
     side = torch.tensor([1.0, -1.0]).repeat(len(g) // 2)
     means = g.means.clone()
     means[::4, 0], means[1::4, 0] = 0.75 * means[::4, 2].abs() * side[::4], -0.9 * means[1::4, 2].abs()

@@ -22,7 +22,7 @@ def parts_of(conics: np.ndarray) -> np.ndarray:
 
 
 def conics_of(kind: str, rng: np.random.Generator) -> np.ndarray:
-    """``[BATCH,8]`` of Gaussians around the tile, their rows those of the whole image."""
+    """Return conics ``[BATCH,8]`` of Gaussians around the tile, their rows those of the whole image."""
     rows = np.zeros((BATCH, 8), np.float32)
     reach = {"near": 8, "far": 40, "huge": 3000}[kind]
     rows[:, 0] = LEFT + 8 + rng.uniform(-reach, reach, BATCH)

@@ -17,5 +17,5 @@ def pixels() -> np.ndarray:
 
 @pytest.fixture
 def labels() -> np.ndarray:
-    """30 connected regions of the picture, not padded."""
+    """Return 30 connected regions of the picture, not padded."""
     return seeds.voronoi(seeds.hexagonal_seeds(*SIZE, 30), *SIZE)

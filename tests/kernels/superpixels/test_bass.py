@@ -28,7 +28,7 @@ def test_simple_points_do_not_change_the_parts_of_either_side() -> None:
 
 
 def slow_parameters(colours: np.ndarray, labels: np.ndarray, count: int) -> list[tuple]:
-    """(mean colour, mean position, covariance) of every region, as the model's posterior has them."""
+    """Return (mean colour, mean position, covariance) of every region, as the model's posterior has them."""
     area, actual = labels.size / count, []
     for k in range(count):
         y, x = np.nonzero(labels == k)
@@ -48,7 +48,7 @@ def test_parameters_of_regions_match_a_slow_twin(pixels: np.ndarray, labels: np.
 
 
 def slow_label_pass(colours: np.ndarray, labels: np.ndarray, count: int, deviation: float) -> np.ndarray:
-    """The constrained label update, pixel by pixel, with the parameters held."""
+    """Update labels under the constraint, pixel by pixel, with the parameters held."""
     (height, width), parameters, table = (
         labels.shape,
         slow_parameters(colours, labels, count),

@@ -16,7 +16,7 @@ ONE = pad_labels(np.zeros((1, 1), int))
 
 
 def make_picture(height: int, width: int) -> np.ndarray:
-    """Noise on a slope."""
+    """Make a picture of noise on a slope."""
     noise = np.random.default_rng(0).random((height, width, 3), dtype=np.float32)
     return 0.3 * noise + np.linspace(0, 0.7, width, dtype=np.float32)[:, None]
 

@@ -18,7 +18,7 @@ def test_integral_image_sums_the_pixels_above_and_left(pixels: np.ndarray) -> No
 
 
 def brute_cuts(pixels: np.ndarray, y0: int, x0: int, y1: int, x1: int) -> list[tuple[float, int, int]]:
-    """(gain, axis, cut) of every straight cut of a rectangle."""
+    """Return (gain, axis, cut) of every straight cut of a rectangle."""
     points = features(pixels).reshape(*pixels.shape[:2], 5)[y0:y1, x0:x1]
     whole, gains = squared_error(points.reshape(-1, 5)), []
     for axis in (0, 1):
@@ -46,7 +46,7 @@ def test_best_cut_is_the_largest_fall_of_the_error(pixels: np.ndarray, box: tupl
 
 
 def greedy_rectangles(pixels: np.ndarray, count: int) -> np.ndarray:
-    """The best cut of all, again and again."""
+    """Make the best cut of all, again and again."""
     labels = np.zeros(pixels.shape[:2], int)
     heap: list[tuple] = []
 

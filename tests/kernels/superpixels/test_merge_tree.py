@@ -34,7 +34,7 @@ class View:
         return float(((self.pixels[mask] - self.pixels[mask].mean(0, dtype=float)) ** 2).sum()) if mask.any() else 0.0
 
     def plane_error(self, mask: np.ndarray) -> float:
-        """Least squares of z (a x + b y + c) against 1, the slopes damped; in coordinates about the region's middle."""
+        """Fit z (a x + b y + c) to 1 by least squares, the slopes damped; in coordinates about the region's middle."""
         mask = mask & (self.depths > 0)
         if not mask.any():
             return 0.0
@@ -71,7 +71,7 @@ class View:
 
 
 def merge_reference(view: View, max_extent: float) -> tuple[list[int], list[float], list[float]]:
-    """The cheapest pair of neighbours of all, again and again."""
+    """Merge the cheapest pair of neighbours of all, again and again."""
     masks = {i: view.labels == i for i in range(COUNT)}
     touching = {tuple(sorted(p)) for p in adjacent_pairs(pad_labels(view.labels)).tolist()}
     parents, heights, growths = [-1] * (2 * COUNT - 1), [0.0] * (2 * COUNT - 1), []

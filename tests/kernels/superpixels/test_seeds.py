@@ -18,7 +18,7 @@ def test_voronoi_regions_hold_the_nearest_pixels() -> None:
 
 
 def slow_dither(density: np.ndarray) -> np.ndarray:
-    """Floyd-Steinberg error diffusion, serpentine, with the kernel's noise."""
+    """Diffuse errors as Floyd and Steinberg do, serpentine, with the kernel's noise."""
     height, width = density.shape
     left, seeds_at, noise = density.copy(), np.zeros(density.shape, bool), 1
     for y in range(height):

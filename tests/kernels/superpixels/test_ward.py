@@ -37,7 +37,7 @@ def test_adjacent_pairs_are_all_neighbours(labels: np.ndarray) -> None:
 
 
 def greedy_merge(pixels: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """The cheapest pair of neighbours, again and again."""
+    """Merge the cheapest pair of neighbours, again and again."""
     labels, points = labels.copy(), features(pixels)
 
     def cost(pair: tuple[int, int]) -> float:

@@ -38,7 +38,7 @@ def assert_close(a: FeatureGaussians | Gaussians, b: FeatureGaussians | Gaussian
 
 
 def pairs(features: FeatureGaussians) -> Matches:
-    """Every Feature Gaussian of the first view with the same one of the second, but for the first."""
+    """Match every Feature Gaussian of the first view with the same one of the second, but for the first."""
     half = len(features) // 2
     clusters = np.tile(np.arange(half), 2)
     clusters[half] = half

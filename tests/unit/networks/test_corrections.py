@@ -43,7 +43,7 @@ def move(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarray, axes: 
 
 
 def base_of(features: FeatureGaussians) -> Gaussians:
-    """The Gaussian of each, in C order."""
+    """Return the Gaussian of each, in C order."""
     return Gaussians(*(np.ascontiguousarray(column) for column in vars(feature_to_gaussians(features)).values()))
 
 

@@ -33,7 +33,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Networks that moved away from their start at random."""
+    """Return networks that moved away from their start at random."""
     return written(tmp_path_factory.mktemp("networks") / "absolute.safetensors", noisy(SMALL, 0.05))
 
 

@@ -62,7 +62,7 @@ def test_policy_lets_the_page_s_own_scripts_and_styles_run_alone(page: str) -> N
 
 
 def _written(page: str) -> str:
-    """The page without what is in base64: pictures and programs."""
+    """Return the page without what is in base64: pictures and programs."""
     return re.sub(r'(<script type="text/plain" id="[\w-]+">)[^<]*', r"\1", re.sub(r"base64,[\w+/=]+", "base64,", page))
 
 
@@ -96,7 +96,7 @@ def test_page_holds_the_data_that_its_script_reads(page: str, data: ViewData) ->
 
 
 def with_three_results(data: ViewData) -> ViewData:
-    """The scene with results of a half, a tenth and a hundredth; the second is worse than it."""
+    """Return the scene with results of a half, a tenth and a hundredth; the second is worse than it."""
     scene, half = (replace(side, num_gaussians=1000, mean=Quality(20.0, 0.5)) for side in data.sides)
     half = replace(half, name="half", num_gaussians=500, file_bytes=2_000, mean=Quality(25.0, 0.75))
     tenth = replace(half, name="tenth", num_gaussians=100, file_bytes=400, mean=Quality(19.0, 0.5, lpips_alex=0.25))
@@ -185,7 +185,7 @@ def test_colours_are_readable_in_both_schemes(page: str) -> None:
 
 
 def contrast(*colors: str) -> float:
-    """The ratio of two colours' luminances, as WCAG 2 has it."""
+    """Return the ratio of two colours' luminances, as WCAG 2 has it."""
 
     def luminance(color: str) -> float:
         digits = color[1:] if len(color) == 7 else "".join(2 * digit for digit in color[1:])

@@ -35,7 +35,7 @@ def assign(
 
 @pytest.fixture(scope="module")
 def others() -> list[np.ndarray]:
-    """Photos of another place."""
+    """Return photos of another place."""
     return list(take_photos(cut_views(VIEWS, 9)))
 
 
@@ -43,7 +43,7 @@ ORDER = [3, 5, 0, 2, 4, 1]  # place of the photo in the pool of each view
 
 
 def in_order(photos: list[np.ndarray]) -> tuple[list[np.ndarray], list[Assignment]]:
-    """A pool in which photos have these places, and what has to be found."""
+    """Return a pool in which photos have these places, and what has to be found."""
     return [photos[ORDER.index(place)] for place in range(VIEWS)], [Assignment(place, 0) for place in ORDER]
 
 
@@ -122,7 +122,7 @@ def test_each_photo_is_read_once_for_its_scores(views: np.ndarray, photos: list[
 
 
 def displaced(photos: list[np.ndarray], pixels: Sequence[int]) -> Assigner:
-    """An assigner of photos whose parts lie some pixels beside what is shown."""
+    """Return an assigner of photos whose parts lie some pixels beside what is shown."""
     pool = [np.roll(photo, away, 1) for photo, away in zip(photos, pixels, strict=True)]
     views = cut_views(VIEWS)
     return Assigner(lambda side: show(views, side), Candidates(lambda photo: pool[photo], VIEWS, lambda _: 0))

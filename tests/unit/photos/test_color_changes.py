@@ -29,7 +29,7 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 
 def pair(change: Change, noise: float = 0.0) -> Pairs:
-    """Photos of four views, which ``change`` brings to what the Gaussians show, but for noise of their pixels."""
+    """Return photos of four views, which ``change`` brings to what the Gaussians show, but for noise of pixels."""
     photos = shrunk(cut_views(4), 96)
     grain = noise * np.random.default_rng(0).standard_normal(photos.shape)
     pictures = (change(photos) + grain).clip(0, 1).astype(np.float32)

@@ -31,12 +31,12 @@ VIEWS = range(5)
 
 
 def grey(*gains: float) -> np.ndarray:
-    """The same logarithmic gain for red, green and blue."""
+    """Return the same logarithmic gain for red, green and blue."""
     return np.repeat(np.array(gains)[:, None], 3, 1)
 
 
 def row(count: int) -> np.ndarray:
-    """Distances of cameras side by side."""
+    """Return distances of cameras side by side."""
     return np.abs(np.subtract.outer(np.arange(count), np.arange(count))).astype(float)
 
 

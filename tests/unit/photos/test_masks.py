@@ -23,7 +23,7 @@ from gsmerge.scene.read import load_scene, read_scene
 
 
 def half(tiny: Tiny) -> np.ndarray:
-    """A mask of the left half."""
+    """Return a mask of the left half."""
     mask = np.zeros((tiny.height, tiny.width), bool)
     mask[:, : tiny.width // 2] = True
     return mask

@@ -22,7 +22,7 @@ from gsmerge.raster.photos import shrink_pictures
 
 
 def correlate_slowly(shown: ViewPictures, view: int, upright: np.ndarray) -> float:
-    """Weighted correlation of local contrasts, the mean of all sizes, pixel by pixel."""
+    """Return the weighted correlation of local contrasts, the mean of all sizes, pixel by pixel."""
     out, most = [], fit_size(upright.shape[1::-1], SCORE_PIXELS[-1])
     for side in SCORE_PIXELS:
         small = shown.shrink(side)

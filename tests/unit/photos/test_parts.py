@@ -22,7 +22,7 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 
 def other(photo: np.ndarray) -> np.ndarray:
-    """A picture of the same size that shows something else."""
+    """Return a picture of the same size that shows something else."""
     return np.ascontiguousarray(cv2.GaussianBlur(photo[::-1, ::-1], (0, 0), 2))
 
 

@@ -39,7 +39,7 @@ def test_metrics_of_tensors_are_those_of_arrays(torch: Any) -> None:
 
 
 def reference_ssim(image: np.ndarray, photo: np.ndarray) -> float:
-    """scikit-image's, with the windows of the literature; it crops the border itself."""
+    """Return scikit-image's SSIM, with the windows of the literature; it crops the border itself."""
     settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     return structural_similarity(
         image.astype(np.float64), photo.astype(np.float64), channel_axis=-1, data_range=1, **settings

@@ -15,13 +15,13 @@ FOCAL = 100.0
 
 
 def camera(width: int = 21, height: int = 11, count: int = 1) -> Cameras:
-    """At the origin, looking along z; the principal point is the centre of the middle pixel."""
+    """Return cameras at the origin that look along z; the principal point is the centre of the middle pixel."""
     K = np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1]])
     return Cameras(np.stack([np.eye(4)] * count), np.stack([K] * count), width, height)
 
 
 def balls(*rows: tuple[float, float, float, float, float, float]) -> Gaussians:
-    """Round grey Gaussians: x, y, z, standard deviation, opacity, grey."""
+    """Return round grey Gaussians: x, y, z, standard deviation, opacity, grey."""
     means, sizes, opacities, greys = np.split(np.array(rows, np.float32).reshape(-1, 6), [3, 4, 5], axis=1)
     n = len(means)
     quats, scales = np.eye(1, 4, dtype=np.float32).repeat(n, 0), sizes.repeat(3, 1)

@@ -32,12 +32,12 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def noisy() -> Scene:
-    """With the errors of an export, which runs of every case begin with."""
+    """Return a scene with the errors of an export, which runs of every case begin with."""
     return load_scene(make_once("small", write_small)).scene
 
 
 def offsets(scene: Scene) -> float:
-    """Largest distance (pixels) of a Gaussian from its pixel."""
+    """Return the largest distance (pixels) of a Gaussian from its pixel."""
     pixels, _ = project(scene.gaussians.means, scene.cameras)
     v, h, w = scene.pixels.shown.shape
     own = pixels.reshape(v, v, h * w, 2)[np.arange(v), np.arange(v)].reshape(v, h, w, 2)
@@ -128,7 +128,7 @@ def test_scenes_without_photos_are_judged_by_colours_of_pixels(noisy: Scene) -> 
 
 
 def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
-    """Every run after the first one goes wrong in some way."""
+    """Let every run after the first one go wrong in some way."""
     genuine, runs = module.compact, []
 
     def compact(scene: Any, options: CompactOptions) -> Any:

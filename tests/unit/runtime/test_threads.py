@@ -23,7 +23,7 @@ def library_threads() -> Iterator[None]:
 
 
 def library_thread_counts() -> list[int]:
-    """Of OpenCV, and of torch where it is installed."""
+    """Return the threads of OpenCV, and of torch where it is installed."""
     torch = sys.modules.get("torch")
     return [cv2.getNumThreads(), *([torch.get_num_threads()] if torch else [])]
 

@@ -20,7 +20,7 @@ from gsmerge.scene.read import load_scene, read_scene
 
 @pytest.fixture(scope="module")
 def smooth() -> Tiny:
-    """Three views of 48 x 36 of a smooth surface."""
+    """Return three views of 48 x 36 of a smooth surface."""
     return smooth_scene(48, 36)
 
 
@@ -121,7 +121,7 @@ def test_unknown_or_impossible_arguments_are_refused(tmp_path: Path, smooth: Tin
 
 
 def dump_of(tiny: Tiny, folder: Path, root: Path, **changes: Any) -> Path:
-    """``views.npz`` beside the Gaussians, written by the lines of the example."""
+    """Write ``views.npz`` beside the Gaussians by the lines of the example."""
     save_export(folder, tiny, export_rows(tiny), cameras=False)
     values = {"c2w": tiny.c2w, "K": np.tile(tiny.K, (3, 1, 1)), "images": tiny.images} | changes
     load_script(root / "examples" / "04_dump_views.py").dump_views(str(folder / "views.npz"), **values)

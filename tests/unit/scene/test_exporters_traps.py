@@ -97,7 +97,7 @@ def test_harmonics_of_long_lrm_are_read_from_the_first_columns(tmp_path: Path, d
 
 
 def sharp_rows(square: Smooth) -> np.ndarray:
-    """Two layers seen by a camera at the origin."""
+    """Return two layers seen by a camera at the origin."""
     one = np.arange(36 * 36)
     rows = turned(export_rows(square, np.concatenate([one, one]), normals=""), square.w2c[0, :3, :3],
                   shift=square.w2c[0, :3, 3])  # fmt: skip
@@ -202,7 +202,7 @@ def test_inria_s_test_cameras_come_first(tmp_path: Path) -> None:
 
 
 def save_world_mirror(folder: Path, scene: Smooth, photos: np.ndarray, ids: Sequence[object] = range(3)) -> None:
-    """Rows of no pixels, photos under names of their own, and ``camera_params.json`` with the cameras in reverse."""
+    """Save rows of no pixels, photos under their own names, and ``camera_params.json`` with cameras in reverse."""
     scene = replace(scene, names=tuple(f"image_{i:04d}.png" for i in range(3)))
     some = np.random.default_rng(0).permutation(len(scene.gaussians))[len(scene.gaussians) // 9 + 1 :]
     save_export(folder, scene, export_rows(scene, some), cameras=False)

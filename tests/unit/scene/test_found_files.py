@@ -30,7 +30,7 @@ def some(views: Sequence[int], scene: Tiny = SMOOTH) -> Tiny:
 
 
 def astray(count: int) -> Tiny:
-    """More cameras than photos, at random places."""
+    """Return more cameras than photos, at random places."""
     c2w = np.tile(np.eye(4), (count, 1, 1))
     for pose, numbers in zip(c2w, np.random.default_rng(1).uniform(-1, 1, (count, 6)), strict=True):
         pose[:3, :3], pose[:3, 3] = rotation(*3 * numbers[:3]), 9 * numbers[3:]
@@ -47,7 +47,7 @@ def resized(scale: float) -> Tiny:
 
 
 def flat(scene: Tiny = SMOOTH) -> Tiny:
-    """Photos and cameras without folders in their names."""
+    """Return photos and cameras without folders in their names."""
     return replace(scene, names=tuple(Path(name).name for name in scene.names))
 
 
@@ -89,7 +89,7 @@ def several_folders(folder: Path) -> None:
 
 
 def other_places(folder: Path) -> None:
-    """Photos of another scene, and those of other names in the usual place."""
+    """Write photos of another scene, and those of other names in the usual place."""
     write_images(folder / "images", replace(dark(), names=("x.png", "y.png", "z.png")))
     write_images(folder / "another/images", flat(dark()))
     write_ply(folder / "another/scene.ply", SMOOTH.gaussians)
@@ -169,7 +169,7 @@ def test_model_in_its_usual_place_gets_no_note(tmp_path: Path) -> None:
 
 
 def mask_paths(folder: Path, paths: Sequence[object], *, size: tuple[int, int] = (56, 40), shared: str = "") -> Path:
-    """Masks that leave out the upper quarter, in a folder of any name."""
+    """Write masks that leave out the upper quarter, in a folder of any name; return the scene."""
     save_export(folder, SMOOTH, export_rows(SMOOTH, ROWS["grid"]))
     picture = np.full(size[::-1], 255, np.uint8)
     picture[: size[1] // 4] = 0

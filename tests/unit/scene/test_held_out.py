@@ -28,7 +28,7 @@ def tiny() -> Tiny:
 
 
 def write_views(folder: Path, poses: dict[str, np.ndarray], tiny: Tiny, size: tuple[int, int] = (32, 24)) -> Path:
-    """``transforms.json`` and a photo for each pose (camera to world, OpenCV)."""
+    """Write ``transforms.json`` and a photo for each pose (camera to world, OpenCV)."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     scale = size[0] / tiny.width
     frames = []
@@ -43,7 +43,7 @@ def write_views(folder: Path, poses: dict[str, np.ndarray], tiny: Tiny, size: tu
 
 
 def between(tiny: Tiny) -> np.ndarray:
-    """A pose that is none of the scene's."""
+    """Return a pose that is none of the scene's."""
     pose = tiny.c2w[0].copy()
     pose[:3, 3] = tiny.c2w[:2, :3, 3].mean(0)
     return pose

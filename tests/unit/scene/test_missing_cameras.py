@@ -21,7 +21,7 @@ FAR = np.argsort(-SMOOTH.gaussians.means[:, 2], kind="stable")[: len(ALL) // 12]
 
 
 def registered(views: list[int], *, moved: bool = False) -> Tiny:
-    """Some of the cameras, as they are or in a world of another frame and scale."""
+    """Return some of the cameras, as they are or in a world of another frame and scale."""
     c2w = SMOOTH.c2w[views].copy()
     if moved:
         turn = rotation(0.4, -0.8, 0.3)

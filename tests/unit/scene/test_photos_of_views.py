@@ -29,13 +29,13 @@ def write_room(folder: Path) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The scene of :func:`write_room`, which a test may change."""
+    """Return the scene of :func:`write_room`, which a test may change."""
     return write_room(tmp_path / "scene")
 
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
-    """The photos of all views ``[v,h,w,3]``."""
+    """Return the photos of all views ``[v,h,w,3]``."""
     return np.stack([read(path) for path in photos_in(write_room(tmp_path_factory.mktemp("photos") / "room"))])
 
 
@@ -50,7 +50,7 @@ def photos_in(folder: Path) -> list[Path]:
 
 
 def right_ones(loaded: Loaded, truth: np.ndarray) -> list[bool]:
-    """Whether each view has its photo."""
+    """Return whether each view has its photo."""
     assert loaded.scene.images is not None
     return [bool(np.abs(a - b).mean() < 0.02) for a, b in zip(loaded.scene.images, truth, strict=True)]
 

@@ -35,7 +35,7 @@ def save_result(path: Path, tiny: Tiny) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The tiny scene as another program writes it, called ``room.ply``."""
+    """Return the tiny scene as another program writes it, called ``room.ply``."""
     tiny = make_tiny()
     return save_export(tmp_path / "scene", tiny, export_rows(tiny), name="room.ply")
 

@@ -26,7 +26,7 @@ KINDS = {"grid": ALL, "voxels": SOME[np.lexsort(SMOOTH.gaussians.means[SOME].rou
 
 
 def another() -> Tiny:
-    """Cameras and photos of another capture, of four views."""
+    """Return cameras and photos of another capture, of four views."""
     c2w = np.concatenate([SMOOTH.c2w, SMOOTH.c2w[:1]])
     for pose, (x, y, z) in zip(c2w, np.random.default_rng(1).uniform(-1, 1, (4, 3)), strict=True):
         pose[:3, :3], pose[:3, 3] = rotation(3 * x, 3 * y, z), (50 + x, y, 9 * z)
@@ -57,7 +57,7 @@ def save(folder: Path, kind: str, *, cameras: bool = False) -> Path:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Loaded]:
-    """What each kind of file is without anything beside it."""
+    """Return what each kind of file is without anything beside it."""
     folder = tmp_path_factory.mktemp("alone")
     return {kind: load_scene(save(folder / kind, kind)) for kind in KINDS}
 

@@ -27,7 +27,7 @@ def scene() -> Scene:
 
 
 def sphere_in(scene: Scene, share: float) -> str:
-    """A sphere about the scene's middle that holds that share of its Gaussians."""
+    """Return a sphere about the scene's middle that holds that share of its Gaussians."""
     means = scene.gaussians.means.astype(float)
     middle = np.median(means, axis=0)
     radius = np.quantile(np.linalg.norm(means - middle, axis=1), share)
@@ -35,7 +35,7 @@ def sphere_in(scene: Scene, share: float) -> str:
 
 
 def wall(n: int = 40) -> Gaussians:
-    """n x n Gaussians that touch, at a distance of 1, on a plane that is not along an axis."""
+    """Return n x n Gaussians that touch, at a distance of 1, on a plane that is not along an axis."""
     y, x = np.divmod(np.arange(n * n), n)
     means = np.stack([x, y, (x + y) / 4], 1).astype(np.float32)
     count = len(means)

@@ -126,7 +126,7 @@ def test_faint_ones_are_left_out(scene: Scene, k: int) -> None:
 
 
 def faint_division(counts: np.ndarray) -> Gaussians:
-    """Groups whose further children are too faint to be seen, except the last two groups'."""
+    """Return groups whose further children are too faint to be seen, except the last two groups'."""
     opacities = np.concatenate(
         [[0.5] + [0.5 if i > 1 else 1e-4 * j for j in range(1, n)] for i, n in enumerate(counts)]
     )

@@ -20,7 +20,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def groups() -> Groups:
-    """Squares of four pixels."""
+    """Return squares of four pixels."""
     ys, xs = np.mgrid[:HEIGHT, :WIDTH]
     labels = (ys // 4 * (WIDTH // 4) + xs // 4).astype(np.int32)
     return Groups(np.stack([labels, labels]), (6, 6))

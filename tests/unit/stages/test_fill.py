@@ -14,7 +14,7 @@ from gsmerge.types import Cameras, Gaussians
 
 
 def sheet(left: float, right: float, depth: float, color: float) -> Gaussians:
-    """A plane across the cameras' axis, from ``left`` to ``right``, of opaque Gaussians."""
+    """Return a plane across the cameras' axis, from ``left`` to ``right``, of opaque Gaussians."""
     step = 0.004 * depth
     x, y = np.meshgrid(np.arange(left, right, step), np.arange(-0.5 * depth, 0.5 * depth, step))
     means = np.stack([x.ravel(), y.ravel(), np.full(x.size, depth)], 1).astype(np.float32)
@@ -29,7 +29,7 @@ def sheet(left: float, right: float, depth: float, color: float) -> Gaussians:
 
 
 def slit(*centres: float) -> tuple[Gaussians, Cameras]:
-    """Two posts before a wall, of which is there what cameras at -0.6 and 0.6 see: nothing behind the slit."""
+    """Return two posts before a wall, of which is there what cameras at -0.6 and 0.6 see: nothing behind the slit."""
     wall = [(-4, -1.2), (-0.9, -0.3), (0.3, 0.9), (1.2, 4)]
     parts = [sheet(-0.9, -0.15, 3, 0.8), sheet(0.15, 0.9, 3, 0.8), *(sheet(*span, 6, 0.3) for span in wall)]
     viewmats = np.tile(np.eye(4), (len(centres), 1, 1))
@@ -39,7 +39,7 @@ def slit(*centres: float) -> tuple[Gaussians, Cameras]:
 
 
 def fill(gaussians: Gaussians, cameras: Cameras, **settings: bool) -> Gaussians:
-    """What is added where there is room for a tenth as many."""
+    """Return what is added where there is room for a tenth as many."""
     return fill_between(gaussians, cameras, None, len(gaussians) // 10, **settings)
 
 

@@ -23,7 +23,7 @@ def room() -> Scene:
 
 
 def shown(gaussians: Gaussians, scene: Scene) -> float:
-    """PSNR (dB) of the views against those of the scene's Gaussians."""
+    """Return the PSNR (dB) of the views against those of the scene's Gaussians."""
     pictures = [render(g, scene.cameras).images.clip(0, 1) for g in (gaussians, scene.gaussians)]
     return float(np.mean([psnr(*pair) for pair in zip(*pictures, strict=True)]))
 

@@ -28,7 +28,7 @@ def peaks_of(gaussians: Gaussians, scene: Scene) -> np.ndarray:
 
 
 def change(before: Gaussians, after: Gaussians, scene: Scene) -> float:
-    """Largest root mean square over the views of the change from one scene to another."""
+    """Return the largest root mean square over the views of the change from one scene to another."""
     pictures = [render(gaussians, scene.cameras).images.clip(0, 1) for gaussians in (before, after)]
     return float(np.sqrt(((pictures[0] - pictures[1]) ** 2).mean((1, 2, 3)).max()))
 

@@ -31,7 +31,7 @@ def cut(images: np.ndarray, count: int) -> Groups:
 
 
 def tree_of(images: np.ndarray, depths: np.ndarray, count: int = 200, **constants: float) -> RegionTree:
-    """The tree of whole pictures, with other constants, named as those of the module."""
+    """Return the tree of whole pictures, with other constants, named as those of the module."""
     valid = np.ones(depths.shape, bool)
     with mock.patch.dict(vars(module), constants):
         return region_tree(images, depths, cut(images, count), valid)
@@ -46,7 +46,7 @@ def noise(num_views: int = 1) -> np.ndarray:
 
 
 def slanted(num_views: int = 1) -> np.ndarray:
-    """Depths of a wall that is not parallel to the image."""
+    """Return depths of a wall that is not parallel to the image."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     return np.stack([(1 / (1 + 0.01 * x - 0.008 * y)).astype(np.float32)] * num_views)
 

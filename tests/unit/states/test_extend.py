@@ -26,12 +26,12 @@ SHAPES = {"room": scenes.room, "wall": scenes.wall, "planes": scenes.two_planes}
 
 @pytest.fixture(scope="module")
 def room() -> Scene:
-    """Six views of 48 x 36."""
+    """Return six views of 48 x 36."""
     return scenes.make_scene(scenes.room(), scenes.arc(6, 48, 36), noise=0.005)
 
 
 def parts_of(scene: Scene, size: int) -> list[Scene]:
-    """The views in batches, under their own names."""
+    """Return the views in batches, under their own names."""
     batches = [list(range(first, min(first + size, len(scene)))) for first in range(0, len(scene), size)]
     return [
         replace(scenes.take_views(scene, views), names=tuple(scene.names[view] for view in views)) for views in batches

@@ -20,7 +20,7 @@ PAPER: dict[str, Any] = {"recipe": "paper", "superpixels": "10%"}
 
 
 def make_room() -> Scene:
-    """Four views of 36 x 24."""
+    """Return four views of 36 x 24."""
     return scenes.make_scene(scenes.room(), scenes.arc(4, 36, 24), noise=0.005)
 
 

@@ -33,13 +33,13 @@ def scene() -> Scene:
 
 
 def made(scene: Scene, method: str, **settings: Any) -> CompactResult:
-    """With a few steps of the fit for the one that has one."""
+    """Compact by a baseline, with a few steps of the fit for the one that has one."""
     quick = {"fit_steps": 12} if method == "unmerged-fit" else {}
     return compact(scene, method=method, **{"budget": COUNT, **quick, **settings})
 
 
 def rows_of(part: Gaussians, whole: Gaussians) -> list[int]:
-    """The rows of ``whole`` whose opacity and colour the rows of ``part`` have."""
+    """Return the rows of ``whole`` whose opacity and colour the rows of ``part`` have."""
 
     def columns(gaussians: Gaussians) -> list[list[float]]:
         return np.concatenate([gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1).tolist()

@@ -13,7 +13,7 @@ from gsmerge.research.baselines import greedy
 
 
 def slow_area(covar: np.ndarray) -> float:
-    """Knud Thomsen's formula."""
+    """Return an area by Knud Thomsen's formula."""
     a, b, c = np.sqrt(np.linalg.eigvalsh(covar))
     p = 1.6075
     return float(4 * np.pi * (((a * b) ** p + (a * c) ** p + (b * c) ** p) / 3) ** (1 / p))
@@ -40,7 +40,7 @@ class Blob:
 
 
 def slow_greedy(gaussians: Gaussians, count: int) -> list[Blob]:
-    """Round after round, pair after pair."""
+    """Merge round after round, pair after pair."""
     covars = covariances(gaussians.quats.astype(np.float64), gaussians.scales.astype(np.float64))
     sh = np.concatenate([gaussians.sh0, gaussians.shN], 1).astype(np.float64).reshape(len(gaussians), -1)
     rows = zip(gaussians.means.astype(np.float64), covars, gaussians.opacities.astype(np.float64), sh, strict=True)

@@ -89,7 +89,7 @@ def test_figures_without_their_data_are_left_out() -> None:
 
 
 def figure_of(count: int, name: str = "method") -> Chart:
-    """One panel with so many lines of a point each, and the input."""
+    """Return one panel with so many lines of a point each, and the input."""
     points = [Point("1%", 0.1 * (i + 1), Interval(20 + i, 19 + i, 21 + i, 4), {}) for i in range(count)]
     lines = tuple(Line(f"{name} {i}", i == 0, (point,)) for i, point in enumerate(points))
     return Chart("quality", "", "", "Seconds", (), (), (Panel("PSNR", True, lines, 22.0),))

@@ -39,7 +39,7 @@ def folder() -> Path:
 
 @pytest.fixture
 def first(tmp_path: Path) -> Path:
-    """A folder with the first scene alone, which a test may change."""
+    """Return a folder with the first scene alone, which a test may change."""
     shutil.copytree(make_two() / "scene_0000", tmp_path / "scene_0000")
     return tmp_path
 

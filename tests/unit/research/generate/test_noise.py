@@ -36,7 +36,7 @@ CLEAN = replace(
 
 
 def seen(step: float = 0.0) -> TrueView:
-    """A slanted wall with detail; its right half is nearer by ``step``."""
+    """Return a slanted wall with detail; its right half is nearer by ``step``."""
     rng = np.random.default_rng(0)
     x = np.broadcast_to(np.arange(W), (H, W))
     depth = 1 / (0.3 + 0.001 * x) * np.where(x < W // 2, 1, 1 - step)
@@ -49,7 +49,7 @@ def made(noise: Noise, given: TrueView | None = None, seed: int = 0) -> Gaussian
 
 
 def seen_again(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions and depths of means."""
+    """Return pixel positions and depths of means."""
     cameras = Cameras(np.linalg.inv(POSE)[None], LENS.intrinsics[None], W, H)
     pixels, depths = project(gaussians.means, cameras)
     return pixels[0], depths[0].reshape(H, W)

@@ -103,7 +103,7 @@ def test_every_network_gets_a_gradient(example: Example) -> None:
 
 
 def teacher_of(example: Example) -> Prediction:
-    """The Gaussians of the paper's two equations, by hand, for a whole example."""
+    """Return the Gaussians of the paper's two equations, by hand, for a whole example."""
     m, merged = example.members, merge(example.features, match(example.features, PAPER.match_options()))
     means, covars, colors = [], [], []
     for first, last in zip(merged.starts[:-1].tolist(), merged.starts[1:].tolist(), strict=True):
@@ -149,7 +149,7 @@ def test_the_teacher_is_the_paper_s_two_equations(example: Example) -> None:
 
 
 def turn(quats: torch.Tensor, angle: float) -> torch.Tensor:
-    """Rotated about the first axis of the world."""
+    """Return rotations turned about the first axis of the world."""
     w, x, y, z = quats.unbind(1)
     c, s = elementary.cos(angle / 2), elementary.sin(angle / 2)
     return torch.stack([c * w - s * x, c * x + s * w, c * y - s * z, c * z + s * y], 1)

@@ -148,7 +148,7 @@ def test_a_window_with_too_much_in_it_is_halved(example: Example) -> None:
 
 
 def uniform_ssim(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """``[h,w]`` scores of uniform windows of 7 x 7 pixels, zero beyond the border."""
+    """Return ``[h,w]`` scores of uniform windows of 7 x 7 pixels, zero beyond the border."""
     x, y = image.astype(np.float64), photo.astype(np.float64)
     ux, uy, xx, yy, xy = (uniform_filter(a, (7, 7, 0), mode="constant") for a in (x, y, x * x, y * y, x * y))
     above = (2 * ux * uy + 1e-4) * (2 * (xy - ux * uy) + 9e-4)
