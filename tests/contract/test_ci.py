@@ -1,4 +1,4 @@
-"""The automatic checks, and what the front page and the templates of issues say of them."""
+"""The automatic checks do what the front page and the templates of issues say of them."""
 
 from __future__ import annotations
 

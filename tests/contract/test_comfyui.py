@@ -1,4 +1,4 @@
-"""The nodes for ComfyUI, on the interface of ComfyUI 0.27 without ComfyUI."""
+"""The nodes for ComfyUI work on the interface of ComfyUI 0.27, for which modules stand in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page's table of what the recipe does otherwise than the paper: every row is so, and there is no other."""
+"""The recipe departs from the paper as the page's table says, and nowhere else."""
 
 from __future__ import annotations
 

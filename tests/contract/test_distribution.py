@@ -1,4 +1,4 @@
-"""What the wheel and the source archive hold, and what their metadata say."""
+"""The wheel and the source archive hold what they should, and their metadata say so."""
 
 from __future__ import annotations
 

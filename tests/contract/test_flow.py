@@ -1,4 +1,4 @@
-"""The flow reads from top to bottom: options end in the plan, notes go to the record, one scene."""
+"""The flow reads from top to bottom: options end in the plan, notes go to the record, there is one kind of scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options of the command line: declared once."""
+"""Each option of the command line is declared once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``.npz`` files: objects that would run code, bombs, shapes and types that lie, and arrays that make no sense."""
+"""Damages of ``.npz`` files hold code, bombs, shapes and types that lie, and arrays that make no sense."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""COLMAP models, lists of poses and files of Metashape that promise much."""
+"""Damages of COLMAP models, lists of poses and files of Metashape promise more than there is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Changes to a file of any format: its bytes, its JSON document, the members of its archive."""
+"""These functions change a file of any format: its bytes, its JSON document, the members of its archive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``.spz``, ``.splat`` and ``.glb``: headers, tables and documents that promise more than there is."""
+"""Damages of ``.spz``, ``.splat`` and ``.glb`` have headers and tables that promise more than there is."""
 
 from __future__ import annotations
 

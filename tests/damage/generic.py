@@ -1,4 +1,4 @@
-"""What is done to sound files of every kind: they are cut, filled with zeros, and other content takes their place."""
+"""Sound files of every kind are cut, filled with zeros, and other content takes their place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras in JSON: much in little, depth, and places that are none."""
+"""Damages of cameras in JSON repeat what is little, nest deep, and name places that are none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photos and masks that lie about their size, that unpack to far more than they have, or that are of rare kinds."""
+"""Damaged photos and masks lie about their size, unpack to far more than they have, or are of rare kinds."""
 
 from __future__ import annotations
 

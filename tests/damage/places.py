@@ -1,4 +1,4 @@
-"""Names and places: spaces, Unicode, links in circles, pipes, folders where files should be."""
+"""Odd places have spaces and Unicode in their names, links in circles, pipes, and folders where files should be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``.ply`` files: headers that promise more than there is, and rows of values that overflow."""
+"""Damages of ``.ply`` files have headers that promise more than there is, and rows of values that overflow."""
 
 from __future__ import annotations
 

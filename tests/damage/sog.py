@@ -1,4 +1,4 @@
-"""``.sog`` and Streamed SOG: documents that promise more than the pictures have, or lead out of their folder."""
+"""Damages of ``.sog`` and Streamed SOG promise more than the pictures have, or lead out of their folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of sound files: for each kind a maker, what reads it, and the command that tells whether it is sound."""
+"""A table has, for each kind of file, a maker, what reads it, and the command that tells whether it is sound."""
 
 from __future__ import annotations
 

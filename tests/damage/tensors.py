@@ -1,4 +1,4 @@
-"""Files in the safetensors format: states and networks, of which arrays or parts of the header are wrong."""
+"""Damages of states and networks in safetensors files have wrong arrays or wrong parts of the header."""
 
 from __future__ import annotations
 

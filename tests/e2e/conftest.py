@@ -1,4 +1,4 @@
-"""Running the command line inside the test's own process."""
+"""Fixtures run the command line inside the test's own process."""
 
 from __future__ import annotations
 

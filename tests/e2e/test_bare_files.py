@@ -1,4 +1,4 @@
-"""Files beside which nothing lies: each command runs without a hint; photos without cameras are not passed over."""
+"""Each command runs on a file beside which nothing lies; photos without cameras are not passed over."""
 
 from __future__ import annotations
 

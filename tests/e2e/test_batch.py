@@ -1,4 +1,4 @@
-"""``gsmerge batch`` as people use it: folders of scenes, one of which is bad, resumed, planned, told in JSON."""
+"""``gsmerge batch`` compacts folders of scenes, one of which is bad, resumes, plans, and tells it in JSON."""
 
 from __future__ import annotations
 

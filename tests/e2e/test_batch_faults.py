@@ -1,4 +1,4 @@
-"""What may happen to a batch: it is killed, its processes are, the disk is full, somebody else is there."""
+"""A batch survives that it or its processes are killed, the disk is full, or another batch is there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scripts that make captures and their exports, on a made scene; a function stands in for the depth network."""
+"""Scripts make captures and exports of a made scene; a function stands in for the depth network."""
 
 from __future__ import annotations
 

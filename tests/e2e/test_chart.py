@@ -1,4 +1,4 @@
-"""``gsmerge lab chart`` on small made scenes: runs, resumes, draws, tells what failed."""
+"""``gsmerge lab chart`` runs on small made scenes, resumes, draws, and tells what failed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands on a scene that the project makes itself."""
+"""The commands work on a scene that the project makes itself."""
 
 from __future__ import annotations
 

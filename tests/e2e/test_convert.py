@@ -1,4 +1,4 @@
-"""Conversion: other formats, frames and extents of the same Gaussians, with their cameras."""
+"""``gsmerge convert`` gives the same Gaussians another format, frame and extent, with their cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What nobody foresaw: one line, the right code, a traceback only on request, no half-written file."""
+"""What nobody foresaw ends in one line and the right code, with a traceback on request and no half-written file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``gsmerge evaluate`` as users call it."""
+"""``gsmerge evaluate`` works as users call it."""
 
 from __future__ import annotations
 

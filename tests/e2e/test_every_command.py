@@ -1,4 +1,4 @@
-"""What all commands have in common: --json, --quiet, --dry-run, notes, and that inputs are never replaced."""
+"""All commands share --json, --quiet, --dry-run and notes, and never replace their input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes far from their origin, whose positions lose digits in files: scores are those of what was written."""
+"""Positions far from the origin lose digits in files, and scores are those of what was written."""
 
 from __future__ import annotations
 

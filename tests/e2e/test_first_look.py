@@ -1,4 +1,4 @@
-"""``gsmerge SCENE``: a result and its page by one word; outputs that are folders."""
+"""``gsmerge SCENE`` makes a result and its page, and outputs may be folders."""
 
 from __future__ import annotations
 

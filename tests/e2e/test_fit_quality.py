@@ -1,4 +1,4 @@
-"""Floors (floors.csv, dB) of the fits on photos that the scene was not made from, and exact counts."""
+"""Fits have exact counts, and reach floors (floors.csv, dB) on photos that the scene was not made from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``gsmerge lab generate``, and its scenes in other commands."""
+"""``gsmerge lab generate`` makes scenes that other commands read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``gsmerge inspect`` of files: sound ones of every format, and every kind of fault by its cause."""
+"""``gsmerge inspect`` calls sound files of every format ok, and names every kind of fault by its cause."""
 
 from __future__ import annotations
 

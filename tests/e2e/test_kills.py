@@ -1,4 +1,4 @@
-"""Commands that end before a call that changes their folder, a few of the many of ``tools/kills.py``."""
+"""Commands end well before a call that changes their folder: a few of the many of ``tools/kills.py``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rival methods from the command line."""
+"""Rival methods run from the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names of scenes, files and photos that are programs: in a real browser pages show them and run none."""
+"""A real browser shows names of scenes, files and photos that are programs, and runs none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of charts in a real browser: nothing is fetched, nothing complains."""
+"""The page of charts works in a real browser, which fetches nothing and complains of nothing."""
 
 from __future__ import annotations
 

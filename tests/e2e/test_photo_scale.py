@@ -1,4 +1,4 @@
-"""Photos twice as large as the grid: sharper seen from near, as good at the grid's size (floors.csv, dB)."""
+"""Photos twice as large as the grid make it sharper from near, as good at its own size (floors.csv, dB)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What has to stay sharp: ``--protect`` spends Gaussians and steps where its pictures are white."""
+"""``--protect`` spends Gaussians and steps where its pictures are white."""
 
 from __future__ import annotations
 

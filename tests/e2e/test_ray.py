@@ -1,4 +1,4 @@
-"""A batch, and the blocks of a scene, on a real Ray cluster of two nodes, of which a node or processes are killed."""
+"""A batch and the blocks of a scene survive lost nodes and processes of a real Ray cluster of two nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The README's blocks, run as printed in the folder that it names, from its own installations."""
+"""The README's blocks run as printed in the folder that it names, from its own installations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clips of `render`: videos, GIFs and frames along a path, of one scene, or of several under lines that move."""
+"""``render`` makes videos, GIFs and frames along a path, of one scene, or of several under lines that move."""
 
 from __future__ import annotations
 

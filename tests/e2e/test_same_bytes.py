@@ -1,4 +1,4 @@
-"""The same bytes from every processor: eight results, which take two to three seconds together.
+"""Every processor writes the same bytes of eight results, which take two to three seconds together.
 
 Other processors are stood for by targets of the native library and by what NumPy, its BLAS, OpenCV, its IPP and torch
 leave unused (also tools/processors.py).

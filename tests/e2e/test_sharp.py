@@ -1,4 +1,4 @@
-"""Files of SHARP as it leaves them: one with its photo, and several of one place as one scene."""
+"""Files of SHARP are read as it leaves them: one with its photo, and several of one place as one scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``-o small.html``: one file that opens from disk, and from any web server."""
+"""``-o small.html`` writes one file that opens from disk, and from any web server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``extend``, and what every command makes of a state, on scenes that the project makes itself."""
+"""``extend`` makes states of scenes that the project makes itself, and every command takes them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras beside a file that belong to another one: a note, and with ``--strict`` a doubt."""
+"""Cameras beside a file that belong to another one are a note, and with ``--strict`` a doubt."""
 
 from __future__ import annotations
 

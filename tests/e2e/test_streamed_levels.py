@@ -1,4 +1,4 @@
-"""``compact -o scene/lod-meta.json``: levels that stream, from the command line."""
+"""``compact -o scene/lod-meta.json`` writes levels that stream."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``gsmerge lab stress`` as users call it."""
+"""``gsmerge lab stress`` works as users call it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quality targets, devices and levels of detail, from the command line and from Python."""
+"""Quality targets, devices and levels of detail are met from the command line and from Python."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person sees in a terminal of 80 columns: commands run in a pseudo-terminal, their bytes become a screen."""
+"""A person sees whole lines in a terminal of 80 columns: commands run in one, and their bytes become a screen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``gsmerge lab train`` and ``checkpoint`` as users call them."""
+"""``gsmerge lab train`` and ``checkpoint`` work as users call them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes in no order from files to files, with floors (floors.csv, dB) on photos that no stage has seen."""
+"""Scenes in no order reach floors (floors.csv, dB) on photos that no stage has seen, from files to files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``gsmerge view``: what it writes and replaces, pages without the scene's Gaussians."""
+"""``gsmerge view`` writes pages, also without the scene's Gaussians, and replaces no other file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of ``gsmerge view`` in a real browser: stills, 3D as our own renderer draws it, jumps, the swipe."""
+"""The page of ``gsmerge view`` shows stills, 3D as our own renderer draws it, jumps and the swipe in a browser."""
 
 from __future__ import annotations
 

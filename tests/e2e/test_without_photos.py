@@ -1,4 +1,4 @@
-"""Scenes with cameras and without photos: the rows' own colours stand in, which every command says."""
+"""Scenes without photos are compacted by the rows' own colours, which every command says."""
 
 from __future__ import annotations
 

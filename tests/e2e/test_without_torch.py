@@ -1,4 +1,4 @@
-"""Where torch is not installed: what runs all the same, and what says how to install it."""
+"""Without torch most commands run all the same, and the others say how to install it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results that show the scene's own photos worse than the input: never without a word about it."""
+"""Results that show the scene's own photos worse than the input are never written without a word about it."""
 
 from __future__ import annotations
 

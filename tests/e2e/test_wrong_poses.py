@@ -1,4 +1,4 @@
-"""Scenes whose cameras are wrong, as users meet them: moved with a note, written on request, or refused."""
+"""Scenes whose cameras are wrong are moved with a note, written on request, or refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every kind of wrong usage of every command: its exit code, one clear line, nothing written."""
+"""Wrong usage of every command ends in its exit code and one clear line, with nothing written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Batches for tests: tiny scenes, and options under which each takes a fraction of a second."""
+"""Batches for tests are of tiny scenes, under options with which each takes a fraction of a second."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A headless Chromium driven over its debugging pipe: no port, no network, nothing left behind."""
+"""This drives a headless Chromium over its debugging pipe: no port, no network, nothing left behind."""
 
 from __future__ import annotations
 

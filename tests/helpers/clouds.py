@@ -1,4 +1,4 @@
-"""Gaussians without a scene."""
+"""These Gaussians belong to no scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the nodes of ``examples/comfyui`` use of ComfyUI 0.27, as modules that stand in for it."""
+"""These modules stand in for what the nodes of ``examples/comfyui`` use of ComfyUI 0.27."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records of made-up experiments."""
+"""These records are of made-up experiments."""
 
 from __future__ import annotations
 

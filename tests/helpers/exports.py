@@ -1,4 +1,4 @@
-"""Exports of made scenes: rows of a file as exporters write them, before any reader has touched them."""
+"""Exports of made scenes have rows as exporters write them, before any reader has touched them."""
 
 from __future__ import annotations
 

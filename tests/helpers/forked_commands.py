@@ -1,4 +1,4 @@
-"""Commands in processes of their own and in limits, forked from one process that has imported what they need."""
+"""Commands run in processes and limits of their own, forked from one that has imported what they need."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that gsmerge reads and no longer writes: packed ``.ply`` of PlayCanvas, and ``.spz`` of version 4."""
+"""gsmerge reads these files and no longer writes them: packed ``.ply`` of PlayCanvas, ``.spz`` of version 4."""
 
 from __future__ import annotations
 

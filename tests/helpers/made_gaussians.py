@@ -1,4 +1,4 @@
-"""Random Gaussians before a camera, as the tests of this folder draw them."""
+"""These functions draw random Gaussians before a camera for the tests of kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a message has to say wherever its wording is not the subject: the kind of error, its place and its value.
+"""A message has to say the kind of error, its place and its value wherever its wording is not the subject.
 
 A message begins with its place, such as ``k: expected 1 to 8, got 9`` and ``a/b.ply: no such file``; after it come the
 values, which are numbers, names and options, or one word that tells it from others of that place.

@@ -1,4 +1,4 @@
-"""Made scenes as rows of files: what programs keep of their pixels, in which order, world and encoding."""
+"""Programs keep rows of made scenes: of which pixels, in which order, world and encoding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views that contradict others: by random motions, or by nearer depths."""
+"""Views contradict others by random motions, or by nearer depths."""
 
 from __future__ import annotations
 

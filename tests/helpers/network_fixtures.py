@@ -1,4 +1,4 @@
-"""Networks with weights that do something, and Feature Gaussians of a made scene for them."""
+"""Networks have weights that do something, and a made scene has Feature Gaussians for them."""
 
 from __future__ import annotations
 

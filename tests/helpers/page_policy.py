@@ -1,4 +1,4 @@
-"""What a page lets a browser run."""
+"""A page's policy says what a browser may run."""
 
 from __future__ import annotations
 

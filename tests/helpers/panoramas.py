@@ -1,4 +1,4 @@
-"""Views of a made panorama, which overlap as neighbouring photos do, with photos of other exposure and grain."""
+"""Views of a made panorama overlap as neighbouring photos do, with photos of other exposure and grain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The error that superpixels minimise, slowly, and what touches what."""
+"""These functions compute the error that superpixels minimise, slowly, and what touches what."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras as ``transforms.json``."""
+"""These functions write cameras as ``transforms.json``."""
 
 from __future__ import annotations
 

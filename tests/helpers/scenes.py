@@ -1,4 +1,4 @@
-"""Tiny synthetic scenes in memory, and what must hold of every compact scene.
+"""Tiny synthetic scenes are made in memory, and checks say what must hold of every compact scene.
 
 The maker is the product's own (:mod:`gsmerge.research.generate`): its rays, and its Gaussians with the errors set to
 zero. Surfaces here have colours that are functions of the place alone, so photos are exact, and every pixel gets one

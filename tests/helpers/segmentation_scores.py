@@ -1,4 +1,4 @@
-"""Photos that come with scikit-image and scikit-learn, and what superpixels of them are worth."""
+"""Photos that come with scikit-image and scikit-learn tell what superpixels of them are worth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files as SHARP saves them: one photo each, two layers of Gaussians on a square grid, the camera inside."""
+"""SHARP saves files of one photo each, two layers of Gaussians on a square grid, and the camera inside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A room under a painted sky."""
+"""This room is under a painted sky."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slow, obvious readers of formats, and Gaussians to write: drawn at random, and with extreme values."""
+"""Slow, obvious readers check formats, and Gaussians to write are random or have extreme values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slow renderer to check the fast one against: float64, one Gaussian after the other, over all pixels.
+"""A slow renderer checks the fast one: in float64, one Gaussian after the other, over all pixels.
 
 Written from the published formulas: EWA splatting (Zwicker et al. 2001), 3DGS (Kerbl et al. 2023) and gsplat's
 conventions. It knows no tiles, boxes or early exits, and torch can differentiate it: the second half makes gradients

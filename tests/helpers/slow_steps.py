@@ -1,4 +1,4 @@
-"""The slow, obvious twin of a step of the full fit: single calls of the kernels, one after the other."""
+"""The slow, obvious twin of a step of the full fit calls one kernel after the other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests over many cases: a few in every run, all others in the sweeps (``-m slow``)."""
+"""Of tests over many cases a few run always, and all others in the sweeps (``-m slow``)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A tiny per-pixel scene, and writers of every camera format, as the formats' own documents describe them."""
+"""A tiny per-pixel scene is written in every camera format, as the formats' own documents describe them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Networks, examples and runs that take a second; tests that import this are skipped where torch is missing."""
+"""Networks, examples and runs take a second; tests that import this are skipped where torch is missing."""
 
 from __future__ import annotations
 

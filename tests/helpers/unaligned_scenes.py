@@ -1,4 +1,4 @@
-"""Made scenes whose Gaussians are in no order of pixels."""
+"""These made scenes have Gaussians in no order of pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The build: every platform, other compilers, and what it says where it cannot."""
+"""The build works for every platform and other compilers, and says where it cannot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rays against shapes: the kernel, and looking at every point of a ray for what the shape's definition says."""
+"""Rays meet shapes where a look at every point of a ray finds the shape's definition."""
 
 from __future__ import annotations
 

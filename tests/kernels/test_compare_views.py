@@ -1,4 +1,4 @@
-"""Comparison of the pixels of views, against plain formulas."""
+"""Comparison of the pixels of views matches plain formulas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Elementary functions against NumPy's."""
+"""Elementary functions match NumPy's."""
 
 from __future__ import annotations
 

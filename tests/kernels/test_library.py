@@ -1,4 +1,4 @@
-"""Which library is loaded, and what is said where none fits."""
+"""The right library is loaded, and where none fits the error says what to do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small linear algebra against NumPy's."""
+"""Small linear algebra matches NumPy's."""
 
 from __future__ import annotations
 

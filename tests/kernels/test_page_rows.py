@@ -1,4 +1,4 @@
-"""Gaussians as the numbers of a page, against NumPy on the columns of a ``.spz``."""
+"""Gaussians as the numbers of a page match NumPy on the columns of a ``.spz``."""
 
 from __future__ import annotations
 

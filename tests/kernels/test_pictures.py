@@ -1,4 +1,4 @@
-"""Filters and lookups in pictures against SciPy's and slow loops."""
+"""Filters and lookups in pictures match SciPy's and slow loops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Projection errors and their derivatives, against plain formulas."""
+"""Projection errors and their derivatives match plain formulas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows by the native conversion, against the same rows column by column, bit for bit."""
+"""Rows by the native conversion are the same rows as column by column, bit for bit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever the picture and the budget: the exact count, every view kept, and smaller budgets nest in larger ones."""
+"""Any picture and budget gives the exact count with every view kept, and smaller budgets nest in larger ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever the picture and the segmentation: the exact number, nothing empty, everything in one piece, every time."""
+"""Any picture and segmentation gives the exact number of superpixels, each in one piece and none empty."""
 
 from __future__ import annotations
 

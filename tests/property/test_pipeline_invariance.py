@@ -1,4 +1,4 @@
-"""The whole command: order of views, similarity transforms, seeds and threads."""
+"""The whole command does not depend on order of views, similarity transforms, seeds and threads."""
 
 from __future__ import annotations
 

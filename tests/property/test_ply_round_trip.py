@@ -1,3 +1,5 @@
+"""Gaussians are the same after they were written to a ``.ply`` and read."""
+
 from __future__ import annotations
 
 import tempfile

@@ -1,4 +1,4 @@
-"""What must not change the image."""
+"""The image does not depend on threads, order of Gaussians and rows that are left out."""
 
 from __future__ import annotations
 

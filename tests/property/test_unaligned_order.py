@@ -1,4 +1,4 @@
-"""Gaussians in no order: what a permutation of them must not change."""
+"""Gaussians in no order give the same result after a permutation of them."""
 
 from __future__ import annotations
 

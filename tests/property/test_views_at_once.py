@@ -1,4 +1,4 @@
-"""How many views' results are in memory together is a matter of memory alone: the same to the last bit."""
+"""How many views' results are in memory together changes memory alone: results are the same to the last bit."""
 
 from __future__ import annotations
 

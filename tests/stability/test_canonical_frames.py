@@ -1,4 +1,4 @@
-"""Flyaways, coordinates far from zero, scale and orientation (stability.md, cases 13, 37, 38)."""
+"""Flyaways, coordinates far from zero, scale and orientation do no harm (stability.md, cases 13, 37, 38)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Networks that are missing, damaged or badly wrong."""
+"""Networks that are missing, damaged or badly wrong do little harm, or are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exposure, flat and noisy pictures, shine, and what moves (stability.md, cases 29 to 31, 40, 54)."""
+"""Exposure, flat and noisy pictures, shine and motion do little harm (stability.md, cases 29 to 31, 40, 54)."""
 
 from __future__ import annotations
 

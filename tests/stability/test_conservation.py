@@ -1,4 +1,4 @@
-"""What merging keeps: coverage, brightness, detail with K (stability.md, cases 47, 48, 55)."""
+"""Merging keeps coverage, brightness, and more detail with K (stability.md, cases 47, 48, 55)."""
 
 from __future__ import annotations
 

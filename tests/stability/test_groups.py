@@ -1,4 +1,4 @@
-"""Hostile groups: coincident, degenerate, oversized, transparent, torn in depth (stability.md, cases 1 to 17)."""
+"""Hostile groups are coincident, degenerate, oversized, transparent, torn in depth (stability.md, cases 1 to 17)."""
 
 from __future__ import annotations
 

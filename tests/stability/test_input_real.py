@@ -1,4 +1,4 @@
-"""One real scene, where the measuring data is at hand."""
+"""One real scene is read right, where the measuring data is at hand."""
 
 from __future__ import annotations
 

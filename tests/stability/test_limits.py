@@ -1,4 +1,4 @@
-"""At the ends of what may be asked for: budgets of nearly nothing and of everything, views of hardly any pixels."""
+"""Budgets of nearly nothing and of everything, and views of hardly any pixels, give sound results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clusters that must not form (stability.md, cases 18 to 20)."""
+"""Some clusters must not form (stability.md, cases 18 to 20)."""
 
 from __future__ import annotations
 

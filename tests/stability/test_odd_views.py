@@ -1,4 +1,4 @@
-"""Few, repeated, disjoint, turned and misplaced views (stability.md, cases 21 to 27)."""
+"""Few, repeated, disjoint, turned and misplaced views do little harm (stability.md, cases 21 to 27)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photos as people have them: covered, masked, in bars, in another tone or exposure (stability.md, case 29)."""
+"""Photos are covered, masked, in bars, in another tone or exposure, as people have them (stability.md, case 29)."""
 
 from __future__ import annotations
 

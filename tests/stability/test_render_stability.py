@@ -1,4 +1,4 @@
-"""Hostile but finite input: no crash, no NaN, nothing outside its range."""
+"""Hostile but finite input causes no crash, no NaN and nothing outside its range."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What fitted results show from outside of the capture: no fog where the input is empty, no holes where it is solid."""
+"""Fitted results show no fog where the input is empty, and no holes where it is solid, from outside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The number of threads, the picture's size and real photos."""
+"""Superpixels do not depend on threads, stay exact in wide pictures, and describe real photos."""
 
 from __future__ import annotations
 

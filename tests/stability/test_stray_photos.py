@@ -1,4 +1,4 @@
-"""Photos that do not show the scene: black, noise, of another scene, of another view (stability.md, case 56)."""
+"""Photos that do not show the scene are left out: black, noise, of another scene or view (stability.md, case 56)."""
 
 from __future__ import annotations
 

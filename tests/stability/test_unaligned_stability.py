@@ -1,4 +1,4 @@
-"""Gaussians in no order that lack something: finite values, views, photos, cameras, anything to see."""
+"""Gaussians in no order may lack finite values, views, photos, cameras, or anything to see."""
 
 from __future__ import annotations
 

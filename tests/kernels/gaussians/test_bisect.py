@@ -1,4 +1,4 @@
-"""Recursive bisection, and the errors of its children, against slow, obvious numpy in float64."""
+"""Recursive bisection and the errors of its children match slow, obvious numpy in float64."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Overlaps and clusters against slow, obvious numpy in float64."""
+"""Overlaps and clusters match slow, obvious numpy in float64."""
 
 from __future__ import annotations
 

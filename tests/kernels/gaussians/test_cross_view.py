@@ -1,4 +1,4 @@
-"""What other views say of points, against one point and one view at a time."""
+"""What other views say of points matches a loop over one point and one view at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussians cut at the edges of photos, against the formulas of the truncated normal distribution."""
+"""Gaussians cut at the edges of photos match the formulas of the truncated normal distribution."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pixels of Gaussians and what pixels show, against a loop over Gaussians in order of depth."""
+"""Pixels of Gaussians, and what pixels show, match a loop over Gaussians in order of depth."""
 
 from __future__ import annotations
 

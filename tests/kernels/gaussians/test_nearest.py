@@ -1,3 +1,5 @@
+"""Neighbours of other views match a search through all of them."""
+
 from __future__ import annotations
 
 import numpy as np

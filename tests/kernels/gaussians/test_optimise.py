@@ -1,4 +1,4 @@
-"""The optimiser's step against a slow, obvious twin in float64."""
+"""The optimiser's step matches a slow, obvious twin in float64."""
 
 from __future__ import annotations
 

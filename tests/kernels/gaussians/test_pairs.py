@@ -1,4 +1,4 @@
-"""Merging pair by pair against slow, obvious numpy in float64."""
+"""Merging pair by pair matches slow, obvious numpy in float64."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pooling and decomposition against slow, obvious numpy in float64."""
+"""Pooling and decomposition match slow, obvious numpy in float64."""
 
 from __future__ import annotations
 

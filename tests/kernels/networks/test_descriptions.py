@@ -1,4 +1,4 @@
-"""What the networks read, one Gaussian after the other by the formulas."""
+"""What the networks read matches the formulas, one Gaussian after the other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layers of the networks against NumPy in float64, and against the modules of torch that training uses."""
+"""Layers of the networks match NumPy in float64, and the modules of torch that training uses."""
 
 from __future__ import annotations
 

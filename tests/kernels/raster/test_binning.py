@@ -1,4 +1,4 @@
-"""Depth order and tile lists against sorting and loops."""
+"""Depth order and tile lists match sorting and loops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The renderer against the slow float64 one of this folder."""
+"""The renderer matches the slow float64 one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The array interface: against autograd through the slow renderer, threads, hostile input."""
+"""The array interface matches autograd through the slow renderer, on any threads and hostile input."""
 
 from __future__ import annotations
 

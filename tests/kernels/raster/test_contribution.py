@@ -1,4 +1,4 @@
-"""The dominant superpixel of every Gaussian against sums over a dense matrix of weights."""
+"""The dominant superpixel of every Gaussian matches sums over a dense matrix of weights."""
 
 from __future__ import annotations
 

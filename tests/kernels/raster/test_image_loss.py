@@ -1,4 +1,4 @@
-"""The image loss: against autograd of a plain float64 loss."""
+"""The image loss matches autograd of a plain float64 loss."""
 
 from __future__ import annotations
 

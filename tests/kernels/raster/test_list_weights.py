@@ -1,4 +1,4 @@
-"""The written-out blending weights against the renderer and against a dense matrix."""
+"""The written-out blending weights match the renderer and a dense matrix."""
 
 from __future__ import annotations
 

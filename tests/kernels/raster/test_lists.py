@@ -1,4 +1,4 @@
-"""What the walks refuse: lists that point outside their arrays."""
+"""The walks refuse lists that point outside their arrays."""
 
 from __future__ import annotations
 

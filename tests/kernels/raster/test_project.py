@@ -1,4 +1,4 @@
-"""Footprints and culling against the slow renderer."""
+"""Footprints and culling match the slow renderer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``render`` as autograd sees it, against autograd through the slow float64 renderer."""
+"""``render`` as autograd sees it matches autograd through the slow float64 renderer."""
 
 from __future__ import annotations
 

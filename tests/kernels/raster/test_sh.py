@@ -1,4 +1,4 @@
-"""Colours seen from a camera, and their gradient, against the slow renderer."""
+"""Colours seen from a camera, and their gradient, match the slow renderer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Phases of a step on any numbers: nothing outside the buffers is read or written, as sanitizers would see.
+"""Phases of a step read and write nothing outside the buffers on any numbers, as sanitizers would see.
 
 That the bits are those of a slow twin is in ``tests/unit/fit/test_steps.py``.
 """

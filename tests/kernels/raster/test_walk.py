@@ -1,4 +1,4 @@
-"""The rows of a tile in which a Gaussian of a batch shows, against all its pixels."""
+"""The rows of a tile in which a Gaussian of a batch shows match a look at all its pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small picture cut into regions, and the error that superpixels minimise."""
+"""Fixtures are a small picture and its cut into regions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's BASS against slow, obvious twins."""
+"""The paper's BASS matches slow, obvious twins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Corners against OpenCV."""
+"""Corners match OpenCV's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all kernels of superpixels share: the same bits from every library, empty and odd inputs, bad labels."""
+"""All kernels of superpixels give the same bits with every library, and take empty, odd or wrong inputs."""
 
 from __future__ import annotations
 

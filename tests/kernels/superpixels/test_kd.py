@@ -1,4 +1,4 @@
-"""Splitting rectangles against slow, obvious twins."""
+"""Splitting rectangles matches slow, obvious twins."""
 
 from __future__ import annotations
 

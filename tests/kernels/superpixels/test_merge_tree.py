@@ -1,4 +1,4 @@
-"""Merging regions against slow, obvious numpy."""
+"""Merging regions matches slow, obvious numpy."""
 
 from __future__ import annotations
 

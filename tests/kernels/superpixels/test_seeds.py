@@ -1,4 +1,4 @@
-"""Seeds of superpixels against slow, obvious twins."""
+"""Seeds of superpixels match slow, obvious twins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sweeps over border pixels against a slow, obvious twin."""
+"""Sweeps over border pixels match a slow, obvious twin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Merging neighbours by the growth of the error, and rows of regions, against slow, obvious twins."""
+"""Merging neighbours by the growth of the error, and rows of regions, match slow, obvious twins."""
 
 from __future__ import annotations
 

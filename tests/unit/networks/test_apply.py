@@ -1,3 +1,5 @@
+"""Networks change every stage, and silent ones change nothing."""
+
 from __future__ import annotations
 
 from dataclasses import fields, replace

@@ -1,3 +1,5 @@
+"""Networks are written to a checkpoint and read back."""
+
 from __future__ import annotations
 
 import json

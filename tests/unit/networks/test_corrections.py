@@ -1,3 +1,5 @@
+"""Corrections move Gaussians by their formulas, within bounds."""
+
 from __future__ import annotations
 
 from dataclasses import fields, replace

@@ -1,4 +1,4 @@
-"""``recipe="paper"``: the paper's own chain under one name."""
+"""``recipe="paper"`` is the paper's own chain under one name."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Members of groups are sampled and put into tables."""
+
 from __future__ import annotations
 
 import numpy as np

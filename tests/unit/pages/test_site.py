@@ -1,4 +1,4 @@
-"""A page with a scene, that needs no other host, and a camera that it may not leave."""
+"""A page with a scene needs no other host, and its camera stays within bounds."""
 
 from __future__ import annotations
 

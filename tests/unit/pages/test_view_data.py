@@ -1,4 +1,4 @@
-"""What a page shows: pictures, cameras, numbers, Gaussians."""
+"""A page shows pictures, cameras, numbers and Gaussians of its scenes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page: complete in one file, and nothing in it that a name could have put there."""
+"""The page is complete in one file, and nothing in it is there because of a name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tells exposures that are to be compensated from those that are better left alone."""
+"""Some exposures are to be compensated, and others are better left alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masks beside the photos and inside them, and bars around them."""
+"""Masks lie beside the photos or inside them, and bars around photos are cut off."""
 
 from __future__ import annotations
 

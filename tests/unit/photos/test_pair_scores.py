@@ -1,4 +1,4 @@
-"""Scores of pairs, against slow and obvious twins."""
+"""Scores of pairs match slow, obvious twins."""
 
 from __future__ import annotations
 

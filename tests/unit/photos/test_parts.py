@@ -1,4 +1,4 @@
-"""Photos that show more than their views: a part is cut out, or all are left out."""
+"""Photos that show more than their views are cut to a part, or all are left out."""
 
 from __future__ import annotations
 

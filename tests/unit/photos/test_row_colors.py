@@ -1,4 +1,4 @@
-"""Pictures that stand in for photos: the rows' own colours, or drawings of the Gaussians where those say little."""
+"""The rows' own colours stand in for photos, or drawings of the Gaussians where those say little."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which views are context and which are targets."""
+"""Some views are context, and others are targets."""
 
 from __future__ import annotations
 

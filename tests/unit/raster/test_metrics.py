@@ -1,3 +1,5 @@
+"""PSNR and SSIM match known values and scikit-image's."""
+
 from __future__ import annotations
 
 import math

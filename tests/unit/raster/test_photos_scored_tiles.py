@@ -1,4 +1,4 @@
-"""The sample of the input views that scenes are judged by."""
+"""Scenes are judged by a sample of the input views."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""The renderer draws what follows by hand, and refuses what does not fit."""
+
 from __future__ import annotations
 
 import math

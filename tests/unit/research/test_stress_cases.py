@@ -1,4 +1,4 @@
-"""Stress cases: changes do what they say, and a property that does not hold is noticed."""
+"""Stress cases change what they say, and find a property that does not hold."""
 
 from __future__ import annotations
 

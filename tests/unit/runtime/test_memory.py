@@ -1,4 +1,4 @@
-"""Arrays in files, whose pages leave memory and whose values stay; and what a run needs, and a machine has."""
+"""Arrays in files keep their values when pages leave memory, and a run knows what it needs and has."""
 
 from __future__ import annotations
 

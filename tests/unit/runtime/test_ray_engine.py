@@ -1,4 +1,4 @@
-"""Work in parts: calls in order, their records, and engines that cannot be had."""
+"""Work in parts has calls in order and records, and engines that cannot be had are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ambient record: what is written where, and that nothing is lost or counted twice."""
+"""The ambient record has what each run wrote, with nothing lost or counted twice."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Work on several threads keeps its order, its errors and the number of threads."""
+
 from __future__ import annotations
 
 import sys

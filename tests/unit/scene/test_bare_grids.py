@@ -1,4 +1,4 @@
-"""A ``.ply`` with nothing beside it whose rows are a grid: its cameras follow from its rows."""
+"""Cameras of a ``.ply`` with nothing beside it follow from its rows if they are a grid."""
 
 from __future__ import annotations
 

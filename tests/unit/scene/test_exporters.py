@@ -1,4 +1,4 @@
-"""Files as exporters write them: each is read without a word, and every row comes to its own pixel."""
+"""Files are read as exporters write them, without a word, and every row comes to its own pixel."""
 
 from __future__ import annotations
 

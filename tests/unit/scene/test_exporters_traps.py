@@ -1,4 +1,4 @@
-"""Facts about exporters that break a naive reader, each in a small file of its own."""
+"""Some facts about exporters would break a naive reader; each is in a small file of its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders as the programs of models leave them: Gaussians one folder down, cameras under names of their own."""
+"""Folders of models are read as left: Gaussians one folder down, cameras under names of their own."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def test_model_in_its_usual_place_gets_no_note(tmp_path: Path) -> None:
 
 
 def mask_paths(folder: Path, paths: Sequence[object], *, size: tuple[int, int] = (56, 40), shared: str = "") -> Path:
-    """Write masks that leave out the upper quarter, in a folder of any name; return the scene."""
+    """Write masks that leave out the upper quarter, in a folder of any name; return the scene's folder."""
     save_export(folder, SMOOTH, export_rows(SMOOTH, ROWS["grid"]))
     picture = np.full(size[::-1], 255, np.uint8)
     picture[: size[1] // 4] = 0

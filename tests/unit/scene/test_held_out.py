@@ -1,4 +1,4 @@
-"""Held-out views: which they are, and that they come in the frame of the Gaussians."""
+"""Held-out views are known from others, and come in the frame of the Gaussians."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows that are the pixels of more views than the file has cameras: the rows give the poses of all views."""
+"""Rows of more views than the file has cameras give the poses of all views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files as models leave them, by what is beside them: read right, or refused with what to do."""
+"""Files of models are read right by what is beside them, or refused with what to do."""
 
 from __future__ import annotations
 

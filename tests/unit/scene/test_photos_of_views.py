@@ -1,4 +1,4 @@
-"""Photos as they lie beside scenes: each view has the one that shows it, or none, whatever the files are called."""
+"""Each view has the photo that shows it, or none, whatever the files beside the scene are called."""
 
 from __future__ import annotations
 

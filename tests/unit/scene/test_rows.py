@@ -1,4 +1,4 @@
-"""Rows of a file as Gaussians of a scene: those that are there, in the order of their pixels."""
+"""Rows of a file become Gaussians of a scene in the order of their pixels."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""A folder is read as a scene with cameras, photos and pixels, or refused."""
+
 from __future__ import annotations
 
 import json

@@ -1,3 +1,5 @@
+"""The files of a scene are found beside it by their names."""
+
 from __future__ import annotations
 
 import os

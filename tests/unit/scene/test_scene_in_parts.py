@@ -1,4 +1,4 @@
-"""Scenes whose rows are in several files: one for each view, or chunks."""
+"""The rows of a scene may be in several files: one for each view, or chunks."""
 
 from __future__ import annotations
 

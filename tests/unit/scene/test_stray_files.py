@@ -1,4 +1,4 @@
-"""Cameras, photos and masks beside a file that belong to something else, and ``none`` in their place."""
+"""Cameras, photos and masks of something else are left out, and ``none`` takes their place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What settings ask of a run: one piece, all views, a number of Gaussians."""
+"""Settings ask of a run one piece, all views, or a number of Gaussians."""
 
 from __future__ import annotations
 

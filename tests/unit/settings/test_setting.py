@@ -1,4 +1,4 @@
-"""Declarations of settings, and what is made of them."""
+"""Declarations of settings make checks, help and options."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the depths of other views say: fainter groups, and a share of superpixels."""
+"""The depths of other views make groups fainter, and set the share of superpixels."""
 
 from __future__ import annotations
 

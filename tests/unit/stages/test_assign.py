@@ -1,3 +1,5 @@
+"""Gaussians in no order belong to the superpixels that show them."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What is left out of a result: crops, floaters, and a budget that is met after them."""
+"""Crops and floaters are left out of a result, and a budget is met after them."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Groups are split into children that keep their moments."""
+
 from __future__ import annotations
 
 from dataclasses import replace

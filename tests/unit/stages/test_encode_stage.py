@@ -1,3 +1,5 @@
+"""Groups of Gaussians become Feature Gaussians."""
+
 from __future__ import annotations
 
 import numpy as np

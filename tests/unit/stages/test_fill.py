@@ -1,4 +1,4 @@
-"""Gaussians for what cameras between the views see empty."""
+"""Gaussians are added where cameras between the views see nothing."""
 
 from __future__ import annotations
 

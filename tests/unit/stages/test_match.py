@@ -1,3 +1,5 @@
+"""Features of several views that overlap and agree in colour match."""
+
 from __future__ import annotations
 
 from dataclasses import replace

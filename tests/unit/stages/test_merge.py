@@ -1,3 +1,5 @@
+"""Matched features merge with their moments and members."""
+
 from __future__ import annotations
 
 from dataclasses import fields, replace

@@ -1,4 +1,4 @@
-"""Merging by positions and colours alone."""
+"""Gaussians are merged by positions and colours alone."""
 
 from __future__ import annotations
 

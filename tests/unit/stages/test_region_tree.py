@@ -1,3 +1,5 @@
+"""Regions of all views form one tree that is cut to any count."""
+
 from __future__ import annotations
 
 from unittest import mock

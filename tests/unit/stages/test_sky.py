@@ -1,4 +1,4 @@
-"""Gaussians of sky: found where photos show one, and nowhere else."""
+"""Gaussians of sky are found where photos show one, and nowhere else."""
 
 from __future__ import annotations
 

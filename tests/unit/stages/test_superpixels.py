@@ -1,3 +1,5 @@
+"""Superpixels follow colours, and their number is exact."""
+
 from __future__ import annotations
 
 from typing import Any

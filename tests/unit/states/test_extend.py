@@ -1,4 +1,4 @@
-"""Batches whose results, cameras and pictures are kept, and compact scenes of all of them."""
+"""States keep results, cameras and pictures of batches, and give compact scenes of all of them."""
 
 from __future__ import annotations
 

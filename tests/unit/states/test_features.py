@@ -1,4 +1,4 @@
-"""Feature Gaussians across batches: encoded once, decoded at any K, matched and merged (paper section 4.5)."""
+"""Feature Gaussians are encoded once, decoded at any K, matched and merged across batches (paper section 4.5)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every baseline: its count, its order, and what defines it."""
+"""Every baseline has its count and its order, and does what defines it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pairwise merging against loops over all pairs."""
+"""Pairwise merging matches loops over all pairs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures that repeat to the byte, and a page that stands alone and escapes text."""
+"""Figures repeat to the byte, and the page stands alone and escapes text."""
 
 from __future__ import annotations
 

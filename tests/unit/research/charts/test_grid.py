@@ -1,4 +1,4 @@
-"""The grid: products, the scenes that it is run on, and records that come back whatever is beside them."""
+"""The grid multiplies lists, finds its scenes, and reads its records back whatever is beside them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which runs make a line, what it is called, its means, and statistics against known values and slow twins."""
+"""Runs make named lines of means, with statistics that match known values and slow twins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Made scenes as folders: the same for the same seed, read back aligned, kept when they are there."""
+"""Made scenes are folders, the same for the same seed, read back aligned, and kept when they are there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The noise model: nothing drawn changes nothing, and what is drawn is found again in the Gaussians."""
+"""The noise model changes nothing where nothing is drawn, and what is drawn is found in the Gaussians."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photos and depth of rooms whose geometry is known by hand."""
+"""Photos and depths are those of rooms whose geometry is known by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of training share."""
+"""Tests of training share this fixture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``--preset paper`` trains with: random views, clusters, the teacher, absolute heads."""
+"""``--preset paper`` trains with random views, clusters, the teacher and absolute heads."""
 
 from __future__ import annotations
 

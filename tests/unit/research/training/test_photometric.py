@@ -1,3 +1,5 @@
+"""Training on photos sees the views, windows and losses that it should."""
+
 from __future__ import annotations
 
 import csv

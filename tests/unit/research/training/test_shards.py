@@ -1,4 +1,4 @@
-"""Examples in files."""
+"""Examples are kept in files."""
 
 from __future__ import annotations
 

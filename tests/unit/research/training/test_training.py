@@ -1,3 +1,5 @@
+"""Training runs write, resume and refuse what they should, and presets have their values."""
+
 from __future__ import annotations
 
 import csv
