@@ -41,7 +41,7 @@ def layers() -> list[str]:
     return [name for layer in contract["layers"] for name in layer.split(" | ")]
 
 
-def test_rooms_are_those_of_the_import_contract_in_its_order() -> None:
+def test_rooms_of_the_page_follow_the_import_contract() -> None:
     assert [room.rstrip("/") for room in rooms(section("Rooms"))] == layers()
 
 

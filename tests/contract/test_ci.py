@@ -77,7 +77,7 @@ def test_short_line_of_a_block_runs_the_commands_that_are_written_out_below(
     assert run_block(find_block(steps), tmp_path) == calls_of(*tasks)
 
 
-def test_tasks_use_what_setup_installs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tasks_use_the_python_that_setup_installs(monkeypatch: pytest.MonkeyPatch) -> None:
     tasks, programs = load_script(ROOT / "tasks.py"), []
 
     def run(call: list[str], **_: object) -> SimpleNamespace:

@@ -65,7 +65,7 @@ def make_cameras(cameras: gsmerge.Cameras) -> list[dict[str, Any]]:
     return out
 
 
-def test_what_comfyui_calls_is_there(nodes: ModuleType) -> None:
+def test_nodes_have_what_comfyui_calls(nodes: ModuleType) -> None:
     """The inputs of a schema are the arguments of ``execute``; the folder has two nodes and under 150 lines."""
     listed = asyncio.run(asyncio.run(nodes.comfy_entrypoint()).get_node_list())
     assert [node.__name__ for node in listed] == ["CompactGaussians", "CompactFile"]
@@ -122,7 +122,7 @@ def test_batches_are_compacted_one_by_one(nodes: ModuleType, scene: gsmerge.Scen
     assert len(reports) == 3
 
 
-def test_a_run_ends_when_it_is_cancelled(nodes: ModuleType, scene: gsmerge.Scene) -> None:
+def test_run_of_a_node_ends_when_it_is_cancelled(nodes: ModuleType, scene: gsmerge.Scene) -> None:
     Bar.cancelled.append(True)
     with pytest.raises(CancelError):
         nodes.CompactGaussians.execute([make_splat(scene.gaussians)], ["300"], ["draft"])

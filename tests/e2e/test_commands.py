@@ -115,8 +115,9 @@ def test_render_draws_each_view_most_like_its_own_photo(made_scene: Path, tmp_pa
 
 
 def test_render_of_two_scenes_shows_them_side_by_side(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    more = ("--views", 2, "--size", "64x64")
-    run("render", made_scene, made_scene / "scene.ply", "-o", tmp_path / "some", *more, code=0)
+    run(
+        "render", made_scene, made_scene / "scene.ply", "-o", tmp_path / "some", "--views", 2, "--size", "64x64", code=0
+    )
     assert list(listing(tmp_path / "some")) == ["view_001.png", "view_003.png"]  # of two scenes, side by side
     both = cv2.imread(str(tmp_path / "some" / "view_001.png"))
     assert both.shape[1] >= 2 * 320

@@ -203,7 +203,7 @@ def test_crop_and_its_inverse_keep_or_leave_out_a_part(result: Path, tmp_path: P
     assert not (tmp_path / "d.ply").exists()
 
 
-def test_what_no_view_shows_is_left_out(result: Path, tmp_path: Path) -> None:
+def test_convert_leaves_out_gaussians_that_no_view_shows(result: Path, tmp_path: Path) -> None:
     """By the cameras beside a result, without them by placed ones, which a note says."""
     whole, clean = read(result), CleanOptions(drop="unseen")
     behind = replace(whole, means=whole.means - 500 * np.array([0, 0, 1], np.float32))

@@ -60,7 +60,7 @@ def test_evaluate_prints_a_table_and_writes_all_scores(
 
 
 @pytest.mark.slow
-def test_a_page_shows_what_is_measured(scene: Path, run: Run) -> None:
+def test_page_of_view_shows_what_evaluate_measures(scene: Path, run: Run) -> None:
     call, page = (scene, scene / "small.ply", "--targets", scene / "targets"), scene / "page.html"
     document = json.loads(run("evaluate", *call, "--lpips", "none", "--json", code=0).out)
     run("view", *call, "--no-open", "-o", page, code=0)

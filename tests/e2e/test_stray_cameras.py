@@ -74,7 +74,7 @@ def test_photos_that_do_not_show_the_scene_are_a_doubt_too(smallest_copy: Path, 
 
 
 @pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")])
-def test_commands_that_take_cameras_run_beside_them(words: tuple[str, ...], stray: Path, run: Run) -> None:
+def test_commands_that_take_cameras_run_beside_stray_ones(words: tuple[str, ...], stray: Path, run: Run) -> None:
     small = stray / "small.ply"
     shutil.copy(stray / "scene.ply", small)
     (stray / "small.cameras.json").write_text("nonsense")

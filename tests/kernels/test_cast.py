@@ -105,7 +105,7 @@ def test_depth_is_where_the_side_changes(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_normals_are_those_of_the_depth(name: str) -> None:
+def test_normals_match_the_slopes_of_the_depth(name: str) -> None:
     """A step along the surface is at right angles to the normal, which looks at the camera."""
     shape, (w, h, f) = random_shape(KINDS[name], np.random.default_rng(KINDS[name])), (120, 90, 120.0)
     depth, ids, _, normals = run(pack_shapes([shape]), w, h, f)
@@ -135,7 +135,7 @@ def test_the_nearest_of_several_shapes_is_seen() -> None:
     np.testing.assert_array_equal(ids, np.where(alone.min(0) < 1e6, alone.argmin(0), -1))
 
 
-def test_light_reaches_what_nothing_is_before() -> None:
+def test_light_reaches_points_with_nothing_before_them() -> None:
     rng = np.random.default_rng(0)
     axes = np.stack([rotation(rng) for _ in range(3)])
     maps = rng.uniform(-0.5, 0.5, (3, 8, 8)).astype(np.float32)

@@ -72,7 +72,7 @@ def test_coincident_members_add_optical_depths(small: Scene) -> None:
 
 
 @pytest.mark.parametrize("axes", [[0], [0, 1]], ids=["line", "sheet"])
-def test_flat_groups_have_a_smallest_scale(small: Scene, axes: list[int]) -> None:
+def test_flat_groups_get_a_smallest_scale_of_a_tenth_of_a_pixel(small: Scene, axes: list[int]) -> None:
     means = np.tile([0.0, 0.0, 3.0], (len(small.gaussians), 1))
     means[:, axes] = small.gaussians.means[:, axes]
     scene = changed(small, means=means, scales=np.full_like(small.gaussians.scales, 1e-9))

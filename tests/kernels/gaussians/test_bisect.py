@@ -127,7 +127,7 @@ def test_transparent_members_are_still_dealt_out() -> None:
     assert [len(parts) for parts in case.children(4)] == [1, 2, 3, 4, 4]
 
 
-def test_first_group_may_start_late() -> None:
+def test_starts_of_groups_need_not_begin_at_zero() -> None:
     """A task works on a range of the groups: starts need not begin at zero."""
     case = Case(2)
     starts, ids, parents = bisect(
@@ -139,7 +139,7 @@ def test_first_group_may_start_late() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_errors_are_those_of_the_children(seed: int) -> None:
+def test_errors_of_splits_match_their_children(seed: int) -> None:
     """Colour about its mean and positions about their plane, weighted by opacity, times the number of members."""
     case = Case(seed, (1, 2, 7, 40))
 

@@ -76,7 +76,7 @@ def test_gaussians_cut_in_pieces_are_those_cut_at_once() -> None:
         np.testing.assert_array_equal(whole, pieces)
 
 
-def test_moments_are_those_of_the_part_inside() -> None:
+def test_cut_gaussian_has_the_moments_of_the_part_inside() -> None:
     """Points drawn from a Gaussian that one edge cuts, those beyond left out."""
     normals = np.zeros((1, NUM_EDGES, 3))
     normals[0, :, 0] = 1

@@ -56,8 +56,7 @@ def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type:
 
 @pytest.mark.parametrize(("num", "count"), [(0, 4), (1, 4), (1, 0), (40, 0)])
 def test_gaussians_of_one_view_have_no_neighbours(num: int, count: int) -> None:
-    neighbors = nearest_of_other_views(np.ones((num, 3)), np.zeros(num, np.int64), count)
-    assert neighbors.tolist() == [[-1] * count] * num
+    assert nearest_of_other_views(np.ones((num, 3)), np.zeros(num, np.int64), count).tolist() == [[-1] * count] * num
 
 
 def test_damaged_trees_are_refused() -> None:

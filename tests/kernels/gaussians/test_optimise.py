@@ -184,7 +184,7 @@ def test_sizes_stay_above_the_least_within_the_box_and_beyond() -> None:
 
 
 @pytest.mark.parametrize("pieces", [[0, 1, 33], [0, 16, 33], [0, 5, 6, 6, 20, 33]])
-def test_rows_may_be_split_anywhere(pieces: list[int]) -> None:
+def test_steps_in_pieces_have_the_same_bits_as_at_once(pieces: list[int]) -> None:
     whole, split = make_run(33), make_run(33)
     for step in range(1, 8):
         g = gradients(33, seed=step, share=1.1)

@@ -92,7 +92,7 @@ def test_cheapest_pair_is_merged_until_the_wanted_share_is_left() -> None:
             members[first] |= members.pop(second)
 
 
-def test_moments_are_those_of_the_formula() -> None:
+def test_moments_of_gaussians_match_the_formulas() -> None:
     g = random_gaussians(50, 2)
     quats = (g.quats * 3).astype(np.float32)
     covars, masses = np.empty((50, 6), np.float32), np.empty(50, np.float32)

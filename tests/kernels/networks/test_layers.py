@@ -186,7 +186,7 @@ def names_of(options: NetworkOptions) -> list[str]:
 
 
 @sweep("which", [*IN_PACKAGE, *range(len(OTHERS))])
-def test_networks_are_those_of_training(which: str | int, each_target: Callable[..., list[np.ndarray]]) -> None:
+def test_networks_match_the_modules_of_training(which: str | int, each_target: Callable[..., list[np.ndarray]]) -> None:
     """Of what ships and of random ones, to rounding."""
     modules_of = training_helpers().modules_of
     named = isinstance(which, str)
@@ -214,6 +214,6 @@ def test_every_group_is_computed_alone() -> None:
 
 
 @pytest.mark.parametrize("options", [NetworkOptions(), *OTHERS, NetworkOptions(encoder=False, merger=False)])
-def test_shapes_of_weights_are_those_of_the_modules(options: NetworkOptions) -> None:
+def test_shapes_of_weights_match_the_modules_of_training(options: NetworkOptions) -> None:
     state = training_helpers().Networks(options).state_dict()
     assert weight_shapes(options) == {name: tuple(tensor.shape) for name, tensor in state.items()}

@@ -115,7 +115,7 @@ def test_owner_is_in_the_first_of_equal_views() -> None:
         pytest.param([(np.nan, 1, -1)], 1, id="a label that is no number"),
     ],
 )
-def test_chains_that_do_not_end_are_refused(pairs: list[tuple[float, float, float]], num_pairs: int) -> None:
+def test_damaged_chains_of_pairs_are_refused(pairs: list[tuple[float, float, float]], num_pairs: int) -> None:
     rows, num_labels = np.array(pairs, float), 2
     heads, active, counts = np.zeros(1, np.int32), np.zeros(2, np.int32), np.array([num_pairs, 1, 0])
     totals, seen = np.zeros(num_labels), np.empty(num_labels, np.int32)

@@ -117,7 +117,7 @@ def test_pixels_without_weight_teach_nothing() -> None:
     np.testing.assert_allclose(image_gradient(image, elsewhere, weight, 0.2, 1.2)[0], gradient, atol=1e-7)
 
 
-def test_flat_pictures_stay_finite() -> None:
+def test_gradients_of_flat_pictures_are_finite() -> None:
     flat, weight = np.zeros((9, 9, 3), np.float32), np.ones((9, 9), np.float32)
     for image in (flat, flat + 1):
         assert np.isfinite(image_gradient(image, flat, weight, 0.2, 1.2)[0]).all()

@@ -130,7 +130,7 @@ def test_bits_are_the_same_on_every_processor(each_target: Any, kernel: Any, hos
 
 
 @pytest.mark.parametrize("num", [0, 1, 2, 4, 5, 7, 8, 11, 15, 20, 24])
-def test_any_number_of_harmonics(each_target: Any, num: int) -> None:
+def test_missing_harmonics_of_a_degree_count_as_zero(each_target: Any, num: int) -> None:
     """Those of a degree may be given in part; the rest count as zero. The last Gaussian is one of those listed."""
     columns = columns_of(31, num)
     actual = each_target(lambda: colors_of(columns))
@@ -186,7 +186,7 @@ def test_ranges_outside_are_refused() -> None:
         project.project_backward(*head, 1, 5, *results)
 
 
-def test_rows_are_added_where_they_belong() -> None:
+def test_added_rows_go_to_the_rows_of_their_ids() -> None:
     totals, rows = normal(6, 5), normal(3, 5)
     expected, ids = totals.copy(), np.array([4, 0, 5], np.int32)
     expected[ids] += rows

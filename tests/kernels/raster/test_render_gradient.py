@@ -92,7 +92,7 @@ def test_gradients_of_degenerate_gaussians_match_autograd(change: str) -> None:
     assert_close(gradients(gaussians, cameras), reference_gradients(gaussians, cameras))
 
 
-def test_what_is_not_drawn_has_no_gradient() -> None:
+def test_gaussians_that_are_not_drawn_have_no_gradient() -> None:
     gaussians, cameras = random_gaussians(40, 2, 6), turned_cameras(1)
     means, opacities = gaussians.means.clone(), gaussians.opacities.clone()
     means[:10, 2], opacities[10:20] = -3.0, 0.0
@@ -122,7 +122,7 @@ def test_inputs_that_ask_for_a_gradient_get_one_of_their_type() -> None:
     assert gaussians.opacities.grad is None
 
 
-def test_images_are_those_without_gradients() -> None:
+def test_images_with_gradients_are_those_without() -> None:
     gaussians, cameras = random_gaussians(40, 1), turned_cameras()
     plain = render(gaussians, cameras, BACKGROUND, with_depths=True)
     *tensors, viewmats = leaves(gaussians, cameras)

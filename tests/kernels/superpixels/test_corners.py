@@ -16,7 +16,7 @@ def noise(height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_corners_are_those_of_opencv(size: tuple[int, int]) -> None:
+def test_corners_match_opencv_s(size: tuple[int, int]) -> None:
     pixels = noise(*size)
     expected = cv2.cornerMinEigenVal(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), 3, ksize=3)
     response = seeds.corner_response(pixels)

@@ -117,7 +117,7 @@ def test_corrections_of_tensors_are_those_of_arrays(torch: Any) -> None:
 
 @pytest.mark.parametrize("opacity", [0.0, 1e-6, 1.0])
 @pytest.mark.parametrize("logit", [-3.0, 3.0])
-def test_opacities_at_the_ends_stay_within_them(logit: float, opacity: float) -> None:
+def test_opacities_of_0_and_1_stay_within_0_and_1(logit: float, opacity: float) -> None:
     base = replace(base_of(some()), opacities=np.full(20, opacity, np.float32))
     residuals = zeros()
     residuals[:, LOGIT_COLUMN] = logit

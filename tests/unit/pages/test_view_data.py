@@ -97,7 +97,7 @@ def unpacked(packed: bytes | None) -> tuple[dict[str, Any], np.ndarray]:
     return head, np.stack(columns, 1)
 
 
-def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
+def test_scores_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
     nets = (data.LPIPS,) if lpips_available(data.LPIPS) else ()
     expected = evaluate(scene, {"half": half}, held_out, EvaluateOptions(lpips=nets, fog=False))
     by_place = sorted(actual.views, key=lambda view: view.place)
@@ -230,7 +230,7 @@ def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: py
     assert unpacked(content)[1].shape == (len(half), 13 + 24)
 
 
-def test_harmonics_of_zeros_are_left_out(small: Scene) -> None:
+def test_higher_degrees_of_zeros_are_left_out(small: Scene) -> None:
     half = small.gaussians[::2]
     flat = np.zeros((len(half), 15, 3), np.float32)
     flat[:, :3] = 0.1
@@ -247,7 +247,7 @@ def test_pixels_in_order_take_less_than_their_spz(scene: Scene) -> None:
     assert len(packed or b"") < 0.8 * len(pack_splats(gaussians)[0] or b"") < 0.8 * len(spz_bytes(gaussians))
 
 
-def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
+def test_gaussians_not_finite_or_too_faint_are_left_out(half: Gaussians) -> None:
     means, opacities = half.means.copy(), half.opacities.copy()
     means[0, 1], opacities[1] = np.nan, 0.003
     content, _ = pack_splats(replace(half, means=means, opacities=opacities))
@@ -256,7 +256,7 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
     assert counts[0] == counts[1] - 2
 
 
-def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_views_are_thinned_to_some_with_the_worst(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(data, "MAX_SHOWN_VIEWS", 1)
     actual = collect_page_data("room", small, {"half": small.gaussians[::2]}, (2, 1))
     everything = evaluate(small, {"half": small.gaussians[::2]}, None, EvaluateOptions(lpips=())).results[1].scores

@@ -197,7 +197,7 @@ def contrast(*colors: str) -> float:
     return (high + 0.05) / (low + 0.05)
 
 
-def test_what_the_input_covers_stands_beside_all_pixels(data: ViewData) -> None:
+def test_scores_of_covered_pixels_stand_beside_those_of_all_pixels(data: ViewData) -> None:
     """Where the scene itself lacks pixels."""
     before, after = (replace(side, covered_share=0.79, covered=Quality(26.1)) for side in data.sides[:2])
     lacking = replace(data, sides=(before, after, *data.sides[2:]))

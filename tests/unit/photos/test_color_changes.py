@@ -81,7 +81,7 @@ def test_a_map_is_least_squares() -> None:
 
 
 @pytest.mark.parametrize("change", [gamma, mix])
-def test_a_change_explains_what_it_made(change: Change) -> None:
+def test_fitted_change_explains_the_change_that_was_made(change: Change) -> None:
     pairs = pair(change, noise=0.02)
     stored = cut_blocks(pairs)
     after = tone_blocks(pairs, GROUPS) if change is gamma else map_blocks(stored)
@@ -127,7 +127,7 @@ def half_grey(photos: np.ndarray) -> np.ndarray:
     ],
     ids=["grey", "sepia", "half grey", "mixed"],
 )
-def test_grey_photos_are_those_without_hues(change: Change, is_grey: bool) -> None:
+def test_photos_without_hues_are_told_from_others(change: Change, is_grey: bool) -> None:
     """Of the Gaussians, since grey Gaussians need no other photos."""
     pairs = pair(lambda photos: photos)
     photos = change(pairs.photos)

@@ -58,7 +58,7 @@ def test_each_of_few_views_is_compared_with_all_others_and_of_many_with_some() -
     assert (np.diff(many) > 0).all()
 
 
-def test_gains_of_many_views_follow_from_some_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gains_of_many_views_are_solved_from_some_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("NEAREST_VIEWS", "FARTHER_VIEWS"):
         monkeypatch.setattr(f"gsmerge.photos.exposure.{name}", 4)
     count = 16

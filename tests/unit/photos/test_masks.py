@@ -157,7 +157,7 @@ def test_levels_of_a_mask_are_its_greys_unless_only_0_and_1(tmp_path: Path, most
     assert decode_levels(tmp_path / "a.png").tolist() == [[0, white, 0]]
 
 
-def test_a_mask_may_take_what_its_photo_allows(tmp_path: Path) -> None:
+def test_mask_may_take_as_much_memory_as_its_photo_allows(tmp_path: Path) -> None:
     mask, photo = tmp_path / "mask.png", tmp_path / "photo.jpg"
     write(mask, np.full((6000, 6000), 255, np.uint8))
     photo.write_bytes(bytes(1_000_000))
@@ -179,7 +179,7 @@ def test_grey_of_a_mask_is_the_weight_of_its_pixel(tiny_folder: Path, tiny: Tiny
     assert scene.protected is None
 
 
-def test_what_has_to_stay_sharp_counts_four_times(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+def test_protected_pixels_count_four_times(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
     levels = half(tiny).astype(np.uint8) * 255
     levels[:, 0] = 51
     write(tmp_path / "signs" / tiny.names[1], levels)

@@ -57,7 +57,7 @@ def test_no_gaussians_leave_the_background() -> None:
     assert (rendering.depths == 0).all()
 
 
-def test_what_is_behind_or_too_faint_is_not_seen() -> None:
+def test_gaussians_behind_the_camera_or_too_faint_are_not_drawn() -> None:
     gaussians = balls((0, 0, -1, 0.1, 1, 1), (0, 0, 0.01, 0.1, 1, 1), (0, 0, 1, 0.1, 1 / 256, 1), (9, 0, 1, 0.1, 1, 1))
     tiled = tile_view(make_splats(gaussians), np.eye(4), camera().Ks[0], 21, 11)
     assert len(tiled.ids) == 0
@@ -72,7 +72,7 @@ def test_negative_colours_are_clamped_but_given_ones_are_not() -> None:
     assert transmittance[5, 10] == pytest.approx(0.2, abs=1e-6)
 
 
-def test_left_out_ones_and_other_opacities() -> None:
+def test_tiled_views_leave_out_gaussians_and_take_other_opacities() -> None:
     splats = make_splats(balls((0, 0, 1, 0.5, 0.5, 1), (0, 0, 2, 1.0, 0.5, 1)))
     alone = tile_view(splats, np.eye(4), camera().Ks[0], 21, 11, keep=np.array([False, True]))
     assert alone.ids.tolist() == [1]
@@ -194,7 +194,7 @@ def test_bands_of_a_large_picture_are_those_of_the_whole(band: int, monkeypatch:
     assert shapes == [*[tall] * (61 // tall), 61 % tall] * 2
 
 
-def test_lists_end_behind_what_hides_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tile_lists_end_behind_gaussians_that_hide_the_tile(monkeypatch: pytest.MonkeyPatch) -> None:
     """So Gaussians that cover every pixel, and cannot be seen, take no memory; what is drawn stays."""
     huge = balls(*((0.01 * i, 0, 4 + 0.01 * i, 30 + i, 0.02 + 0.004 * i, 0.5) for i in range(200)))
     gaussians, cameras = Gaussians.concat([many_balls()[:40], huge]), camera(41, 61)

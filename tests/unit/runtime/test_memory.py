@@ -18,7 +18,7 @@ def test_values_stay_when_pages_are_freed(monkeypatch: pytest.MonkeyPatch) -> No
     np.testing.assert_array_equal(array, np.arange(1500).reshape(300, 5))
 
 
-def test_private_pages_of_others_stay(tmp_path: Path) -> None:
+def test_freed_pages_of_private_copies_keep_their_values(tmp_path: Path) -> None:
     np.zeros(4096, np.float32).tofile(tmp_path / "rows")
     array = np.memmap(tmp_path / "rows", np.float32, mode="c")
     array[:] = 1

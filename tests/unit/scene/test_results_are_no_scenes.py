@@ -74,7 +74,7 @@ def test_result_is_not_taken_for_a_part_or_a_step_of_training(tmp_path: Path, ti
     assert find_scene_files(tmp_path / "run").ply == steps / "point_cloud_6999.ply"
 
 
-def test_what_the_library_writes_may_be_a_scene(tmp_path: Path, tiny: Tiny) -> None:
+def test_files_written_by_the_library_may_be_scenes(tmp_path: Path, tiny: Tiny) -> None:
     """Generated scenes, too, are written without the comment of results."""
     tiny.save(tmp_path)
     assert header_content(tmp_path / "scene.ply") == "Gaussians"

@@ -96,13 +96,13 @@ def test_members_without_a_pixel_are_in_no_group(room: Scene, groups: Groups) ->
     np.testing.assert_allclose(members.footprints[::3], (away / focals).min(1)[::3], rtol=1e-5)
 
 
-def test_frame_is_that_of_the_grid(room: Scene) -> None:
+def test_frame_of_gaussians_in_no_order_is_that_of_the_grid(room: Scene) -> None:
     actual, expected = canonicalise(unaligned_scenes.without_order(room))[1], scene_frame(room)
     assert actual.unit == expected.unit
     assert np.abs(actual.origin - expected.origin).max() < 0.5
 
 
-def test_density_is_of_the_gaussians_where_those_are_fewer(room: Scene) -> None:
+def test_share_of_superpixels_is_of_gaussians_where_these_are_fewer(room: Scene) -> None:
     options = SegmentOptions(superpixels="10%")
     whole = unaligned_scenes.without_order(room)
     sizes = [whole, room, *(replace(whole, gaussians=room.gaussians[rows]) for rows in (slice(0, None, 2), slice(1)))]
@@ -110,7 +110,7 @@ def test_density_is_of_the_gaussians_where_those_are_fewer(room: Scene) -> None:
     assert superpixels_per_view(measure_size(whole), SegmentOptions(superpixels=50)) == 50
 
 
-def test_few_gaussians_are_as_many_as_of_pixels(room: Scene) -> None:
+def test_few_gaussians_get_half_as_many_superpixels_at_most(room: Scene) -> None:
     """A share of tokens is too few to show the photos; half of them are the most."""
     tokens = replace(measure_size(unaligned_scenes.without_order(room)), rendered=False)
     sizes = [replace(tokens, num_gaussians=count) for count in (1151, 200)]
@@ -134,7 +134,7 @@ def test_unknown_cameras_are_placed(room: Scene) -> None:
     assert "photos" in log.notes[-1]
 
 
-def test_placed_cameras_see_most(room: Scene) -> None:
+def test_placed_cameras_see_most_gaussians(room: Scene) -> None:
     blind = add_views(Scene(room.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ()))
     groups = Groups(np.zeros((len(blind), blind.cameras.height, blind.cameras.width), np.int32), (1,) * len(blind))
     owners = find_owners(blind, groups)

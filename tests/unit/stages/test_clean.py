@@ -232,7 +232,7 @@ def test_crop_and_dropped_floaters_need_the_whole_scene() -> None:
     ]  # fmt: skip
 
 
-def test_what_no_view_shows_is_left_out(scene: Scene) -> None:
+def test_gaussians_that_no_view_shows_are_left_out(scene: Scene) -> None:
     """What stands behind the cameras, and nothing that takes part in a picture."""
     given = scene.gaussians
     behind = given.means - 1000 * scene.cameras.viewmats[0, 2, :3].astype(np.float32)

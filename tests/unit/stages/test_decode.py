@@ -83,7 +83,9 @@ def test_mixed_k_goes_by_the_saliency(features: FeatureGaussians, members: Membe
     assert options.mean_k == pytest.approx(1.9)
 
 
-def test_mixed_k_by_distortion_has_as_many(features: FeatureGaussians, members: Members) -> None:
+def test_mixed_k_has_as_many_children_by_distortion_as_by_saliency(
+    features: FeatureGaussians, members: Members
+) -> None:
     saliency = np.random.default_rng(0).random(len(members.means)).astype(np.float32)
     by_saliency = mixed_counts(features, members, saliency, DecodeOptions(k="mixed"))
     by_distortion = mixed_counts(features, members, saliency, DecodeOptions(k="mixed", k_rule="distortion"))
@@ -115,7 +117,7 @@ def test_gains_reach_the_children(features: FeatureGaussians, members: Members) 
 
 
 @pytest.mark.parametrize("k", [1, 4])
-def test_faint_ones_are_left_out(scene: Scene, k: int) -> None:
+def test_faint_children_are_left_out(scene: Scene, k: int) -> None:
     opacities = scene.gaussians.opacities.copy()
     opacities[: scene.pixels_per_view] = 0
     half = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))

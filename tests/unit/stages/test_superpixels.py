@@ -81,10 +81,13 @@ def test_image_of_a_wrong_shape_or_type_is_refused(image: np.ndarray, found: obj
             use()
 
 
-def test_counts_of_options() -> None:
+def test_count_follows_a_number_or_a_share_of_pixels() -> None:
     assert count_for(SegmentOptions(superpixels=7), 100, 100) == 7
     assert count_for(SegmentOptions(superpixels="5%"), 20, 30) == 30
     assert count_for(SegmentOptions(superpixels="0.1%"), 5, 5) == 1
+
+
+def test_number_or_share_of_no_superpixels_is_refused() -> None:
     with refuses(ValueError, "superpixels", 1, 0):
         SegmentOptions(superpixels=0)
     with refuses(ValueError, "superpixels", "4.4%", "'0%'"):

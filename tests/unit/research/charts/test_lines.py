@@ -27,7 +27,7 @@ def test_each_method_with_its_settings_is_a_line() -> None:
     assert point.y.high - point.y.low < 0.2  # the scenes' own level, 5 dB apart, is taken off
 
 
-def test_names_tell_only_what_differs() -> None:
+def test_names_of_lines_tell_only_the_settings_that_differ() -> None:
     settings = [{"k": 2, "effort": "fast"}, {"k": 2, "effort": "best", "segmentation": "slic"}]
     keys = [line_key(make_record("fern", "gsmerge", one)) for one in settings]
     names = ["gsmerge, effort fast", "gsmerge, effort best, segmentation slic"]
@@ -82,8 +82,11 @@ def test_confidence_interval_of_no_values_is_refused() -> None:
         mean_interval([])
 
 
-def test_paired_intervals_of_one_scene_have_no_width_and_of_one_line_are_the_mean_s() -> None:
+def test_paired_intervals_of_one_scene_have_no_width() -> None:
     assert [(i.low, i.high) for i in paired_intervals(np.array([[1.0, 2.0]]))] == [(1, 1), (2, 2)]
+
+
+def test_paired_interval_of_one_line_is_its_confidence_interval() -> None:
     assert paired_intervals(np.array([[1.0], [3.0]])) == [mean_interval([1.0, 3.0])]
 
 

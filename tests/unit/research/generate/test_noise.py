@@ -66,7 +66,7 @@ def test_without_noise_every_gaussian_is_where_its_pixel_looks() -> None:
     np.testing.assert_allclose(colors, seen().image.reshape(-1, 3), atol=1e-6)
 
 
-def test_thin_axes_are_the_normals() -> None:
+def test_thin_axes_of_gaussians_are_normals_of_the_surface() -> None:
     turns = quat_to_rotmat(made(replace(CLEAN, flatness=0.2)).quats)
     np.testing.assert_allclose(np.abs(turns[:, :, 2] @ POSE[:3, 2]), 1, atol=1e-5)
     normals = np.random.default_rng(0).normal(size=(50, 3))

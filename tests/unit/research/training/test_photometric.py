@@ -109,7 +109,7 @@ def test_masks_leave_out_what_the_views_have_not_seen() -> None:
     assert not masks[3].any()
 
 
-def test_views_cover_together_what_half_covers() -> None:
+def test_pixel_is_covered_where_views_cover_half_together() -> None:
     covers = np.array([[[255, 127, 80, 0]], [[0, 0, 80, 128]]], np.uint8)
     np.testing.assert_array_equal(covered_pixels(covers), [[True, False, True, True]])
 
@@ -238,7 +238,7 @@ def test_untrained_networks_render_what_the_analytic_stages_do(example: Example)
 
 @pytest.mark.parametrize("network", [TINY, PAPER.network], ids=["ours", "paper"])
 @pytest.mark.parametrize("k", [1, 2])
-def test_what_is_rendered_is_what_the_stages_make(example: Example, network: NetworkOptions, k: int) -> None:
+def test_rendered_windows_are_what_the_stages_make(example: Example, network: NetworkOptions, k: int) -> None:
     networks = noisy_networks(network)
     learned = NetworkContext(networks, example.members, example.cameras, 0)
     encoded = learned.encode(example.features)
@@ -323,7 +323,7 @@ def test_renders_change_colours_as_photos_do(example: Example) -> None:
 
 
 @pytest.mark.slow
-def test_training_on_renders_makes_them_better(example: Example, tmp_path: Path) -> None:
+def test_training_raises_the_quality_of_renders(example: Example, tmp_path: Path) -> None:
     shard = written(example, tmp_path / "shards")
     done = train([shard], [shard], tmp_path, replace(PHOTO, steps=40, save_every=20, warmup=5))
     rows = list(csv.DictReader((tmp_path / "losses.csv").read_text().splitlines()))

@@ -95,7 +95,7 @@ def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(shard
         {"window": 5}, {"photo_loss": "l2"}, {"lpips_weight": -1}, {"teacher_steps": 0}, {"buffer": 0},
         {"segmentation": "slice"}, {"overlap": 2}, {"iou": -0.1}, {"photo_side": -1}, {"random_views": (3, 2)},
 ])  # fmt: skip
-def test_settings_are_checked(wrong: dict[str, object], tmp_path: Path) -> None:
+def test_settings_out_of_range_are_refused(wrong: dict[str, object], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         replace(OPTIONS, **wrong)
 
