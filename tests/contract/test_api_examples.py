@@ -18,7 +18,7 @@ NAMES = sorted(set(gsmerge.__all__) - {"__version__"})
 
 @pytest.fixture(scope="module")
 def compact() -> Callable[..., gsmerge.CompactResult]:
-    """The function, which takes the folder ``demo`` once for the same options, with its cameras as they are."""
+    """Return the function that takes the folder ``demo`` once for the same options, with its cameras as they are."""
     once, plain = functools.cache(gsmerge.compact), gsmerge.compact
     return lambda scene, **options: (once if isinstance(scene, str) else plain)(scene, poses="fixed", **options)
 

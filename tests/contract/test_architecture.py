@@ -23,25 +23,25 @@ SOURCES = (".py", ".c", ".h", ".toml", ".js", ".html", ".yml", ".sh")
 
 
 def section(title: str, page: Path = ARCHITECTURE) -> str:
-    """The text of a section of a page, without its title."""
+    """Return the text of a section of a page, without its title."""
     return page.read_text("utf-8").partition(f"\n## {title}\n")[2].partition("\n## ")[0]
 
 
 def rooms(text: str) -> list[str]:
-    """The rooms of the list, in its order; what follows the colon of a line describes them."""
+    """Return the rooms of the list, in its order; what follows the colon of a line describes them."""
     heads = re.findall(r"^- (.+?):", text, re.MULTILINE)
     return [name for head in heads for name in re.findall(r"`([\w/]+)`", head)]
 
 
 def layers() -> list[str]:
-    """The rooms of the import contract, from the top; those of one layer in its order."""
+    """Return the rooms of the import contract, from the top; those of one layer in its order."""
     tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
     (contract,) = [one for one in contracts if one["name"] == "Imports flow down"]
     return [name for layer in contract["layers"] for name in layer.split(" | ")]
 
 
-def test_rooms_are_those_of_the_import_contract_in_its_order() -> None:
+def test_rooms_of_the_page_follow_the_import_contract() -> None:
     assert [room.rstrip("/") for room in rooms(section("Rooms"))] == layers()
 
 
@@ -53,7 +53,7 @@ def test_rooms_are_the_folders_and_modules_of_the_package() -> None:
     assert len(listed) == len(inside)
 
 
-def test_the_drawing_has_rooms_alone() -> None:
+def test_drawing_names_rooms_alone() -> None:
     """In its left column; small rooms may be left out."""
     drawing = ARCHITECTURE.read_text("utf-8").partition("A room may import")[2].partition("One run, from top")[0]
     lines = [line for line in drawing.splitlines() if line.startswith("    ")]
@@ -63,18 +63,18 @@ def test_the_drawing_has_rooms_alone() -> None:
 
 
 def arrows() -> list[list[str]]:
-    """The cells of the table of arrows."""
+    """Return the cells of the table of arrows."""
     lines = [line for line in section("Arrows").splitlines() if line.startswith("| ")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
 
 
-def test_arrows_are_those_of_the_first_line() -> None:
+def test_table_of_arrows_follows_the_line_from_files_to_ply() -> None:
     first = re.search(r"^    files -> scene -> (.+) -> ply$", ARCHITECTURE.read_text("utf-8"), re.MULTILINE)
     assert first is not None
     assert [row[0] for row in arrows()] == first[1].split(" -> ")
 
 
-def test_functions_of_arrows_are_in_their_files() -> None:
+def test_functions_in_the_table_of_arrows_are_in_the_files_beside_them() -> None:
     for _, functions, files in arrows():
         modules = [import_module("gsmerge." + name.replace("/", ".")) for name in re.findall(r"`([\w/]+)`", files)]
         names = re.findall(r"`(\w+)`", functions)
@@ -84,7 +84,7 @@ def test_functions_of_arrows_are_in_their_files() -> None:
             assert any(hasattr(owner, name) for owner in owners), name
 
 
-def test_each_file_of_cameras_says_what_it_serves() -> None:
+def test_table_of_cameras_has_each_file_of_that_folder() -> None:
     cells = "".join(line.split("|")[1] for line in section("Cameras").splitlines() if line.startswith("| `"))
     files = [path for path in (PACKAGE / "cameras").iterdir() if not path.name.startswith("_")]
     names = {path.stem if path.is_file() else f"{path.name}/" for path in files}
@@ -99,7 +99,7 @@ def code_spans(page: Path) -> Iterator[str]:
 
 @cache
 def top() -> tuple[set[str], set[str]]:
-    """The names of folders of the package, and of the repository."""
+    """Return the names of folders of the package, and of the repository."""
     return tuple({path.name for path in folder.iterdir() if path.is_dir()} for folder in (PACKAGE, ROOT))  # type: ignore
 
 
@@ -111,7 +111,7 @@ def is_there(name: str) -> bool:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_paths_lead_to_files(page: Path) -> None:
+def test_paths_on_a_page_lead_to_files(page: Path) -> None:
     folders = set.union(*top())
     paths = [span for span in code_spans(page) if re.fullmatch(r"[\w.-]+(/[\w.-]+)+/?", span)]
     own = [path for path in paths if path.split("/")[0] in folders and path.rstrip("/") not in MADE | FOREIGN]
@@ -120,7 +120,7 @@ def test_paths_lead_to_files(page: Path) -> None:
 
 @cache
 def words_of_sources() -> set[str]:
-    """All identifiers of the repository's code, tests included, and the names of its files."""
+    """Return all identifiers of the repository's code, tests included, and the names of its files."""
     files = [path for name in ("gsmerge", "benchmarks", "docs", "tests", "tools", "examples", ".github")
              for path in (ROOT / name).rglob("*") if path.suffix in SOURCES and path != Path(__file__)]  # fmt: skip
     texts = [path.read_text("utf-8") for path in (*files, ROOT / "pyproject.toml")]
@@ -128,7 +128,7 @@ def words_of_sources() -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_names_are_in_the_code(page: Path) -> None:
+def test_names_on_a_page_are_names_of_the_code(page: Path) -> None:
     """Names with an underscore or a capital inside, which are those of definitions, settings and keys."""
     spans = [re.sub(r"^--(hint|set) ", "", span) for span in code_spans(page)]
     names = {name for span in spans for name in re.findall(r"\b(?:[A-Za-z]+_\w+|[A-Z][a-z]+[A-Z]\w+)\b", span)}

@@ -1,4 +1,4 @@
-"""The automatic checks, and what the front page and the templates of issues say of them."""
+"""The automatic checks do what the front page and the templates of issues say of them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def run_block(block: str, folder: Path, failing: str = "none") -> list[str]:
     return (folder / "calls").read_text(encoding="utf-8").splitlines()
 
 
-def test_the_commands_that_test_run_as_a_whole(tmp_path: Path) -> None:
+def test_block_of_the_tests_runs_as_a_whole(tmp_path: Path) -> None:
     made, installed, tested = run_block(find_block("-m pytest"), tmp_path)
     assert made == "python3 -m venv .venv"
     assert installed == "pip install -q -c constraints.txt -e .[test]"
@@ -58,7 +58,7 @@ def test_the_commands_that_test_run_as_a_whole(tmp_path: Path) -> None:
 
 
 def calls_of(*tasks: str) -> list[str]:
-    """The commands of tasks, as :func:`run_block` notes them."""
+    """Return the commands of tasks, as :func:`run_block` notes them."""
     calls = [call for task in tasks for call in load_script(ROOT / "tasks.py").TASKS[task]]
     return [" ".join(call).replace("python -m venv", "python3 -m venv") for call in calls]
 
@@ -70,12 +70,14 @@ def calls_of(*tasks: str) -> list[str]:
         ("python3 tasks.py demo\n", "examples/01_make_scene.py", ("demo",)),
     ],
 )
-def test_one_line_runs_the_lines_below_it(line: str, steps: str, tasks: tuple[str, ...], tmp_path: Path) -> None:
+def test_short_line_of_a_block_runs_the_commands_that_are_written_out_below(
+    line: str, steps: str, tasks: tuple[str, ...], tmp_path: Path
+) -> None:
     assert find_block(line.strip()) == line
     assert run_block(find_block(steps), tmp_path) == calls_of(*tasks)
 
 
-def test_tasks_use_what_setup_installs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tasks_use_the_python_that_setup_installs(monkeypatch: pytest.MonkeyPatch) -> None:
     tasks, programs = load_script(ROOT / "tasks.py"), []
 
     def run(call: list[str], **_: object) -> SimpleNamespace:
@@ -90,17 +92,17 @@ def test_tasks_use_what_setup_installs(monkeypatch: pytest.MonkeyPatch) -> None:
     assert programs == [sys.executable]
 
 
-def test_the_commands_that_test_stop_where_one_fails(tmp_path: Path) -> None:
+def test_commands_of_the_tests_stop_where_one_fails(tmp_path: Path) -> None:
     assert run_block(find_block("-m pytest"), tmp_path, failing="pip")[-1].startswith("pip install")
 
 
-def test_the_main_job_runs_as_a_whole(tmp_path: Path) -> None:
+def test_block_of_the_main_job_runs_as_a_whole(tmp_path: Path) -> None:
     calls = [call.split()[:2] for call in run_block(find_block("examples/01_make_scene.py"), tmp_path)]
     install, make = ["pip", "install"], ["python", "examples/01_make_scene.py"]
     assert calls == [["python3", "-m"], install, make, ["gsmerge", "compact"], ["gsmerge", "render"]]
 
 
-def test_ci_runs_that_block() -> None:
+def test_ci_script_runs_the_block_of_the_tests() -> None:
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     assert 'commands=$(python3 tools/readme_block.py "tasks.py setup tests")' in script
     assert 'bash -euo pipefail -c "$commands"' in script
@@ -113,7 +115,7 @@ def test_every_version_of_python_at_the_ends_is_tested() -> None:
     assert {f"3.{first}", f"3.{int(end) - 1}"} <= set(re.findall(r'python: "([\d.]+)"', text))
 
 
-def test_wheels_are_built_for_the_platforms_that_the_guide_names_and_tried_there() -> None:
+def test_wheels_are_built_and_tried_on_the_platforms_of_the_guide() -> None:
     text = (ROOT / ".github" / "workflows" / "wheels.yml").read_text(encoding="utf-8")
     platforms = re.findall(r"for platform in (.+); do", text)[0].split()
     assert len({find_platform(tag) for tag in platforms}) == len(platforms) == 5

@@ -57,27 +57,27 @@ FRACTIONS = {2: "half", 3: "third", 4: "quarter", 5: "fifth", 10: "tenth", 12: "
 
 
 def percent(share: float) -> str:
-    """A share as pages write it."""
+    """Return a share as pages write it."""
     return f"{100 * share:.3g} %"
 
 
 def part(share: float) -> str:
-    """A share as a word, such as a quarter."""
+    """Return a share as a word, such as a quarter."""
     return FRACTIONS[round(1 / share)]
 
 
 def word(number: int, *, ordinal: bool = False) -> str:
-    """A small number as a word."""
+    """Return a small number as a word."""
     return {5: "fifth", 7: "seventh"}[number] if ordinal else NUMBERS[number]
 
 
 def million(number: int) -> str:
-    """A number of millions."""
+    """Return a number of millions."""
     return f"{number / 1e6:g} million"
 
 
 def degree(number: int) -> str:
-    """Gigabytes for a million Gaussians with harmonics of a degree."""
+    """Return gigabytes for a million Gaussians with harmonics of a degree."""
     return f"{1e-3 * round((memory.memory_bytes(10**6, num_rest=3 * ((number + 1) ** 2 - 1)) - FIXED) / 1e6):.2f}"
 
 
@@ -232,12 +232,12 @@ CLAIMS: dict[str, tuple[str, ...]] = {
 
 @cache
 def words_of(page: str) -> str:
-    """The text of a page in one line."""
+    """Return the text of a page in one line."""
     return " ".join((ROOT / page).read_text("utf-8").split())
 
 
 def missing(text: str, quotes: tuple[str, ...]) -> list[str]:
-    """The quotes that a text does not have; a number goes on no further than in its quote."""
+    """Return the quotes that a text does not have; a number goes on no further than in its quote."""
     return [quote for quote in quotes if not re.search(rf"(?<![\d.,]){re.escape(quote)}(?!\d)", text)]
 
 
@@ -265,7 +265,7 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory: pytest.TempPathFactory) -> tuple[gsmerge.Scene, gsmerge.Views]:
-    """The scene, and photos that no run has seen."""
+    """Return the scene, and photos that no run has seen."""
     folder = tmp_path_factory.mktemp("example") / "demo"
     load = load_scene(load_script(ROOT / "examples" / "01_make_scene.py").make_scene(folder))
     held_out = read_held_out(load, folder / "targets")

@@ -1,4 +1,4 @@
-"""The nodes for ComfyUI, on the interface of ComfyUI 0.27 without ComfyUI."""
+"""The nodes for ComfyUI work on the interface of ComfyUI 0.27, for which modules stand in."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def scene() -> gsmerge.Scene:
 
 
 def make_splat(*items: gsmerge.Gaussians) -> Splat:
-    """A batch as ComfyUI holds it."""
+    """Return a batch as ComfyUI holds it."""
     columns = [(g.means, g.scales, g.quats, g.opacities[:, None], np.concatenate([g.sh0, g.shN], 1)) for g in items]
     tensors = [[torch.from_numpy(np.ascontiguousarray(column)) for column in row] for row in columns]
     padded = [torch.nn.utils.rnn.pad_sequence(list(row), batch_first=True) for row in zip(*tensors, strict=True)]
@@ -51,7 +51,7 @@ def make_splat(*items: gsmerge.Gaussians) -> Splat:
 
 
 def make_cameras(cameras: gsmerge.Cameras) -> list[dict[str, Any]]:
-    """Cameras as ComfyUI holds them: y up, looking along -z."""
+    """Return cameras as ComfyUI holds them: y up, looking along -z."""
     out = []
     for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True):
         pose = np.linalg.inv(viewmat)
@@ -65,7 +65,7 @@ def make_cameras(cameras: gsmerge.Cameras) -> list[dict[str, Any]]:
     return out
 
 
-def test_what_comfyui_calls_is_there(nodes: ModuleType) -> None:
+def test_nodes_have_what_comfyui_calls(nodes: ModuleType) -> None:
     """The inputs of a schema are the arguments of ``execute``; the folder has two nodes and under 150 lines."""
     listed = asyncio.run(asyncio.run(nodes.comfy_entrypoint()).get_node_list())
     assert [node.__name__ for node in listed] == ["CompactGaussians", "CompactFile"]
@@ -122,7 +122,7 @@ def test_batches_are_compacted_one_by_one(nodes: ModuleType, scene: gsmerge.Scen
     assert len(reports) == 3
 
 
-def test_a_run_ends_when_it_is_cancelled(nodes: ModuleType, scene: gsmerge.Scene) -> None:
+def test_run_of_a_node_ends_when_it_is_cancelled(nodes: ModuleType, scene: gsmerge.Scene) -> None:
     Bar.cancelled.append(True)
     with pytest.raises(CancelError):
         nodes.CompactGaussians.execute([make_splat(scene.gaussians)], ["300"], ["draft"])

@@ -1,4 +1,4 @@
-"""The page's table of what the recipe does otherwise than the paper: every row is so, and there is no other."""
+"""The recipe departs from the paper as the page's table says, and nowhere else."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ ALL = DecodeOptions(k=2, min_opacity=0.0)
 
 
 def rows() -> list[list[str]]:
-    """The rows of the page's table, without its head."""
+    """Return the rows of the page's table, without its head."""
     section = PAGE.read_text(encoding="utf-8").partition(f"{TITLE}\n")[2].partition("\n## ")[0]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if "|" in line]
     return cells[2:]
 
 
 def heads() -> None:
-    """Silent heads leave round Gaussians as large as their group, half transparent; others move them within bounds."""
+    """Check that silent heads leave round Gaussians as large as their group, and others move them within bounds."""
     scene = made()
     features = encode_features(scene.features, scene.networks(untrained(SMALL)))
     still = decode(features, scene.members, ALL, networks=scene.networks(untrained(SMALL)))
@@ -58,7 +58,7 @@ def group_numbers() -> None:
 
 
 def bass() -> None:
-    """The same number of superpixels in a plain picture and in a busy one."""
+    """Check that a plain picture and a busy one get the same number of superpixels."""
     assert RECIPES["paper"]["segmentation"] == "bass-st"
     pictures = np.stack([np.full((60, 80, 3), 0.5), np.random.default_rng(0).random((60, 80, 3))]).astype(np.float32)
     options = SegmentOptions(segmentation="bass-st", superpixels=RECIPES["paper"]["superpixels"])
@@ -66,7 +66,7 @@ def bass() -> None:
 
 
 def siblings() -> None:
-    """The size of the world has no influence on the loss, which is at most 1 times the photometric one."""
+    """Check that the world's size has no influence on the loss, at most 1 times the photometric one."""
     torch = pytest.importorskip("torch", reason="torch is not installed")
     from gsmerge.research.training.losses import diversity_loss
     from gsmerge.types import Gaussians
@@ -83,7 +83,7 @@ def siblings() -> None:
 
 
 def harmonics() -> None:
-    """Children have their group's."""
+    """Check that children have their group's harmonics."""
     scene = made()
     context = scene.networks(noisy(SMALL, 0.05))
     encoded = context.encode(scene.features)
@@ -112,17 +112,17 @@ CHECKS: dict[str, Callable[[], None]] = {
 }  # fmt: skip
 
 
-def test_the_table_has_a_row_for_every_departure() -> None:
+def test_table_has_a_row_for_every_departure() -> None:
     assert [row[0] for row in rows()] == list(CHECKS)
     assert all(len(row) == 5 and all(row) for row in rows())
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_every_departure_is_as_the_table_says(name: str) -> None:
+def test_recipe_departs_from_the_paper_as_the_table_says(name: str) -> None:
     CHECKS[name]()
 
 
-def test_all_else_is_the_paper_s() -> None:
+def test_recipe_has_the_paper_s_values_besides_the_departures() -> None:
     """The recipe's settings, and those of its networks."""
     assert RECIPES["paper"] == {
         "superpixels": "5.3%", "segmentation": "bass-st", "match": "aabb", "fit": "none", "min_contribution": 0.0,

@@ -1,4 +1,4 @@
-"""What the wheel and the source archive hold, and what their metadata say."""
+"""The wheel and the source archive hold what they should, and their metadata say so."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SOURCES = ("gsmerge", "setup.py", "pyproject.toml", "README.md", "LICENSE")
 
 @pytest.fixture(scope="module")
 def built(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the wheel and the source archive of a copy of the sources."""
+    """Return a folder with the wheel and the source archive of a copy of the sources."""
     folder = tmp_path_factory.mktemp("distribution")
     for name in SOURCES:
         if (root / name).is_dir():
@@ -54,7 +54,7 @@ def project(root: Path) -> dict[str, Any]:
 
 
 def packed(source: Path) -> set[str]:
-    """Files of the package, without the byte code of what the build runs."""
+    """Return files of the package, without the byte code of what the build runs."""
     files = (path for path in (source / "gsmerge").rglob("*") if path.is_file() and path.suffix != ".pyc")
     return {str(path.relative_to(source)) for path in files}
 
@@ -99,7 +99,9 @@ def test_the_source_archive_can_be_built_again(built: Path) -> None:
     assert {"setup.py", "pyproject.toml", "README.md", "LICENSE"} <= names
 
 
-def test_metadata(built: Path, root: Path, project: dict[str, Any]) -> None:
+def test_metadata_of_the_wheel_name_version_types_and_requirements(
+    built: Path, root: Path, project: dict[str, Any]
+) -> None:
     (wheel,) = (built / "dist").glob("*.whl")
     with zipfile.ZipFile(wheel) as file:
         metadata: Message = email.message_from_bytes(

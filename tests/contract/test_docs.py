@@ -52,14 +52,14 @@ def read(page: str) -> str:
 
 
 def blocks_in(page: str) -> list[list[str]]:
-    """Every ``gsmerge ...`` call in each of a page's shell blocks."""
+    """Return every ``gsmerge ...`` call in each of a page's shell blocks."""
     blocks = re.findall(r"```(?:bash|console)\n(.*?)```", read(page), re.DOTALL)
     parts = [[part.strip() for line in block.splitlines() for part in line.split("&&")] for block in blocks]
     return [[re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)] for calls in parts]
 
 
 def calls_in(page: str) -> list[str]:
-    """Every ``gsmerge ...`` call in a page's shell blocks."""
+    """Return every ``gsmerge ...`` call in a page's shell blocks."""
     return [call for calls in blocks_in(page) for call in calls]
 
 
@@ -113,13 +113,13 @@ def test_pages_name_only_options_that_exist(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in WRITTEN if calls_in(page)])
-def test_calls_parse(page: str) -> None:
+def test_calls_on_a_page_parse(page: str) -> None:
     for call in calls_in(page):
         parse(call)
 
 
 @pytest.mark.parametrize("page", [page for page in WRITTEN if "python benchmarks/" in read(page)])
-def test_benchmarks_in_pages_are_there(page: str) -> None:
+def test_benchmarks_that_pages_name_are_there(page: str) -> None:
     """Their scripts, and their options."""
     text = re.sub(r"`[^`]*`", lambda code: code[0].replace("\n", " "), read(page))
     for name, words in re.findall(r"python (benchmarks/\w+\.py)([^`\n]*)", text):
@@ -128,7 +128,7 @@ def test_benchmarks_in_pages_are_there(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in WRITTEN if "```python" in read(page)])
-def test_python_uses_public_names(page: str) -> None:
+def test_python_on_a_page_uses_public_names(page: str) -> None:
     for block in re.findall(r"```python\n(.*?)```", read(page), re.DOTALL):
         compile(block, page, "exec")
         for module, names in re.findall(r"^from (gsmerge[\w.]*) import ([\w, ]+)$", block, re.MULTILINE):
@@ -148,7 +148,7 @@ VARIABLES: dict[str, type] = {
 
 
 @pytest.mark.parametrize("page", [page for page in WRITTEN if "\nimport gsmerge\n" in read(page)])
-def test_attributes_in_python_exist(page: str) -> None:
+def test_attributes_in_python_on_a_page_exist(page: str) -> None:
     """In blocks, with their comments, and in the text of the guide to Python."""
     blocks = re.findall(r"```python\n(.*?)```", read(page), re.DOTALL)
     parts = [block for block in blocks if "import gsmerge" in block]
@@ -161,7 +161,7 @@ def test_attributes_in_python_exist(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_links_lead_somewhere(page: str) -> None:
+def test_links_on_a_page_lead_somewhere(page: str) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", read(page), flags=re.DOTALL)):
         if "://" in target or target.startswith("../../actions/"):  # pages of the repository's host
             continue
@@ -173,7 +173,7 @@ def test_links_lead_somewhere(page: str) -> None:
             assert section in {re.sub(r"[^\w -]", "", h.lower()).strip().replace(" ", "-") for h in headings}, target
 
 
-def test_index_links_every_page() -> None:
+def test_index_of_the_documentation_links_every_page() -> None:
     index = read("docs/README.md")
     pages = [page.removeprefix("docs/") for page in PAGES if page.startswith("docs/")]
     assert [page for page in pages if page != "README.md" and f"]({page})" not in index] == []
@@ -235,7 +235,7 @@ def test_constraints_pin_every_dependency(root: Path) -> None:
 
 
 def stability_rows(root: Path) -> list[tuple[str, str]]:
-    """Numbers and tests of every row of cases."""
+    """Return numbers and tests of every row of cases."""
     text = (root / "docs" / "internals" / "stability.md").read_text()
     return re.findall(r"^\| ([\d, ]+) \| .+ \| .+ \| (.+) \|$", text, re.MULTILINE)
 
@@ -273,7 +273,7 @@ def test_security_names_the_programs_that_commands_start() -> None:
 
 
 def functions_of(node: ast.AST) -> Iterator[ast.FunctionDef]:
-    """The functions in a node's statements, whose expressions hold none."""
+    """Return the functions in a node's statements, whose expressions hold none."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
             if isinstance(child, ast.FunctionDef):
@@ -281,7 +281,7 @@ def functions_of(node: ast.AST) -> Iterator[ast.FunctionDef]:
             yield from functions_of(child)
 
 
-def test_files_and_functions_are_short() -> None:
+def test_package_has_no_long_file_or_function() -> None:
     """As CONTRIBUTING.md says; docstrings do not count."""
     long = list[str]()
     for path in (ROOT / "gsmerge").rglob("*.py"):

@@ -11,7 +11,7 @@ from gsmerge.kernels.signature import PROTOTYPES
 
 
 def prototypes():
-    """The declarations in C, by name, of everything that calls the library."""
+    """Return the declarations in C, by name, of everything that calls the library."""
     for module in pkgutil.walk_packages(gsmerge.kernels.__path__, "gsmerge.kernels."):
         if "-" not in module.name:  # a built library
             importlib.import_module(module.name)
@@ -23,7 +23,7 @@ def sources():
     return re.sub(r"\s+", " ", re.sub(r"\brestrict ", "", text))
 
 
-def test_declarations_are_those_of_the_sources():
+def test_declarations_match_the_functions_of_the_c_sources():
     text = sources()
     missing = {name: prototype for name, prototype in prototypes().items() if f"API {prototype} {{" not in text}
     assert not missing

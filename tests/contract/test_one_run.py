@@ -19,7 +19,7 @@ def script() -> Any:
 
 @pytest.fixture(scope="module")
 def run() -> Any:
-    """The scene, compacted once for all tests."""
+    """Return the run of the scene, compacted once for all tests."""
     return load_script(PROGRAM).watch_run()
 
 

@@ -1,4 +1,4 @@
-"""Options of the command line: declared once."""
+"""Each option of the command line is declared once."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FEW, OF_COMPACT = 138, 23  # options of all commands, of which each has --progre
 
 
 def shown(command: str, name: str) -> Any:
-    """Default of an option of a command: its own, or as help words the library's."""
+    """Return the default of an option of a command: its own, or as help words the library's."""
     (parameter,) = (p for p in COMMANDS[command].params if p.name == name)
     worded = isinstance(parameter.show_default, str)
     return parameter.show_default if worded else parameter.default
@@ -41,7 +41,7 @@ def test_defaults_of_single_commands_are_the_library_s() -> None:
     assert (made.views, made.width, made.height) == (6, 320, 240)
 
 
-def test_commands_are_eight_and_those_of_research() -> None:
+def test_commands_are_eight_beside_four_of_research() -> None:
     assert set(TOP) == {"compact", "batch", "convert", "extend", "inspect", "render", "view", "evaluate", "lab"}
     assert set(LAB) == {"chart", "generate", "stress", "train"}
 
@@ -56,7 +56,7 @@ def test_there_are_few_options() -> None:
     assert not any(getattr(p, "hidden", False) for command in COMMANDS.values() for p in command.params)
 
 
-def test_what_is_declared_is_used() -> None:
+def test_every_declared_option_belongs_to_a_command() -> None:
     used = {name for command in COMMANDS for name in options_of(command)}
     assert set(OPTIONS) - used == set()
 
@@ -71,7 +71,7 @@ def test_output_is_one_option_everywhere(command: str) -> None:
     assert flags.get("-o") == flags.get("--output")
 
 
-def test_the_package_names_only_options_that_exist(root: Path) -> None:
+def test_sources_of_the_package_name_only_options_that_exist(root: Path) -> None:
     others = {"--help", "--version", "--debug", "--no-deps", "--force-reinstall", "--extra-index-url", "--head"}
     others |= {"--lod-chunk-count"}  # of splat-transform
     known = others | {flag for name in COMMANDS for flag in flags_of(name)}

@@ -21,7 +21,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "internals" / "plugins.md"
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
-    """A folder with the example's module and the metadata of its package."""
+    """Return a folder with the example's module and the metadata of its package."""
     text = PAGE.read_text(encoding="utf-8")
     blocks = dict(re.findall(r"```\w+\n# (\S+)\n(.*?)```", text, re.DOTALL))
     site = tmp_path / "site"
@@ -38,7 +38,7 @@ def site(tmp_path: Path) -> Path:
 
 
 def run(site: Path, *commands: list[str]) -> tuple[list[int], str, str]:
-    """Exit codes of commands one after the other in a process that finds the package; what they print."""
+    """Run commands one after the other in a process that finds the package; return exit codes and what they print."""
     path = os.pathsep.join([str(site), *sys.path])
     code = f"from gsmerge.cli import main\nprint([main(words) for words in {commands!r}])"
     command = [sys.executable, "-c", code]
@@ -48,7 +48,7 @@ def run(site: Path, *commands: list[str]) -> tuple[list[int], str, str]:
 
 
 @pytest.mark.slow
-def test_the_example_works(site: Path, small_scene: Path, tmp_path: Path) -> None:
+def test_example_of_the_page_adds_its_method_and_command(site: Path, small_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     compact = ["compact", str(small_scene), "--set", "method=nth", "--budget", "200", "-o", str(out), "-q"]
     codes, printed, errors = run(site, compact, ["count", str(out)], ["--help"])
@@ -59,7 +59,7 @@ def test_the_example_works(site: Path, small_scene: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_broken_package_stops_no_other(site: Path, small_scene: Path) -> None:
+def test_broken_plugin_stops_no_other(site: Path, small_scene: Path) -> None:
     (site / "gsmerge_nth.py").write_text("import no_such_module\n")
     dry = ["compact", str(small_scene), "--set", "method=nth", "--dry-run"]
     codes, printed, errors = run(site, ["--help"], dry)

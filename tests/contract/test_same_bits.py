@@ -36,7 +36,7 @@ ALLOWED = {
 
 
 def dotted(node: ast.expr) -> str:
-    """The name of an attribute with those in front of it, such as ``np.linalg.inv``."""
+    """Return the name of an attribute with those in front of it, such as ``np.linalg.inv``."""
     return f"{dotted(node.value)}.{node.attr}" if isinstance(node, ast.Attribute) else getattr(node, "id", "")
 
 
@@ -52,7 +52,7 @@ def refused_names(tree: ast.AST) -> Iterator[str]:
         yield from refused_here(node)
 
 
-def test_nothing_depends_on_the_processor(root: Path) -> None:
+def test_package_calls_nothing_that_depends_on_the_processor(root: Path) -> None:
     package, found = root / "gsmerge", set()
     for path in sorted(package.rglob("*.py")):
         name = path.relative_to(package).as_posix()
@@ -74,7 +74,7 @@ TWIN = "tests/kernels/test_elementary.py"  # compares NumPy's functions with our
 
 
 def statements(node: ast.AST) -> Iterator[ast.AST]:
-    """All nodes but those of assertions, where an expectation may have another last bit."""
+    """Return all nodes but those of assertions, where an expectation may have another last bit."""
     for child in ast.iter_child_nodes(node):
         name = dotted(child.func).rpartition(".")[2] if isinstance(child, ast.Call) else ""
         if not isinstance(child, ast.Assert) and not name.startswith("assert_") and name != "approx":
@@ -83,7 +83,7 @@ def statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def refused_data(tree: ast.AST) -> Iterator[str]:
-    """Elementary functions of NumPy and of the system, and sorts that leave ties in any order."""
+    """Return elementary functions of NumPy and of the system, and sorts that leave ties in any order."""
     elementary = {f"{module}.{name}" for module in ("np", "math") for name in ELEMENTARY.split()}
     elementary |= {f"math.{name}" for name in ("pow", "atan", "atan2", "acos", "asin")}
     for node in statements(tree):
@@ -98,7 +98,7 @@ def refused_data(tree: ast.AST) -> Iterator[str]:
 
 
 def python_files(root: Path, *places: str, having: str = "") -> Iterator[tuple[str, ast.AST]]:
-    """Names and trees of the files at some places in whose text a pattern is."""
+    """Return names and trees of the files at some places in whose text a pattern is."""
     for place in places:
         for path in sorted((root / place).rglob("*.py")) or [root / place]:
             text = path.read_text(encoding="utf-8")
@@ -106,7 +106,7 @@ def python_files(root: Path, *places: str, having: str = "") -> Iterator[tuple[s
                 yield path.relative_to(root).as_posix(), ast.parse(text)
 
 
-def test_data_are_the_same_on_every_processor(root: Path) -> None:
+def test_data_of_tests_call_nothing_that_depends_on_the_processor(root: Path) -> None:
     makers = list(python_files(root, *MAKERS))
     used = {(name, what) for name, tree in makers for node in statements(tree) for what in refused_here(node)}
     assert used == ALLOWED_MAKERS
@@ -114,7 +114,7 @@ def test_data_are_the_same_on_every_processor(root: Path) -> None:
     assert {(name, what) for name, tree in files if name != TWIN for what in refused_data(tree)} == set()
 
 
-def test_what_is_refused_in_data_is_seen() -> None:
+def test_check_of_test_data_finds_calls_that_depend_on_the_processor() -> None:
     tree = ast.parse(
         "a = np.exp(b)\nc = np.argsort(a)\nd = np.sort(a, order='x')\ne = math.sin(1)\nassert np.log(a) > 1"
     )
@@ -122,6 +122,6 @@ def test_what_is_refused_in_data_is_seen() -> None:
     assert list(refused_data(ast.parse("a = np.argsort(b, kind='stable')\nassert_allclose(a, np.exp(b))"))) == []
 
 
-def test_what_is_refused_is_seen() -> None:
+def test_check_of_results_finds_calls_that_depend_on_the_processor() -> None:
     tree = ast.parse("a = b @ c\nd = np.linalg.inv(a) + np.exp(a)\ncv2.resize(a, interpolation=cv2.INTER_CUBIC)")
     assert set(refused_names(tree)) == {"@", "np.linalg.inv", "np.exp", "cv2.INTER_CUBIC"}

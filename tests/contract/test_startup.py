@@ -55,7 +55,7 @@ for words in (one, loaded, kinds):
 
 
 @sweep("settings", [["--set", "fit_steps=5"], [], ["--fit", "none"], ["--set", "recipe=paper"]], ids=" ".join)
-def test_compacting_loads_and_needs_neither_torch_nor_scipy_nor_matplotlib(settings: list[str], tmp_path: Path) -> None:
+def test_compact_neither_loads_nor_needs_torch_scipy_or_matplotlib(settings: list[str], tmp_path: Path) -> None:
     """Which take longer to load than a small scene takes to merge; without them the result is the same bytes."""
     scene = write_scene(tmp_path / "scene", num_views=2, width=24, height=16)
     outputs = [tmp_path / "with.ply", tmp_path / "without.ply"]

@@ -10,7 +10,7 @@ import pytest
 
 
 @pytest.mark.slow
-def test_results_have_types(tmp_path: Path, root: Path) -> None:
+def test_type_checker_knows_arguments_and_results_of_compact(tmp_path: Path, root: Path) -> None:
     """Takes what a type checker takes that reads the package for the first time."""
     pytest.importorskip("mypy")
     path = tmp_path / "user.py"

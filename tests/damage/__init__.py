@@ -1,4 +1,4 @@
-"""Damaged files: sound files of every kind, changes to them, and what may come of each.
+"""This package has sound files of every kind, changes to them, and what may come of each.
 
 ``SOUNDS`` are the sound files, one maker for each kind. ``DAMAGES`` are the changes of each kind with what is expected:
 ``generic`` has those that fit every kind, the other modules those of one kind. ``tests/e2e/test_damaged_files.py``

@@ -1,4 +1,4 @@
-"""``.npz`` files: objects that would run code, bombs, shapes and types that lie, and arrays that make no sense."""
+"""Damages of ``.npz`` files hold code, bombs, shapes and types that lie, and arrays that make no sense."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Payload:
 
 
 def npy(value: Any, dtype: str | None = None, shape: tuple[int, ...] | None = None) -> bytes:
-    """An ``.npy`` whose header may tell another type or shape than its bytes have."""
+    """Return an ``.npy`` whose header may tell another type or shape than its bytes have."""
     array = np.asarray(value)
     descr = dtype or np.lib.format.dtype_to_descr(array.dtype)
     stream = io.BytesIO()
@@ -76,7 +76,7 @@ def put_objects(name: str) -> Change:
 
 
 def write_pickles(path: Path) -> None:
-    """An archive of pickles by the arrays' names."""
+    """Write an archive of pickles by the arrays' names."""
     data = pickle.dumps(Payload(path.parent / MARKER))
     names = {name.removesuffix(end) for name in read_members(path.read_bytes()) for end in ("", ".npy")}
     write_file(path, pack_members(dict.fromkeys(names | {f"{name}.npy" for name in names}, data)))
@@ -92,7 +92,7 @@ def brackets(depth: int) -> bytes:
 
 
 def of_cameras(poses: str, Ks: str, images: str) -> dict[str, Damage]:
-    """Damages of a file of these arrays, which has the cameras of a scene."""
+    """Return damages of a file of these arrays, which has the cameras of a scene."""
     damages = {
         "the same arrays packed again": accept(edit_bytes(lambda data: pack_members(read_members(data)))),
         "poses as objects that would run code": refuse(put_objects(poses)),

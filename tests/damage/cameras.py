@@ -1,4 +1,4 @@
-"""COLMAP models, lists of poses and files of Metashape that promise much."""
+"""Damages of COLMAP models, lists of poses and files of Metashape promise more than there is."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def add_element(tag: str) -> Change:
 
 
 def nest_sensors(path: Path) -> None:
-    """Each of 400 sensors holds the next one; the innermost has 100,000 elements."""
+    """Nest 400 sensors, each in the one before; the innermost has 100,000 elements."""
     data, count = path.read_text(), 400
     start, end = data.index("<sensor "), data.index("</sensors>")
     sensor = data[start:end].replace("</sensor>", "")
@@ -87,7 +87,7 @@ def add_attributes(path: Path) -> None:
 
 
 def of_metashape() -> dict[str, Damage]:
-    """XML whose parts a parser copies, or goes through again and again."""
+    """Return damages of XML whose parts a parser copies, or goes through again and again."""
     address = "u" * 1_000_000
     names = "".join(f"<a:b{i}/>" for i in range(3000))
     return {

@@ -1,4 +1,4 @@
-"""What is done to a sound file, and what may come of it."""
+"""A damage is what is done to a sound file, and what may come of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Changes to a file of any format: its bytes, its JSON document, the members of its archive."""
+"""These functions change a file of any format: its bytes, its JSON document, the members of its archive."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def document(data: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
 
 
 def glb_bytes(text: bytes, rest: bytes) -> bytes:
-    """A ``.glb`` of that JSON, before chunks of other content."""
+    """Return a ``.glb`` of that JSON, before chunks of other content."""
     text += b" " * (-len(text) % 4)
     return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
 
@@ -139,18 +139,18 @@ def drop_json(*keys: str | int) -> Change:
 
 
 def read_members(data: bytes) -> dict[str, bytes]:
-    """The content of an archive by name."""
+    """Return the content of an archive by name."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
 def read_member(data: bytes, name: str) -> bytes:
-    """One member."""
+    """Return the content of one member."""
     return read_members(data)[name]
 
 
 def pack_members(contents: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
-    """An archive of that content."""
+    """Return an archive of that content."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", method) as archive:
         for name, data in contents.items():
@@ -159,7 +159,7 @@ def pack_members(contents: dict[str, bytes], method: int = zipfile.ZIP_STORED) -
 
 
 def put_member(data: bytes, name: str, content: bytes) -> bytes:
-    """The archive, stored, with other content of a member, which may be new."""
+    """Return the archive, stored, with other content of a member, which may be new."""
     return pack_members(read_members(data) | {name: content})
 
 

@@ -1,4 +1,4 @@
-"""``.spz``, ``.splat`` and ``.glb``: headers, tables and documents that promise more than there is."""
+"""Damages of ``.spz``, ``.splat`` and ``.glb`` have headers and tables that promise more than there is."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def edit_header(**changes: int) -> Change:
 
 
 def equal_bytes(count: int, degree: int = 0) -> bytes:
-    """Equal Gaussians, which pack a thousandfold."""
+    """Return equal Gaussians, which pack a thousandfold."""
     numbers = SPZ_HEADER.pack(MAGIC, 3, count, degree, 12, 0, 0)
     return gzip.compress(numbers + bytes(count * (17 + 3 * (degree + 1) ** 2)), 1)
 
 
 def equal_4(count: int) -> bytes:
-    """The same in version 4, with more bytes behind, so that it is not refused for its ratio alone."""
+    """Return the same in version 4, with more bytes behind, so that it is not refused for its ratio alone."""
     import zstandard
 
     columns = [bytes(width * count) for width in (9, 1, 3, 3, 4)]
@@ -105,7 +105,7 @@ def of_spz() -> dict[str, Damage]:
 
 
 def lengthen_stream(data: bytes) -> bytes:
-    """A first stream that unpacks to a megabyte."""
+    """Return the file with a first stream that unpacks to a megabyte."""
     import zstandard
 
     packed = zstandard.compress(bytes(10**6))
@@ -156,7 +156,7 @@ def lack_attribute(name: str) -> Damage:
 
 
 def chain_nodes(parsed: dict[str, Any]) -> None:
-    """Nodes in one another, of which the last has the Gaussians."""
+    """Put nodes into one another, of which the last has the Gaussians."""
     parsed["nodes"] = [{"children": [i + 1], "scale": [2, 2, 2]} for i in range(DEEP)] + parsed["nodes"]
 
 
@@ -166,7 +166,7 @@ def put_nodes(count: int, node: dict[str, int]) -> Change:
 
 
 def share_positions(parsed: dict[str, Any]) -> None:
-    """All harmonics are the positions."""
+    """Let all harmonics be the positions."""
     names = [f"{SPLATTING}:SH_DEGREE_{d}_COEF_{i}" for d in (1, 2, 3) for i in range(2 * d + 1)]
     parsed["meshes"][0]["primitives"][0]["attributes"] |= dict.fromkeys(names, 0)
 

@@ -1,4 +1,4 @@
-"""What is done to sound files of every kind: they are cut, filled with zeros, and other content takes their place."""
+"""Sound files of every kind are cut, filled with zeros, and other content takes their place."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ OWN = {"a zip": (".sog", ".npz"), "a gzip": (".spz",), "a PLY file": (".ply", ".
 
 
 def _pieces(kind: str) -> dict[str, Damage]:
-    """Damages of a file as bytes."""
+    """Return damages of a file as bytes."""
     outcome = allow if kind == "ply as text" or PurePath(SOUNDS[kind].name).suffix in PARTS_MAY_BE_SOUND else refuse
     shares = {share: outcome(cut(share)) for share in (0.3, 0.9)}
     shares |= leave_to_sweep({share: outcome(cut(share)) for share in (0.0001, 0.05, 0.5)})
@@ -72,7 +72,7 @@ def _pieces(kind: str) -> dict[str, Damage]:
 
 
 def _other_content(kind: str, suffix: str) -> dict[str, Damage]:
-    """Other files in the place of one; the line says what they are, except where a kind's own reader refuses them."""
+    """Return damages by other content; the line says what it is, except where a kind's own reader refuses it."""
     if suffix in SCENES:
         names = list(OTHER_CONTENT)
     else:
@@ -86,7 +86,7 @@ def _other_content(kind: str, suffix: str) -> dict[str, Damage]:
 
 
 def _json() -> dict[str, Damage]:
-    """Damages of a document of JSON."""
+    """Return damages of a document of JSON."""
     return {
         "100,000 open brackets as JSON": refuse(write_json(b"[" * BRACKETS)),
         "100,000 objects in one another as JSON": refuse(write_json(b'{"a":' * BRACKETS)),
@@ -98,7 +98,7 @@ def _json() -> dict[str, Damage]:
 
 
 def _archives() -> dict[str, Damage]:
-    """Damages of a zip that holds the file's parts."""
+    """Return damages of a zip that holds the file's parts."""
     return {
         "an encrypted archive": allow(edit_entries(6, 8, lambda flags: flags | 1)),
         "an archive of an unknown compression": refuse(edit_entries(8, 10, lambda _: 99), "method 99"),

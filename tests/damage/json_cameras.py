@@ -1,4 +1,4 @@
-"""Cameras in JSON: much in little, depth, and places that are none."""
+"""Damages of cameras in JSON repeat what is little, nest deep, and name places that are none."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def edit_frames(change: Callable[[dict[str, Any]], object]) -> Change:
 
 
 def repeat_cameras(times: int, key: str = "") -> Change:
-    """As many times the cameras, or one list of them."""
+    """Repeat the cameras, or one list of them, that many times."""
 
     def change(data: Any) -> None:
         cameras = data[key] if key else data
@@ -37,7 +37,7 @@ def repeat_cameras(times: int, key: str = "") -> Change:
 
 
 def move_photos(change: Change) -> Change:
-    """The photos are not where they are looked for, so that the file alone says where."""
+    """Move photos from where they are looked for, so that the file alone says where they are."""
 
     def both(path: Path) -> None:
         (path.parent / "images").rename(path.parent / "elsewhere")
@@ -47,7 +47,7 @@ def move_photos(change: Change) -> Change:
 
 
 def write_large(shared: dict[str, Any], frame: dict[str, Any]) -> Change:
-    """What all frames share is large, and frames are many: neither is copied for the other."""
+    """Write many frames with much that all share: neither is copied for the other."""
     data = {"fl_x": 30, "cx": 12, "cy": 8, **shared, "frames": [frame] * MOST}
     return lambda path: write_file(path, json.dumps(data))
 
@@ -105,7 +105,7 @@ def lengthen_ids(data: dict[str, Any]) -> None:
 
 
 def rename_stray(change: Change) -> Change:
-    """Under another name, by which no program has cameras."""
+    """Change the file under another name, by which no program has cameras."""
     return lambda path: change(path.rename(path.with_name("stray.json")))
 
 

@@ -1,4 +1,4 @@
-"""Photos and masks that lie about their size, that unpack to far more than they have, or that are of rare kinds."""
+"""Damaged photos and masks lie about their size, unpack to far more than they have, or are of rare kinds."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def edit_all(change: Bytes) -> Change:
 
 
 def recode(suffix: str, change: Bytes) -> Change:
-    """All photos as another format under its own suffix, and changed."""
+    """Encode all photos in another format under its own suffix, and change them."""
 
     def both(path: Path) -> None:
         for photo in list(path.parent.iterdir()):
@@ -54,19 +54,19 @@ def png(width: int, height: int, data: bytes, *, depth: int = 8, color: int = 2)
 
 
 def claim_size(width: int, height: int) -> Bytes:
-    """A PNG whose header tells another size than its rows have."""
+    """Let the header of a PNG tell another size than its rows have."""
     return lambda data: data[:8] + chunk(b"IHDR", struct.pack(">II", width, height) + data[24:29]) + data[33:]
 
 
 @cache
 def black(width: int, height: int) -> bytes:
-    """A PNG of black pixels, a thousandth of their size."""
+    """Return a PNG of black pixels, a thousandth of their size."""
     packer, row = zlib.compressobj(1), bytes(1 + 3 * width)
     return png(width, height, b"".join(packer.compress(row) for _ in range(height)) + packer.flush())
 
 
 def add_chunks(more: bytes) -> Bytes:
-    """A PNG with more chunks between its header and its pixels."""
+    """Add chunks to a PNG between its header and its pixels."""
     return lambda data: data[:33] + more + data[33:]
 
 
@@ -76,12 +76,12 @@ def texts() -> bytes:
 
 
 def flip(place: int) -> Change:
-    """Some bits of a byte."""
+    """Flip some bits of a byte."""
     return edit_bytes(lambda data: data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
 
 
 def name_one_photo(path: Path) -> None:
-    """300 frames that name the same photo of 4 million pixels of one colour, which has 0.2 kB."""
+    """Write 300 frames that name the same photo of 4 million pixels of one colour, which has 0.2 kB."""
     scene = path.parent.parent
     shutil.rmtree(path.parent)
     cv2.imwrite(str(scene / "p.webp"), np.zeros((2000, 2000, 3), np.uint8))
@@ -107,7 +107,7 @@ def claim_jpeg_size(width: int, height: int) -> Bytes:
 
 
 def cmyk(_: bytes) -> bytes:
-    """A JPEG header with four components and no data for them."""
+    """Return a JPEG header with four components and no data for them."""
     parts = b"".join(bytes((i, 0x11, 0)) for i in range(1, 5))
     frame = struct.pack(">HBHHB", 20, 8, HEIGHT, WIDTH, 4) + parts
     tables = b"\xff\xdb" + struct.pack(">HB", 67, 0) + bytes([1] * 64)
@@ -154,7 +154,7 @@ def of_other_formats() -> dict[str, Damage]:
 
 
 def write_progressive(scans: int) -> Change:
-    """A progressive JPEG of 4 million pixels, with its last scan as many times."""
+    """Write a progressive JPEG of 4 million pixels, with its last scan as many times."""
     picture = np.zeros((2048, 2048), np.uint8)
 
     def change(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Names and places: spaces, Unicode, links in circles, pipes, folders where files should be."""
+"""Odd places have spaces and Unicode in their names, links in circles, pipes, and folders where files should be."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FEW = ("line breaks", "bytes that are no UTF-8")  # forms of names that are trie
 
 
 def rename(name: str, part: str = "") -> Change:
-    """The folder, or a file in it, under another name."""
+    """Give the folder, or a file in it, another name."""
     return lambda folder: [(folder / part).rename((folder / part).parent / name)]
 
 
@@ -40,7 +40,7 @@ def remove(path: Path) -> None:
 
 
 def replace_with(name: str, make: Callable[[Path], object]) -> Change:
-    """Something else where a file or folder was."""
+    """Put something else where a file or folder was."""
 
     def change(folder: Path) -> None:
         remove(folder / name)
@@ -50,7 +50,7 @@ def replace_with(name: str, make: Callable[[Path], object]) -> Change:
 
 
 def add_arguments(*arguments: str, make: Callable[[Path], object] = lambda path: None) -> Change:
-    """Arguments after the folder; ``{}`` in them is the folder."""
+    """Add arguments after the folder; ``{}`` in them is the folder."""
 
     def change(folder: Path) -> Sequence[object]:
         make(folder)
@@ -60,19 +60,19 @@ def add_arguments(*arguments: str, make: Callable[[Path], object] = lambda path:
 
 
 def link_to_itself(path: Path) -> None:
-    """A link to itself."""
+    """Make a link to itself."""
     path.symlink_to(path)
 
 
 def link_in_ring(path: Path) -> None:
-    """Two links that name each other."""
+    """Make two links that name each other."""
     other = path.with_name(f"{path.name}.other")
     path.symlink_to(other)
     other.symlink_to(path)
 
 
 def make_endless(path: Path) -> None:
-    """A folder that holds itself."""
+    """Make a folder that holds itself."""
     path.mkdir()
     (path / "again").symlink_to(path)
 
@@ -90,7 +90,7 @@ def move_deep(folder: Path) -> Sequence[object]:
 
 
 def split_in_parts(change: Callable[[Path], object]) -> Change:
-    """A scene whose views are files of their own, the last of them changed."""
+    """Split a scene into a file for each view, and change the last of them."""
 
     def both(folder: Path) -> None:
         head, rows = (folder / "scene.ply").read_bytes().split(b"end_header\n", 1)
@@ -107,7 +107,7 @@ def split_in_parts(change: Callable[[Path], object]) -> Change:
 
 
 def make_pipe(path: Path) -> None:
-    """A pipe in the place of a file."""
+    """Put a pipe in the place of a file."""
     path.unlink(missing_ok=True)
     os.mkfifo(path)
 
@@ -131,7 +131,7 @@ def of_names() -> dict[str, Damage]:
 
 
 def of_things() -> dict[str, Damage]:
-    """A pipe, a link to itself, a ring of links and a folder in the place of each file."""
+    """Return damages by a pipe, a link to itself, a ring of links and a folder in the place of each file."""
     damages = {}
     for thing, make in {"link to itself": link_to_itself, "pipe": make_pipe}.items():
         damages |= {

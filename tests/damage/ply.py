@@ -1,4 +1,4 @@
-"""``.ply`` files: headers that promise more than there is, and rows of values that overflow."""
+"""Damages of ``.ply`` files have headers that promise more than there is, and rows of values that overflow."""
 
 from __future__ import annotations
 
@@ -89,19 +89,19 @@ def write_rows(text: str, count: int = COUNT) -> Change:
 
 
 def repeat_first_row(data: bytes) -> bytes:
-    """Many rows that are the first one."""
+    """Return many rows that are the first one."""
     head, mark, body = data.partition(b"end_header\n")
     return head.replace(VERTEX.encode(), f"element vertex {MANY}\n".encode()) + mark + body[: len(body) // COUNT] * MANY
 
 
 def add_empty_lists(data: bytes) -> bytes:
-    """A million lists of a byte each behind the rows, every one an object in memory."""
+    """Add a million lists of a byte each behind the rows, every one an object in memory."""
     lists = b"element face 1000000\nproperty list uchar uchar vertex_index\nend_header\n"
     return data.replace(b"end_header\n", lists) + bytes(1_000_000)
 
 
 def write_huge_header(count: int | str, form: str = "binary_little_endian", *more: str) -> Callable[[Path], None]:
-    """8 GB of zeros behind a header."""
+    """Write 8 GB of zeros behind a header."""
 
     def change(path: Path) -> None:
         head = path.read_bytes().partition(b"end_header\n")[0] + b"end_header\n"

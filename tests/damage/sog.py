@@ -1,4 +1,4 @@
-"""``.sog`` and Streamed SOG: documents that promise more than the pictures have, or lead out of their folder."""
+"""Damages of ``.sog`` and Streamed SOG promise more than the pictures have, or lead out of their folder."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ HUGE = 10**400
 
 
 def webp(width: int, height: int, value: int = 0, quality: int = 101, channels: int = 4) -> bytes:
-    """A picture of one colour: a kilobyte, however large it is."""
+    """Return a picture of one colour: a kilobyte, however large it is."""
     picture = np.full((height, width, channels), value, np.uint8)
     return cv2.imencode(".webp", picture, (cv2.IMWRITE_WEBP_QUALITY, quality))[1].tobytes()
 
 
 def equal_files(count: int, bands: int) -> dict[str, bytes]:
-    """The files of equal Gaussians."""
+    """Return the files of equal Gaussians."""
     side = int(np.ceil(count**0.5))
     names = {"means": ["a.webp", "a.webp"], "scales": ["a.webp"], "quats": ["b.webp"], "sh0": ["a.webp"]}
     codes = [index / 256 for index in range(256)]
@@ -59,7 +59,7 @@ def replace_picture(name: str, *size: int, **settings: int) -> Change:
 
 
 def swap_pictures(path: Path) -> None:
-    """Colours in the place of rotations, whose mode they lack."""
+    """Put colours in the place of rotations, whose mode they lack."""
     with zipfile.ZipFile(path) as archive:
         colors = archive.read("sh0.webp")
     edit_member("quats.webp", lambda _: colors)(path)
@@ -109,7 +109,7 @@ def leaf(*files: int, count: int = 900) -> dict[str, Any]:
 
 
 def write_chunks(count: int = 900, chunks: int = 1, bands: int = 0, **changes: Any) -> Change:
-    """An index of equal chunks, whose entries are changed."""
+    """Write an index of equal chunks, whose entries are changed."""
 
     def change(path: Path) -> None:
         names = [f"{number}/meta.json" for number in range(chunks)]
@@ -125,7 +125,7 @@ def write_chunks(count: int = 900, chunks: int = 1, bands: int = 0, **changes: A
 
 
 def name_twice(path: Path) -> None:
-    """Two chunks that are one by a link."""
+    """Name two chunks that are one by a link."""
     write_chunks(filenames=["0/meta.json", "1/meta.json"], tree=leaf(0, 1))(path)
     (path.parent / "1").symlink_to("0")
 
@@ -136,13 +136,13 @@ def link_out(path: Path) -> None:
 
 
 def count_fewer(index: dict[str, Any]) -> None:
-    """A count that agrees with all of the index, and not with the chunk."""
+    """Put in a count that agrees with all of the index, and not with the chunk."""
     index["tree"]["lods"]["0"]["count"] -= 1
     index.update(count=index["count"] - 1, counts=[index["counts"][0] - 1, *index["counts"][1:]])
 
 
 def forget(index: dict[str, Any]) -> None:
-    """What writers before versions left out."""
+    """Leave out what writers before versions left out."""
     for key in ("version", "asset", "count", "counts"):
         del index[key]
     index["environment"] = None

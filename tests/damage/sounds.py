@@ -1,4 +1,4 @@
-"""The table of sound files: for each kind a maker, what reads it, and the command that tells whether it is sound."""
+"""A table has, for each kind of file, a maker, what reads it, and the command that tells whether it is sound."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Sound:
 
     @cached_property
     def files(self) -> dict[str, bytes]:
-        """The file and those that belong to it, by their paths in the folder."""
+        """Return the file and those that belong to it, by their paths in the folder."""
         return files_of(self.make)
 
     def put(self, folder: Path) -> Path:
@@ -275,13 +275,13 @@ def write_levels(folder: Path, leaves: int = 1) -> None:
 
 
 def world_mirror(c2w: np.ndarray, K: np.ndarray) -> dict[str, Any]:
-    """The document of WorldMirror's ``camera_params.json``."""
+    """Return the document of WorldMirror's ``camera_params.json``."""
     poses = [{"camera_id": name, "matrix": pose.tolist()} for name, pose in zip(VIEW_NAMES, c2w, strict=True)]
     return {"extrinsics": poses, "intrinsics": [{**pose, "matrix": K.tolist()} for pose in poses]}
 
 
 def long_lrm(c2w: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> dict[str, Any]:
-    """The document of Long-LRM's cameras."""
+    """Return the document of Long-LRM's cameras."""
     common = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": size[0], "h": size[1]}
     poses = zip(VIEW_NAMES, invert(c2w), strict=True)
     return {"frames": [{"file_path": name, "w2c": pose.tolist(), **common} for name, pose in poses]}
@@ -360,7 +360,7 @@ def write_photo(ending: str, kind: str = "") -> Make:
 
 @cache
 def state_bytes(recipe: str, batches: int) -> bytes:
-    """A state of two views of a made room for each batch."""
+    """Return a state of two views of a made room for each batch."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18), degree=1)
     compactor = Compactor(superpixels="10%", **({"recipe": recipe} if recipe else {"checkpoint": "none"}))
     for _ in range(batches):

@@ -1,4 +1,4 @@
-"""Files in the safetensors format: states and networks, of which arrays or parts of the header are wrong."""
+"""Damages of states and networks in safetensors files have wrong arrays or wrong parts of the header."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WEIGHT = "encoder.latent.weight"
 
 
 def entry(path: Path) -> tuple[str, dict[str, Any]]:
-    """The one entry of a file's metadata: its name, which says the format, and the header in it, without checksums."""
+    """Return the entry of a file's metadata: its name, which says the format, and the header, without checksums."""
     size = int.from_bytes(path.read_bytes()[:8], "little")
     ((form, text),) = json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"].items()
     return form, {name: value for name, value in json.loads(text).items() if name != "checksums"}
@@ -37,7 +37,7 @@ def save(path: Path, arrays: dict[str, np.ndarray], form: str, header: Any) -> N
 
 
 def write_header(text: str, form: str | None = None) -> Change:
-    """Another text in place of the header, under the file's own format or another."""
+    """Put another text in place of the header, under the file's own format or another."""
     return lambda path: save(path, load_file(path), form or entry(path)[0], text)
 
 
@@ -83,7 +83,7 @@ def drop_array(name: str) -> Change:
 
 
 def negate(name: str) -> Change:
-    """The signs of an array changed behind the back of its checksum."""
+    """Change the signs of an array behind the back of its checksum."""
 
     def change(path: Path) -> None:
         arrays = load_file(path)
@@ -94,7 +94,7 @@ def negate(name: str) -> Change:
 
 
 def fill(name: str, value: float) -> Change:
-    """Another value in the middle of an array."""
+    """Put another value in the middle of an array."""
 
     def change(array: np.ndarray) -> np.ndarray:
         array = array.copy()
@@ -105,7 +105,7 @@ def fill(name: str, value: float) -> Change:
 
 
 def set_metadata(metadata: object) -> Change:
-    """Another value in the place of the texts by name of a safetensors file."""
+    """Put another value in the place of the texts by name of a safetensors file."""
 
     def change(data: bytes) -> bytes:
         end = 8 + int.from_bytes(data[:8], "little")
@@ -116,7 +116,7 @@ def set_metadata(metadata: object) -> Change:
 
 
 def of_any() -> dict[str, Damage]:
-    """What is wrong with any file."""
+    """Return what is wrong with any file."""
     metadata = ([1, "a"], "text", 7, True, {"gsmerge": 1}, {"gsmerge": ["a"]}, {"gsmerge": {"a": "b"}})
     return {
         "a byte more at the end": refuse(edit_bytes(lambda data: data + b"x")),
@@ -134,7 +134,7 @@ def of_any() -> dict[str, Damage]:
 
 
 def of_each(arrays: Iterable[str], floats: Iterable[str]) -> dict[str, Damage]:
-    """Each array missing, of another type and of another shape; those of numbers with a NaN."""
+    """Return damages: each array missing, of another type or shape; those of numbers with a NaN."""
     damages: dict[str, Damage] = {}
     for name in arrays:
         damages[f"no array {name}"] = refuse(drop_array(name), name)

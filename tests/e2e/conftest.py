@@ -1,4 +1,4 @@
-"""Running the command line inside the test's own process."""
+"""Fixtures run the command line inside the test's own process."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ Run = Callable[..., Outcome]
 
 @pytest.fixture(scope="session")
 def smallest_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene of :func:`shared.write_smallest`. Read only."""
+    """Return the scene of :func:`shared.write_smallest`. Read only."""
     return write_smallest(tmp_path_factory.mktemp("smallest") / "scene")
 
 
 @pytest.fixture
 def small_copy(tmp_path: Path) -> Path:
-    """A small scene that a test may change."""
+    """Return a small scene that a test may change."""
     return write_small(tmp_path / "scene")
 
 
 @pytest.fixture
 def smallest_copy(tmp_path: Path) -> Path:
-    """A smallest scene that a test may change."""
+    """Return a smallest scene that a test may change."""
     return write_smallest(tmp_path / "scene")
 
 
 @pytest.fixture(scope="session")
 def compacted_scene() -> Path:
-    """``small.ply``, which the defaults make of the made scene, and the report ``run.json``. Read only."""
+    """Return ``small.ply``, which the defaults make of the made scene, and the report ``run.json``. Read only."""
 
     def make(place: Path) -> None:
         place.mkdir()
@@ -61,14 +61,14 @@ def compacted_scene() -> Path:
 
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CommandServer]:
-    """A process that has imported what the commands need, which takes it two seconds."""
+    """Yield a process that has imported what the commands need, which takes it two seconds."""
     with CommandServer([("inspect", write_smallest(tmp_path_factory.mktemp("server") / "scene"))]) as server:
         yield server
 
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """``run("compact", path, "--k", 2, code=0)``: exit code, which is checked where one is given, stdout, stderr."""
+    """Return ``run("compact", path, code=0)``, which gives exit code (checked if given), stdout and stderr."""
 
     def call(*arguments: object, code: int | None = None) -> Outcome:
         capsys.readouterr()
@@ -88,13 +88,13 @@ def write_rooms(folder: Path) -> None:
 
 @pytest.fixture(scope="session")
 def rooms() -> Path:
-    """The folder of :func:`write_rooms`. Read only."""
+    """Return the folder of :func:`write_rooms`. Read only."""
     return make_once("four-rooms", write_rooms)
 
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What a batch that nothing happens to makes of the four rooms."""
+    """Return what a batch that nothing happens to makes of the four rooms."""
     out = tmp_path_factory.mktemp("batch") / "undisturbed"
     assert finish(make_once("four-rooms", write_rooms), "--output", out, *FAST, "--jobs", 2, "-q") == 0
     assert sorted(results(out)) == NAMES
@@ -102,12 +102,12 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def listing(folder: Path) -> dict[str, int]:
-    """Every file below a folder with its size, hidden ones too."""
+    """Return every file below a folder with its size, hidden ones too."""
     return {str(p.relative_to(folder)): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def assert_refused(outcome: Outcome, code: int, place: object, *values: object) -> None:
-    """One line on stderr, and nothing else, which names a place and has these values (:func:`messages.says`)."""
+    """Check for one line on stderr alone, which names a place and has these values (:func:`messages.says`)."""
     assert (outcome.code, outcome.out, outcome.err.count("\n")) == (code, "", 1), outcome.err
     assert outcome.err.startswith(ERROR)
     assert says(outcome.err.removeprefix(ERROR).strip(), place, *values), outcome.err

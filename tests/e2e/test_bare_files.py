@@ -1,4 +1,4 @@
-"""Files beside which nothing lies: each command runs without a hint; photos without cameras are not passed over."""
+"""Each command runs on a file beside which nothing lies; photos without cameras are not passed over."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PLACED = ("no cameras", "--cameras", "--images", "cannot be better than its inpu
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file alone in its folder. Read only."""
+    """Return a file alone in its folder. Read only."""
     folder = tmp_path_factory.mktemp("bare")
     scene = gsmerge.read_scene(write_smallest(folder / "made"))
     path = folder / "alone" / "scene.ply"
@@ -33,7 +33,7 @@ def report_of(run: Any, *words: Any) -> dict[str, Any]:
     return document
 
 
-def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
+def test_compact_needs_no_hint_for_a_bare_file(bare: Path, tmp_path: Path, run: Any) -> None:
     report = report_of(run, "compact", bare, "-o", tmp_path / "small.ply", "--budget", "20%")
     assert sum(noted([note], *PLACED) for note in report["notes"]) == 1
     assert not noted(report["notes"], "Depth Anything 3")
@@ -60,7 +60,7 @@ def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
     ],
     often=5,
 )  # fmt: skip
-def test_other_commands_need_none(words: str, bare: Path, tmp_path: Path, run: Any) -> None:
+def test_other_commands_need_no_hint_for_a_bare_file(words: str, bare: Path, tmp_path: Path, run: Any) -> None:
     small = tmp_path / "small.ply"
     if "SMALL" in words:
         gsmerge.write_ply(small, gsmerge.read_ply(bare).gaussians[::9])
@@ -85,7 +85,9 @@ def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_photos_without_cameras_change_nothing(bare: Path, smallest_scene: Path, tmp_path: Path, run: Any) -> None:
+def test_photos_without_cameras_change_no_byte_of_the_result(
+    bare: Path, smallest_scene: Path, tmp_path: Path, run: Any
+) -> None:
     """Neither those that are named nor those that lie beside the scene."""
     named, beside = smallest_scene / "images", Path(shutil.copytree(smallest_scene / "images", tmp_path / "images"))
     scene, quick = Path(shutil.copy(bare, tmp_path)), ("--budget", "20%", "--effort", "draft")
@@ -109,7 +111,7 @@ def test_photos_are_used_with_order_none_where_cameras_are_known(
     assert report["psnr_input_views"]["after"] is not None
 
 
-def test_a_draft_has_no_fit_and_says_so(bare: Path, tmp_path: Path, run: Any) -> None:
+def test_draft_notes_that_it_has_no_fit(bare: Path, tmp_path: Path, run: Any) -> None:
     draft, fast = (
         report_of(run, "compact", bare, "-o", tmp_path / f"{effort}.ply", "--budget", "20%", "--effort", effort)
         for effort in ("draft", "fast")

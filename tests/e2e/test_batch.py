@@ -1,4 +1,4 @@
-"""``gsmerge batch`` as people use it: folders of scenes, one of which is bad, resumed, planned, told in JSON."""
+"""``gsmerge batch`` compacts folders of scenes, one of which is bad, resumes, plans, and tells it in JSON."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def write_rooms(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def rooms() -> Path:
-    """The folder of :func:`write_rooms`. Read only."""
+    """Return the folder of :func:`write_rooms`. Read only."""
     return make_once("bad-room", write_rooms)
 
 
@@ -47,7 +47,7 @@ def batch(run: Run, rooms: Path, out: Path, *options: object) -> Outcome:
 
 @pytest.fixture(scope="module", autouse=True)
 def _in_this_process() -> Iterator[None]:
-    """Processes are the subject of ``test_batch_faults.py``; each takes seconds to start."""
+    """Run batches in this process: those of ``test_batch_faults.py`` take seconds to start others."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
         yield
@@ -61,11 +61,11 @@ def compact_rooms(out: Path) -> None:
 
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
-    """A copy of what :func:`compact_rooms` leaves behind."""
+    """Return a copy of what :func:`compact_rooms` leaves behind."""
     return Path(shutil.copytree(make_once("bad-room-out", compact_rooms), tmp_path / "out"))
 
 
-def test_one_bad_scene_stops_no_other(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
+def test_bad_scene_stops_no_other(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
     names = [f"room{number}.ply" for number in range(2)]
     assert sorted(results(out)) == names
     assert statuses(out) == {"bad.ply": ["failed"], **{name: ["done"] for name in names}}
@@ -83,7 +83,7 @@ def test_one_bad_scene_stops_no_other(rooms: Path, out: Path, run: Run, tmp_path
         assert (tmp_path / f"one{ending}").read_bytes() == (out / f"room1{ending}").read_bytes()
 
 
-def test_the_same_again_does_what_failed_and_nothing_else(rooms: Path, out: Path, run: Run) -> None:
+def test_second_run_repeats_only_the_scene_that_failed(rooms: Path, out: Path, run: Run) -> None:
     before = results(out)
     outcome = batch(run, rooms, out)
     assert outcome.code == 5
@@ -96,7 +96,9 @@ def test_the_same_again_does_what_failed_and_nothing_else(rooms: Path, out: Path
     assert statuses(out)["bad.ply"] == ["failed", "failed"]
 
 
-def test_a_mended_scene_is_done_and_json_is_a_line_each(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
+def test_mended_scene_is_done_by_the_next_run_and_overwrite_does_all_again(
+    rooms: Path, out: Path, run: Run, tmp_path: Path
+) -> None:
     mended = Path(shutil.copytree(rooms, tmp_path / "rooms"))
     shutil.copy(mended / "room0" / "scene.ply", mended / "bad" / "scene.ply")
     outcome = batch(run, mended, out, "--json")
@@ -136,7 +138,7 @@ def test_a_dry_run_makes_no_folder(rooms: Path, tmp_path: Path, run: Run) -> Non
     assert not (tmp_path / "new").exists()
 
 
-def test_scenes_of_one_name_fail_and_no_other(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
+def test_second_scene_of_a_name_fails_alone(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
     """The night after: one whose result is there, one of the same name, and a new one."""
     for name in ("room1", "hall"):
         shutil.copytree(rooms / "room0", tmp_path / "later" / name)
@@ -164,7 +166,7 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
     assert Totals(0).lines() == ["0 scenes: 0 done"]
 
 
-def test_folders_that_drop_out_are_named(rooms: Path, tmp_path: Path, run: Run) -> None:
+def test_folders_without_gaussians_are_noted_by_name(rooms: Path, tmp_path: Path, run: Run) -> None:
     top = Path(shutil.copytree(rooms / "room0", tmp_path / "rooms" / "room0")).parent
     shutil.copytree(top / "room0", top / "room1")
     (top / "room1/scene.ply").unlink()
@@ -173,7 +175,7 @@ def test_folders_that_drop_out_are_named(rooms: Path, tmp_path: Path, run: Run) 
         assert names(outcome.out, f"note: no Gaussians are read from 1 folder beside the scenes: {top / 'room1'}")
 
 
-def test_what_a_scene_lacks_is_said(rooms: Path, tmp_path: Path, run: Run) -> None:
+def test_scenes_without_photos_or_cameras_are_noted(rooms: Path, tmp_path: Path, run: Run) -> None:
     """Photos in the named folder are tried for each scene, and used where they show it."""
     top = Path(shutil.copytree(rooms, tmp_path / "rooms"))
     shutil.rmtree(top / "bad")
@@ -196,7 +198,7 @@ def test_what_a_scene_lacks_is_said(rooms: Path, tmp_path: Path, run: Run) -> No
     assert names("\n".join(totals.lines()), "note: x: no cameras found")
 
 
-def test_a_missed_target_ends_with_4_and_keeps_the_result(rooms: Path, tmp_path: Path, run: Run) -> None:
+def test_missed_target_ends_with_code_4_and_keeps_the_result(rooms: Path, tmp_path: Path, run: Run) -> None:
     arguments = ("--effort", "draft", "--quality", "90dB", "--set", "superpixels=1%", "--jobs", 1)
     for status in ("done", "skipped"):
         outcome = run("batch", rooms / "room0", "--output", tmp_path, *arguments, code=4)

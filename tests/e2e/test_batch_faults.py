@@ -1,4 +1,4 @@
-"""What may happen to a batch: it is killed, its processes are, the disk is full, somebody else is there."""
+"""A batch survives that it or its processes are killed, the disk is full, or another batch is there."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def outlive(pids: list[int]) -> bool:
 
 
 def _runs(pid: int) -> bool:
-    """Whether a process runs; one that has ended and that nobody has asked about does not."""
+    """Return whether a process runs; one that has ended and that nobody has asked about does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
@@ -50,7 +50,7 @@ def test_a_killed_run_goes_on_where_it_was(rooms: Path, tmp_path: Path, undistur
 
 
 @pytest.mark.slow
-def test_a_killed_process_costs_its_scene_alone(tmp_path: Path, run: Run) -> None:
+def test_killed_process_costs_its_scene_alone(tmp_path: Path, run: Run) -> None:
     """Two processes are started, each of which imports the package."""
     rooms, out = tmp_path / "rooms", tmp_path / "out"
     for number in range(2):
@@ -71,7 +71,9 @@ def test_a_killed_process_costs_its_scene_alone(tmp_path: Path, run: Run) -> Non
 
 @pytest.mark.usefixtures("foreground")
 @pytest.mark.slow
-def test_ctrl_c_ends_with_what_is_done(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
+def test_ctrl_c_keeps_whole_results_that_the_next_run_completes(
+    rooms: Path, tmp_path: Path, undisturbed: dict[str, str]
+) -> None:
     process = start(rooms, "--output", tmp_path, *FAST, "--jobs", 1)
     os.setpriority(os.PRIO_PROCESS, process.pid, 19)  # on a busy machine this side is to see the first scene done
     until(lambda: (tmp_path / "batch.jsonl").exists() and records(tmp_path), process)
@@ -90,7 +92,7 @@ def test_ctrl_c_ends_with_what_is_done(rooms: Path, tmp_path: Path, undisturbed:
 
 
 @pytest.mark.slow
-def test_descriptors_that_the_caller_closed(smallest_scene: Path, tmp_path: Path) -> None:
+def test_batch_runs_where_the_caller_closed_its_descriptors(smallest_scene: Path, tmp_path: Path) -> None:
     """The pipe to a process does not take the place of one of them."""
     words = (sys.executable, "-m", "gsmerge", "batch", smallest_scene, "--output", tmp_path / "out", *FAST)
     done = subprocess.run(["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *map(str, words)], check=False)

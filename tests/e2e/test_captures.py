@@ -1,4 +1,4 @@
-"""The scripts that make captures and their exports, on a made scene; a function stands in for the depth network."""
+"""Scripts make captures and exports of a made scene; a function stands in for the depth network."""
 
 from __future__ import annotations
 
@@ -43,21 +43,24 @@ def capture() -> Path:
 
 
 def flat(views: list[Any], near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """A wall in the middle of the range."""
+    """Return a wall in the middle of the range."""
     shape = views[0].image.shape[:2]
     return np.full(shape, (near * far) ** 0.5), np.full(shape, 0.75)
 
 
-def test_views_are_spread_and_held_out_ones_midway() -> None:
+def test_input_views_are_spread_with_held_out_views_midway() -> None:
     inputs, held_out = script("make_capture").pick_views(50, 12)
     assert inputs == [0, 4, 9, 13, 18, 22, 27, 31, 36, 40, 45, 49]  # of the capture fox
     assert held_out == [2, 6, 11, 15, 20, 24, 29, 33, 38, 42, 47]
+
+
+def test_too_few_photos_for_the_views_are_refused() -> None:
     with pytest.raises(SystemExit, match="expected at least 7 photos for 4 views, found 6"):
         script("make_capture").pick_views(6, 4)
 
 
 @pytest.mark.slow
-def test_a_capture_is_read_by_its_export(capture: Path, tmp_path: Path) -> None:
+def test_capture_is_exported_with_its_depths_and_context_views(capture: Path, tmp_path: Path) -> None:
     document = json.loads((capture / "transforms.json").read_text())
     roles = [frame["role"] for frame in document["frames"]]
     assert roles == ["context", "target", "context", "target", "context"]
@@ -81,7 +84,7 @@ def test_a_capture_is_read_by_its_export(capture: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("style", ["da3", "depthsplat", "anysplat"])
-def test_every_style_is_read(style: str, capture: Path, tmp_path: Path) -> None:
+def test_export_in_every_style_is_read_as_a_scene(style: str, capture: Path, tmp_path: Path) -> None:
     loaded = load_scene(script("captures").write_export(capture, tmp_path / style, style))
     assert len(loaded.scene.cameras) == 3
     assert loaded.scene.has_own_pixels == (style != "anysplat")

@@ -1,4 +1,4 @@
-"""``gsmerge lab chart`` on small made scenes: runs, resumes, draws, tells what failed."""
+"""``gsmerge lab chart`` runs on small made scenes, resumes, draws, and tells what failed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .conftest import Outcome, Run, listing
 
 @pytest.fixture
 def copied(tmp_path: Path) -> Path:
-    """A copy of the charted scene that a test may spoil."""
+    """Return a copy of the charted scene that a test may spoil."""
     return Path(shutil.copytree(charted_scene(), tmp_path / "grid"))
 
 
@@ -37,7 +37,7 @@ def _inline(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def merges(monkeypatch: pytest.MonkeyPatch) -> list[object]:
-    """The budgets of every merge from now on; one of 3 % fails."""
+    """Return the budgets of every merge from now on; one of 3 % fails."""
     seen: list[object] = []
     compact = running.compact
 
@@ -52,7 +52,7 @@ def merges(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 
 def runs(folder: Path) -> dict[str, RunRecord]:
-    """All runs by their label."""
+    """Return all runs by their label."""
     return {record.label: record for record in read_runs(folder)}
 
 
@@ -63,7 +63,7 @@ def again(run: Run, folder: Path, *options: object) -> Outcome:
 
 
 @pytest.mark.slow
-def test_what_a_grid_leaves_behind(tmp_path: Path) -> None:
+def test_grid_writes_records_table_page_and_charts(tmp_path: Path) -> None:
     out = charted_scene() / "out"
     records = runs(out)
     assert list(records) == ["input", "gsmerge, budget 1%, fit none", "gsmerge, budget 2%, fit none"]
@@ -122,7 +122,7 @@ def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run:
     assert outcome.err.count("\n") == 1
 
 
-def test_a_dry_run_tells_the_plan_and_writes_nothing(copied: Path, run: Run) -> None:
+def test_dry_run_prints_the_plan_without_writing(copied: Path, run: Run) -> None:
     before = listing(copied)
     outcome = again(run, copied, "--grid", "budget=1%,5%", "--dry-run")
     assert outcome.code == 0
@@ -132,7 +132,7 @@ def test_a_dry_run_tells_the_plan_and_writes_nothing(copied: Path, run: Run) -> 
     assert listing(copied) == before
 
 
-def test_drawing_alone(copied: Path, run: Run) -> None:
+def test_chart_without_scenes_draws_the_runs_of_its_folder_again(copied: Path, run: Run) -> None:
     drawn = {path.name for path in (copied / "out" / "charts").iterdir()}
     shutil.rmtree(copied / "room")
     outcome = run("lab", "chart", "--output", copied / "out", "--json")
@@ -144,7 +144,7 @@ def test_drawing_alone(copied: Path, run: Run) -> None:
     assert "3 runs on 1 scene: room" in Path(document["page"]).read_text()
 
 
-def test_without_targets_it_is_said_which_photos_judge(small_copy: Path, tmp_path: Path, run: Run) -> None:
+def test_without_targets_the_page_says_which_photos_judge(small_copy: Path, tmp_path: Path, run: Run) -> None:
     args = ("--grid", "budget=5%", "--set", "fit=none", "--set", "lpips=none")
     done = run("lab", "chart", small_copy, "-o", tmp_path / "out", *args, code=0)
     assert names(done.err, "without --targets", "scored", "view_001.png")

@@ -1,4 +1,4 @@
-"""The commands on a scene that the project makes itself."""
+"""The commands work on a scene that the project makes itself."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALL = ("--set", "superpixels=200")
 QUICK = (*SMALL, "--fit", "none", "--effort", "draft")  # where the result does not matter
 
 
-def test_compact_writes_beside_the_input_and_says_what_it_did(smallest_copy: Path, run: Run) -> None:
+def test_compact_prints_a_summary_of_the_file_it_writes_beside_the_input(smallest_copy: Path, run: Run) -> None:
     outcome = run("compact", smallest_copy / "scene.ply", "--k", 2, *SMALL, code=0)
     out = smallest_copy / "scene.compact.ply"
     count = len(gsmerge.read_ply(out).gaussians)
@@ -33,7 +33,7 @@ def test_compact_writes_beside_the_input_and_says_what_it_did(smallest_copy: Pat
     assert re.search(r" dB .* time \d+\.\d s most in", said)  # the time of each stage is in the report
 
 
-def test_json_report(smallest_copy: Path, run: Run) -> None:
+def test_json_report_describes_input_output_and_run(smallest_copy: Path, run: Run) -> None:
     out = smallest_copy / "small.ply"
     outcome = run("compact", smallest_copy, "-o", out, *SMALL, "--k", 1, "--seed", 3, "--json", code=0)
     assert outcome.err == ""
@@ -70,7 +70,7 @@ def test_a_scene_too_large_for_the_machine_is_noted_before_it_is_read(
     assert (quiet.out, quiet.err) == ("", "")
 
 
-def test_progress_only_when_a_terminal_is_there(smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_shown_in_terminals_alone(smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     fast = (*QUICK, "--overwrite")
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     assert "segment" not in run("compact", smallest_copy, *fast).err
@@ -80,7 +80,7 @@ def test_progress_only_when_a_terminal_is_there(smallest_copy: Path, run: Run, m
     assert run("compact", smallest_copy, *fast, "--json").err == ""
 
 
-def test_a_plan_tells_what_is_used(small_scene: Path, run: Run) -> None:
+def test_dry_run_prints_matching_networks_and_counts(small_scene: Path, run: Run) -> None:
     message = run("compact", small_scene, "--dry-run", "--fit", "none").out
     assert "views: overlap" in message
     assert "networks: shipped" in message
@@ -90,7 +90,7 @@ def test_a_plan_tells_what_is_used(small_scene: Path, run: Run) -> None:
     assert (plan["superpixels_per_view"], plan["seconds"] > 0, plan["memory_bytes"] > 1e8) == (200, True, True)
 
 
-def test_inspect(small_scene: Path, run: Run) -> None:
+def test_inspect_describes_a_scene_with_the_plan_of_compact(small_scene: Path, run: Run) -> None:
     outcome = run("inspect", small_scene, code=0)
     assert "17-column" in outcome.out
     assert "7,680" in outcome.out
@@ -101,7 +101,7 @@ def test_inspect(small_scene: Path, run: Run) -> None:
     assert document["compact"] == planned["compact"]
 
 
-def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_render_draws_each_view_most_like_its_own_photo(made_scene: Path, tmp_path: Path, run: Run) -> None:
     cameras = made_scene / "transforms.json"
     run("render", made_scene / "scene.ply", "--cameras", cameras, "-o", tmp_path / "frames", code=0)
     names = sorted(path.name for path in (tmp_path / "frames").iterdir())
@@ -111,9 +111,13 @@ def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
         render = cv2.imread(str(tmp_path / "frames" / name)).astype(float)
         errors = [np.abs(photo - render).mean() for photo in photos]
         assert int(np.argmin(errors)) == i
-        assert errors[i] < 20
-    more = ("--views", 2, "--size", "64x64")
-    run("render", made_scene, made_scene / "scene.ply", "-o", tmp_path / "some", *more, code=0)
+        assert errors[i] < 20  # of 255 levels
+
+
+def test_render_of_two_scenes_shows_them_side_by_side(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    run(
+        "render", made_scene, made_scene / "scene.ply", "-o", tmp_path / "some", "--views", 2, "--size", "64x64", code=0
+    )
     assert list(listing(tmp_path / "some")) == ["view_001.png", "view_003.png"]  # of two scenes, side by side
     both = cv2.imread(str(tmp_path / "some" / "view_001.png"))
     assert both.shape[1] >= 2 * 320
@@ -136,7 +140,7 @@ def test_pictures_of_views_are_as_large_as_asked(
     assert document["width"] == width == cv2.imread(document["pictures"][0]).shape[1]
 
 
-def test_panel(small_copy: Path, run: Run) -> None:
+def test_render_into_one_picture_shows_photo_before_and_after(small_copy: Path, run: Run) -> None:
     assert run("compact", small_copy, *QUICK, "--quiet").code == 0
     out = small_copy / "preview.png"
     run("render", small_copy / "scene.ply", small_copy / "scene.compact.ply", "-o", out, code=0)
@@ -165,12 +169,12 @@ def test_a_panel_of_a_size_cuts_photos_as_it_cuts_views(small_copy: Path, run: R
     assert [np.abs(photo - whole[80:240]).mean() < 4, np.abs(view - alone).mean() < 4] == [True, True]
 
 
-def test_version(run: Run) -> None:
+def test_version_option_prints_the_version(run: Run) -> None:
     assert run("--version").out == f"gsmerge {gsmerge.__version__}\n"
 
 
 @pytest.mark.parametrize(("words", "offered"), [("gsmerge com", "compact"), ("gsmerge compact --overw", "--overwrite")])
-def test_shell_completion(
+def test_shell_completion_offers_commands_and_options(
     words: str, offered: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("_GSMERGE_COMPLETE", "complete_bash")
@@ -182,7 +186,7 @@ def test_shell_completion(
     assert capsys.readouterr().out.split() == [offered]
 
 
-def test_progress_is_lines_of_json(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_json_progress_has_stages_as_lines_of_json(small_scene: Path, tmp_path: Path, run: Run) -> None:
     """Whatever is quiet; of levels, every fit counts."""
     call = ("compact", "--progress=json", small_scene, "-o", tmp_path / "a.ply", "--effort", "draft", "--levels", "2")
     outcome = run(*call, "--quiet", code=0)
@@ -199,7 +203,7 @@ def test_progress_is_lines_of_json(small_scene: Path, tmp_path: Path, run: Run) 
     assert seconds == sorted(seconds)
 
 
-def test_notes_warnings_and_errors_are_lines_of_the_same_stream(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_json_progress_has_notes_and_errors_as_lines_of_json(small_scene: Path, tmp_path: Path, run: Run) -> None:
     """Each an object with its kind as a key; without the option they are lines of text."""
     bare = tmp_path / "bare.ply"
     bare.write_bytes((small_scene / "scene.ply").read_bytes())

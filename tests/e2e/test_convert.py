@@ -1,4 +1,4 @@
-"""Conversion: other formats, frames and extents of the same Gaussians, with their cameras."""
+"""``gsmerge convert`` gives the same Gaussians another format, frame and extent, with their cameras."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def make_result(folder: Path) -> None:
 
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
-    """The result of :func:`make_result`, in a folder of its own."""
+    """Return the result of :func:`make_result`, in a folder of its own."""
     return Path(shutil.copytree(make_once("result", make_result), tmp_path, dirs_exist_ok=True)) / "in.ply"
 
 
@@ -122,7 +122,7 @@ def test_up_is_where_the_cameras_look_up_or_minus_y(result: Path) -> None:
     np.testing.assert_array_equal(find_placement(PlacementOptions(up="y"), None).rotation, np.diag([1, -1, -1]))
 
 
-def test_turns_are_the_smallest(tmp_path: Path) -> None:
+def test_rotation_between_directions_turns_by_the_smallest_angle(tmp_path: Path) -> None:
     for seed in range(20):
         start, end = np.random.default_rng(seed).normal(size=(2, 3))
         start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
@@ -176,7 +176,7 @@ def test_columns_of_the_users_own_stay_with_their_rows(result: Path, tmp_path: P
         assert noted(lost["notes"], "left out", "label, confidence, vx")
 
 
-def test_parts_are_kept_or_left_out(result: Path, tmp_path: Path) -> None:
+def test_crop_and_its_inverse_keep_or_leave_out_a_part(result: Path, tmp_path: Path) -> None:
     whole = read(result)
     low, high = np.percentile(whole.means, (25, 75), axis=0)
     box = "box:" + ",".join(f"{value:.6f}" for value in (*low, *high))
@@ -203,7 +203,7 @@ def test_parts_are_kept_or_left_out(result: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "d.ply").exists()
 
 
-def test_what_no_view_shows_is_left_out(result: Path, tmp_path: Path) -> None:
+def test_convert_leaves_out_gaussians_that_no_view_shows(result: Path, tmp_path: Path) -> None:
     """By the cameras beside a result, without them by placed ones, which a note says."""
     whole, clean = read(result), CleanOptions(drop="unseen")
     behind = replace(whole, means=whole.means - 500 * np.array([0, 0, 1], np.float32))
@@ -221,7 +221,7 @@ def test_what_no_view_shows_is_left_out(result: Path, tmp_path: Path) -> None:
     assert noted(again["notes"], "a.cameras.json", "of an earlier file")
 
 
-def test_scales_and_shapes_stay_exact(result: Path, tmp_path: Path) -> None:
+def test_scaled_and_turned_gaussians_have_exact_positions_and_shapes(result: Path, tmp_path: Path) -> None:
     convert_files(
         ConvertOptions(
             [result], name_outputs(tmp_path / "out.ply"), placement=PlacementOptions(scale=2, rotate="0,0,90")
@@ -251,7 +251,7 @@ def test_the_command(small_scene: Path, tmp_path: Path, result: Path, run: Run) 
     assert run("convert", tmp_path / "none.ply", tmp_path / "d.ply").code == 3
 
 
-def test_all_columns_of_a_ply(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_full_columns_are_the_62_of_a_ply(small_scene: Path, tmp_path: Path, run: Run) -> None:
     """Unity's importer wants 62."""
     quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q", "--set", "columns=full")
     run("compact", small_scene, "-o", tmp_path / "a.ply", *quick, code=0)
@@ -293,7 +293,7 @@ def test_a_new_format_of_several_files_with_cameras_is_one_row(
     assert (tmp_path / "small.views").read_text() == str(len(gsmerge.read_scene(small_scene)))
 
 
-def test_linear_scales_by_a_hint(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_hint_reads_linear_scales(small_scene: Path, tmp_path: Path, run: Run) -> None:
     """The commands that read files take the hint, and results have logarithms."""
     scene = gsmerge.read_ply(small_scene / "scene.ply").gaussians
     data = PlyData.read(str(small_scene / "scene.ply"))
@@ -312,7 +312,7 @@ def test_linear_scales_by_a_hint(small_scene: Path, tmp_path: Path, run: Run) ->
     )
 
 
-def test_what_does_not_fit_is_said_before_it_is_read(
+def test_convert_warns_where_the_memory_is_too_small(
     made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.runtime.memory.machine_memory", lambda: 10**5)

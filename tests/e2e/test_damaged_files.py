@@ -58,7 +58,7 @@ of_linux = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory 
 
 
 def limits(num_bytes: int) -> Limits:
-    """Far more than a reader of so many bytes may take."""
+    """Return limits far above what a reader of so many bytes may take."""
     seconds = SECONDS_MARGIN * (FREE_SECONDS + SECONDS_PER_BYTE * num_bytes)
     return Limits(MOST_MEMORY + min(MEMORY_PER_BYTE * num_bytes, MOST_MEMORY), min(seconds, MOST_SECONDS))
 
@@ -193,7 +193,7 @@ def test_damaged_files_can_be_inspected(name: str, tmp_path: Path, server: Comma
 
 
 @sweep("name", COMPACTED)
-def test_odd_values_are_compacted(name: str, tmp_path: Path, run: Run) -> None:
+def test_files_of_odd_values_are_compacted_to_finite_gaussians(name: str, tmp_path: Path, run: Run) -> None:
     scene = spoil(f"scene.ply: {name}", tmp_path)[0].parent
     outcome = run("compact", scene, "-o", scene / "small.ply", "--set", "fit_steps=2", "--quiet", code=0)
     assert "gsmerge: warning" not in outcome.err
@@ -216,7 +216,7 @@ def test_a_frame_of_67_million_pixels_is_drawn_in_bands(tmp_path: Path, server: 
 
 
 @of_linux
-def test_limits_hold() -> None:
+def test_forked_process_ends_at_its_limits_of_memory_and_time() -> None:
     """A process that takes more ends, however it ends."""
     limits = Limits(1 << 28, 0.3)
     assert run_forked(lambda: len(bytearray(1 << 30)), limits).code == FAILED

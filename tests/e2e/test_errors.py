@@ -1,4 +1,4 @@
-"""What nobody foresaw: one line, the right code, a traceback only on request, no half-written file."""
+"""What nobody foresaw ends in one line and the right code, with a traceback on request and no half-written file."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Broken:
         "Ctrl-C",
     ],
 )
-def test_failures_inside_the_work(
+def test_failure_of_a_stage_is_one_line_with_its_exit_code(
     error: BaseException, code: int, line: str, smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.compaction.files.compact_scene", Broken(error))
@@ -68,7 +68,7 @@ def test_failures_inside_the_work(
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write anywhere")
-def test_a_folder_without_permission(smallest_copy: Path, run: Run) -> None:
+def test_folder_without_permission_is_refused(smallest_copy: Path, run: Run) -> None:
     locked = smallest_copy / "locked"
     locked.mkdir(mode=0o500)
     assert_refused(run("compact", smallest_copy, "-o", locked / "small.ply"), 3, locked / "small.ply", "no permission")
@@ -165,7 +165,7 @@ def test_several_outputs_are_all_there_or_none(
     ("name", "code"),
     [("SIGTERM", 143), *(pytest.param(*each, marks=pytest.mark.slow) for each in (("SIGHUP", 129), ("SIGINT", 130)))],
 )
-def test_a_signal_ends_it_in_order(name: str, code: int, small_copy: Path, root: Path) -> None:
+def test_signal_ends_a_command_without_leaving_a_file(name: str, code: int, small_copy: Path, root: Path) -> None:
     """Whenever it comes: no file is left, and one line says why."""
     before = listing(small_copy)
     command = [sys.executable, "-m", "gsmerge", "compact", str(small_copy), "-o", str(small_copy / "out.ply"), "-q"]
@@ -186,7 +186,7 @@ def test_a_signal_ends_it_in_order(name: str, code: int, small_copy: Path, root:
     [None, SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")],
     ids=["swallowed", "as an error of Python", "as an error of the scene"],
 )
-def test_a_signal_that_others_do_not_hand_on(
+def test_signal_ends_a_command_where_other_code_swallows_it(
     name: str, code: int, error: Exception | None, smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Calls back into Python, with which kernels are loaded, cannot hand an exception on; libraries make another."""
@@ -211,7 +211,7 @@ def test_a_signal_that_others_do_not_hand_on(
 
 @pytest.mark.usefixtures("foreground")
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
-def test_an_ignored_signal_stays_ignored(smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ignored_signal_stays_ignored(smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """As under nohup."""
     seen = []
     monkeypatch.setattr(
@@ -251,7 +251,7 @@ ODD_PLACES = {
 
 @pytest.mark.skipif(sys.platform != "linux", reason="devices and limits as Linux has them")
 @sweep("case", ODD_PLACES)
-def test_odd_places_to_write_to_and_run_in(case: str, smallest_copy: Path, root: Path) -> None:
+def test_odd_output_is_written_or_refused_in_one_line(case: str, smallest_copy: Path, root: Path) -> None:
     command, code, line = ODD_PLACES[case]
     env = {**os.environ, "PYTHONPATH": str(root), "G": f"{sys.executable} -m gsmerge"}
     words = ["sh", "-c", command]

@@ -1,4 +1,4 @@
-"""``gsmerge evaluate`` as users call it."""
+"""``gsmerge evaluate`` works as users call it."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ def make(folder: Path) -> None:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A copy of what :func:`make` writes, which a test may change."""
+    """Return a copy of what :func:`make` writes, which a test may change."""
     return Path(shutil.copytree(make_once("evaluated", make), tmp_path / "scene"))
 
 
-def test_table_and_files(scene_copy: Path, compacted_scene: Path, run: Run, floor: Callable[..., None]) -> None:
+def test_evaluate_prints_a_table_and_writes_all_scores(
+    scene_copy: Path, compacted_scene: Path, run: Run, floor: Callable[..., None]
+) -> None:
     """On the scene of the floor, of which the defaults make a result."""
     small = Path(shutil.copy(compacted_scene / "small.ply", scene_copy))
     table, report = scene_copy / "a.csv", scene_copy / "a.json"
@@ -58,7 +60,7 @@ def test_table_and_files(scene_copy: Path, compacted_scene: Path, run: Run, floo
 
 
 @pytest.mark.slow
-def test_a_page_shows_what_is_measured(scene: Path, run: Run) -> None:
+def test_page_of_view_shows_what_evaluate_measures(scene: Path, run: Run) -> None:
     call, page = (scene, scene / "small.ply", "--targets", scene / "targets"), scene / "page.html"
     document = json.loads(run("evaluate", *call, "--lpips", "none", "--json", code=0).out)
     run("view", *call, "--no-open", "-o", page, code=0)
@@ -69,7 +71,7 @@ def test_a_page_shows_what_is_measured(scene: Path, run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_views_that_are_measured(scene: Path, run: Run) -> None:
+def test_settings_choose_the_views_that_are_measured(scene: Path, run: Run) -> None:
     call = ("evaluate", scene, scene / "small.ply", "--lpips", "none", "--json", "--set")
     for setting, targets, counts in (
         ("context=false", ("--targets", scene / "targets"), {"target": 4}), ("views=3", (), {"context": 3}),
@@ -94,7 +96,7 @@ def test_lpips_is_measured_with_alexnet_on_four_views(scene: Path, run: Run, mon
 
 
 @pytest.mark.slow
-def test_files_of_every_kind(scene: Path, run: Run) -> None:
+def test_outputs_of_evaluate_replace_only_its_own_files(scene: Path, run: Run) -> None:
     outputs = {suffix: scene / f"page.{suffix}" for suffix in ("json", "csv")}
     flags = [part for path in outputs.values() for part in ("-o", path)]
     call = ("evaluate", scene / "scene.ply", scene / "small.ply", "--lpips", "none")
@@ -106,7 +108,7 @@ def test_files_of_every_kind(scene: Path, run: Run) -> None:
         assert path.read_text() == "mine"
 
 
-def test_names_that_are_no_text(scene: Path, run: Run) -> None:
+def test_name_that_is_no_text_is_printed_escaped(scene: Path, run: Run) -> None:
     odd = (scene / "small.ply").rename(scene / "odd\udcff\x1b[31m.ply")
     outputs = [scene / f"page.{suffix}" for suffix in ("json", "csv")]
     flags = [part for path in outputs for part in ("-o", path)]

@@ -1,4 +1,4 @@
-"""What all commands have in common: --json, --quiet, --dry-run, notes, and that inputs are never replaced."""
+"""All commands share --json, --quiet, --dry-run and notes, and never replace their input."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ PICTURES = {  # with their number
 
 @pytest.fixture
 def small_copy(tmp_path: Path) -> Path:
-    """A scene with held-out views, of 24 x 16, that a test may change."""
+    """Return a scene with held-out views, of 24 x 16, that a test may change."""
     return write_scene(tmp_path / "scene", num_views=VIEWS, width=24, height=16)
 
 
 def call(command: str, scene: Path) -> list[object]:
-    """The command with its scene, its output, and what makes it fast."""
+    """Return the command with its scene, its output, and what makes it fast."""
     targets = ["--targets", scene / "targets"]
     if command == "inspect":
         return [command, scene]
@@ -73,13 +73,13 @@ def call(command: str, scene: Path) -> list[object]:
 
 
 def all_texts(value: object) -> list[str]:
-    """The texts in a value of JSON, at any depth."""
+    """Return the texts in a value of JSON, at any depth."""
     parts = value if isinstance(value, list) else [*value, *value.values()] if isinstance(value, dict) else []
     return [value] if isinstance(value, str) else [text for part in parts for text in all_texts(part)]
 
 
 def spoil_rows(ply: Path) -> None:
-    """NaN in one row, a log scale of 40 in another, and every opacity between 0 and 1."""
+    """Put NaN in one row, a log scale of 40 in another, and every opacity between 0 and 1."""
     head, data = ply.read_bytes().split(b"end_header\n", 1)
     rows = np.frombuffer(data, "<f4").reshape(-1, 17).copy()
     rows[3, 0], rows[7, 10] = np.nan, 40
@@ -88,7 +88,7 @@ def spoil_rows(ply: Path) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_json_is_all_there_is_on_stdout_and_names_the_pictures(command: str, small_copy: Path, run: Run) -> None:
+def test_json_is_alone_on_stdout_and_names_the_pictures(command: str, small_copy: Path, run: Run) -> None:
     before = listing(small_copy)
     outcome = run(*call(command, small_copy), "--json")
     assert (outcome.code, outcome.err) == (0, "")
@@ -103,7 +103,7 @@ def test_json_is_all_there_is_on_stdout_and_names_the_pictures(command: str, sma
 
 
 @sweep("command", [*OTHERS, *COMMANDS], often=len(OTHERS) + len(COMMANDS) - MODES)
-def test_quiet_says_nothing(command: str, small_copy: Path, run: Run) -> None:
+def test_quiet_prints_nothing_about_odd_rows(command: str, small_copy: Path, run: Run) -> None:
     spoil_rows(small_copy / "scene.ply")
     written = ["-o", small_copy / "scores.json"] if command == "evaluate" else []  # without it nothing would be left
     outcome = run(*call(command, small_copy), *written, "--quiet")
@@ -112,7 +112,7 @@ def test_quiet_says_nothing(command: str, small_copy: Path, run: Run) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems allow no such names")
 @pytest.mark.parametrize("command", ["extend", "compact a state", "evaluate", "inspect", *WRITERS, "batch"])
-def test_names_that_are_not_utf_8(command: str, small_copy: Path, run: Run) -> None:
+def test_json_keeps_the_bytes_of_names_that_are_not_utf_8(command: str, small_copy: Path, run: Run) -> None:
     """They are in the JSON, from which the bytes of the name follow."""
     name, photo = os.fsdecode(b"r\xe9sum\xe9"), os.fsdecode(b"\xff.png")
     cameras = small_copy / "transforms.json"
@@ -136,7 +136,9 @@ def test_names_that_are_not_utf_8(command: str, small_copy: Path, run: Run) -> N
 
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
 @pytest.mark.parametrize("command", ["compact a state", "extend", *WRITERS])
-def test_rights(command: str, small_copy: Path, run: Run) -> None:
+def test_output_has_the_rights_of_its_photos_or_of_the_file_it_replaces(
+    command: str, small_copy: Path, run: Run
+) -> None:
     """Outputs that hold photos are as private as these, and what replaces a file takes its mode."""
     for path in (small_copy / "images").iterdir():
         path.chmod(0o600)
@@ -179,14 +181,14 @@ def test_a_dry_run_knows_budgets(wish: tuple[str, ...], most: int, small_scene: 
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_file_that_is_no_scene_is_refused_and_nothing_is_written(command: str, small_copy: Path, run: Run) -> None:
+def test_file_that_is_no_scene_is_refused_before_anything_is_written(command: str, small_copy: Path, run: Run) -> None:
     (small_copy / "scene.ply").write_text("These are notes, not Gaussians.\n")
     before = listing(small_copy)
     assert_refused(run(*call(command, small_copy)), 3, "scene.ply", ".ply file", "text")
     assert listing(small_copy) == before
 
 
-def test_the_way_to_render_is_passed_on(small_copy: Path, run: Run) -> None:
+def test_comment_on_the_way_to_render_is_passed_on(small_copy: Path, run: Run) -> None:
     """Files whose Gaussians carry a filter of their own say so in the header; other comments end with the file."""
     head, rows = (small_copy / "scene.ply").read_bytes().split(b"element vertex", 1)
     more = b"comment SplatRenderMode: mip\ncomment SplatRenderMode:\tx\ncomment of no use\nelement vertex"
@@ -238,5 +240,5 @@ def test_inputs_are_not_replaced(command: str, output: str, small_copy: Path, ru
         ([], []),
     ],
 )
-def test_picture_names(names: list[str], stems: list[str]) -> None:
+def test_names_of_pictures_are_those_of_views_unless_they_collide(names: list[str], stems: list[str]) -> None:
     assert picture_stems(names) == stems

@@ -1,4 +1,4 @@
-"""Scenes far from their origin, whose positions lose digits in files: scores are those of what was written."""
+"""Positions far from the origin lose digits in files, and scores are those of what was written."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def set_apart(folder: Path, factor: float) -> None:
     ("name", "shift", "worse"),
     [("out.ply", 5e6, True), ("out.spz", 0, True), ("out.sog", 1e5, False), ("out.splat", 5e6, True)],
 )
-def test_the_score_is_that_of_the_file(
+def test_score_is_that_of_the_written_file(
     scene_copy: Path, tmp_path: Path, run: Run, name: str, shift: float, worse: bool
 ) -> None:
     if shift:
@@ -69,7 +69,7 @@ def test_the_score_is_that_of_the_file(
         run("compact", scene_copy, "-o", out, "--overwrite", *DRAFT, "--strict", code=4)
 
 
-def test_moved_to_the_origin_as_the_note_says_nothing_is_lost(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+def test_scene_moved_to_the_origin_as_noted_loses_nothing(scene_copy: Path, tmp_path: Path, run: Run) -> None:
     exact = psnr_of((scene := gsmerge.read_scene(scene_copy)).gaussians, scene)
     move_scene(scene_copy, 5e6)
     near, call = tmp_path / "near.ply", ("convert", scene_copy / "scene.ply")

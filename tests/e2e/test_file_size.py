@@ -21,7 +21,7 @@ def file_bytes(folder: Path) -> int:
 
 
 @sweep("name", FORMATS, often=2)
-def test_compact_meets_it(name: str, small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_compact_meets_a_budget_in_bytes(name: str, small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "out"
     done = run("compact", small_scene, "-o", out / name, "--budget", "40KB", *QUICK, "--json", code=0)
     size = 40_000
@@ -31,7 +31,7 @@ def test_compact_meets_it(name: str, small_scene: Path, tmp_path: Path, run: Run
 
 
 @pytest.mark.slow
-def test_harmonics_count(tmp_path: Path, small_scene: Path, run: Run) -> None:
+def test_budget_in_bytes_counts_harmonics(tmp_path: Path, small_scene: Path, run: Run) -> None:
     """They take two thirds of a .sog, or nothing: what is built first is far off."""
     from dataclasses import replace
 
@@ -52,7 +52,7 @@ def test_harmonics_count(tmp_path: Path, small_scene: Path, run: Run) -> None:
 
 @pytest.mark.slow
 @sweep(("name", "size"), [("a.spz", 24_000), ("a.ply", 40_000), ("a.sog", 20_000)])
-def test_states_and_batch_meet_it(
+def test_states_and_batches_meet_a_budget_in_bytes(
     name: str, size: int, small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)

@@ -1,4 +1,4 @@
-"""``gsmerge SCENE``: a result and its page by one word; outputs that are folders."""
+"""``gsmerge SCENE`` makes a result and its page, and outputs may be folders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FAST = ("--budget", "5%", "--effort", "draft", "--fit", "none")
 
 @pytest.fixture(autouse=True)
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Pages that a browser was asked to open."""
+    """Return pages that a browser was asked to open."""
     pages: list[str] = []
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr("webbrowser.open", lambda address: not pages.append(address))
@@ -28,7 +28,7 @@ def pages_in(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.html"))
 
 
-def test_a_scene_alone_is_compacted_and_shown(
+def test_scene_without_a_command_is_compacted_and_shown(
     smallest_copy: Path, run: Run, opened: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert files.load_files  # which reads the scene, once
@@ -45,7 +45,7 @@ def test_a_scene_alone_is_compacted_and_shown(
     assert listing(smallest_copy) == before
 
 
-def test_a_plan_and_what_no_page_shows_open_none(smallest_copy: Path, run: Run, opened: list[str]) -> None:
+def test_dry_run_or_output_that_is_a_page_opens_no_browser(smallest_copy: Path, run: Run, opened: list[str]) -> None:
     assert "would write" in run(smallest_copy, *FAST, "--dry-run", code=0).out
     run(smallest_copy, *FAST, "-o", smallest_copy.parent / "page.html", code=0)
     assert (pages_in(smallest_copy), opened) == ([], [])
@@ -64,7 +64,7 @@ def test_results_are_written_into_folders_that_exist(smallest_copy: Path, tmp_pa
     assert len(copied) == len(gsmerge.read_ply(result).gaussians)
 
 
-def test_threads_of_the_environment(smallest_copy: Path, monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+def test_variable_sets_the_number_of_threads(smallest_copy: Path, monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
     from gsmerge.runtime.threads import available_threads, use_threads
 
     monkeypatch.setenv("GSMERGE_THREADS", "3")

@@ -1,4 +1,4 @@
-"""Floors (floors.csv, dB) of the fits on photos that the scene was not made from, and exact counts."""
+"""Fits have exact counts, and reach floors (floors.csv, dB) on photos that the scene was not made from."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from sweeps import sweep
 import gsmerge
 from gsmerge.compaction.result import CompactResult
 
-Measure = Callable[[Path, Path], float]
 NUM_VIEWS = 5
 
 
 @pytest.fixture(scope="module")
 def compacted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[CompactResult, float]]:
-    """``compacted(k=2)``: the result, and its PSNR (dB) on the targets; each is made once."""
+    """Return ``compacted(k=2)``: the result, and its PSNR (dB) on the targets; each is made once."""
     folder = write_made(tmp_path_factory.mktemp("fit") / "scene")
     scene, out = gsmerge.read_scene(folder), folder / "small.ply"
 
@@ -71,7 +70,7 @@ def test_full_fit_beats_the_merge_alone(
     floor(full - none)
 
 
-def test_plain_merging_without_photos(
+def test_plain_merging_reaches_the_floor(
     compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:
     result, actual = compacted(superpixels=256, fit="none")
@@ -79,7 +78,7 @@ def test_plain_merging_without_photos(
     floor(actual)
 
 
-def test_photos_help(
+def test_gain_over_the_input_reaches_the_floor(
     compacted: Callable[..., tuple[CompactResult, float]], made_scene: Path, floor: Callable[..., None]
 ) -> None:
     floor(compacted(superpixels=256)[1] - target_psnr(made_scene / "targets", made_scene / "scene.ply"))

@@ -36,7 +36,9 @@ def replace(folder: Path) -> None:
     [(lambda folder: folder.rename(folder.with_name("moved")), False), (replace, True)],
     ids=["moved", "replaced"],
 )
-def test_nothing_is_read_after_the_start(act: Callable[[Path], None], is_doubt: bool, smallest_copy: Path) -> None:
+def test_moved_or_replaced_scene_is_not_read_again(
+    act: Callable[[Path], None], is_doubt: bool, smallest_copy: Path
+) -> None:
     sha256, out = file_sha256(smallest_copy / "scene.ply"), smallest_copy.parent / "o.ply"
     files, num_bytes = find_scene_files(smallest_copy), (smallest_copy / "scene.ply").stat().st_size
     document = compact_files(files, PLAIN, Outputs(out), hashed=True, on_read=lambda _: act(smallest_copy))
@@ -61,7 +63,7 @@ def test_a_file_that_changes_while_it_is_read_is_refused(smallest_copy: Path, mo
     assert not out.exists()
 
 
-def test_a_file_that_broke_off_is_a_doubt_everywhere(smallest_copy: Path, run: Run) -> None:
+def test_file_that_broke_off_is_a_doubt_of_every_command(smallest_copy: Path, run: Run) -> None:
     """The last 60 % of it are zeros."""
     ply, out = smallest_copy / "scene.ply", smallest_copy.parent / "out"
     content = np.frombuffer(ply.read_bytes(), np.uint8).copy()

@@ -1,4 +1,4 @@
-"""``gsmerge inspect`` of files: sound ones of every format, and every kind of fault by its cause."""
+"""``gsmerge inspect`` calls sound files of every format ok, and names every kind of fault by its cause."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Spoil = Callable[[Path], object]
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a sound file of every kind. Read only."""
+    """Return a folder with a sound file of every kind. Read only."""
     folder = write_smallest(tmp_path_factory.mktemp("sound") / "room")
     (folder / "away").mkdir()
     for name in FORMATS[1:]:
@@ -49,7 +49,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_sound_files(sound: Path, run: Run) -> None:
+def test_inspect_calls_sound_files_ok(sound: Path, run: Run) -> None:
     before = listing(sound)
     done = run("inspect", *(sound / name for name in (*FORMATS, *OTHERS)), code=0)
     assert [line.split(": ")[0] for line in done.out.splitlines()] == [
@@ -61,7 +61,7 @@ def test_sound_files(sound: Path, run: Run) -> None:
     assert listing(sound) == before
 
 
-def test_a_document_of_all(sound: Path, run: Run, tmp_path: Path) -> None:
+def test_json_of_inspect_describes_sound_and_missing_files(sound: Path, run: Run, tmp_path: Path) -> None:
     done = run("inspect", sound / "scene.ply", tmp_path / "none.spz", "--json")
     assert done.code == 3
     document = json.loads(done.out)
@@ -73,7 +73,7 @@ def test_a_document_of_all(sound: Path, run: Run, tmp_path: Path) -> None:
 
 
 def flip(place: int) -> Spoil:
-    """One bit of the byte at a place, from the end where it is negative."""
+    """Flip one bit of the byte at a place, from the end where it is negative."""
 
     def spoil(path: Path) -> None:
         data = bytearray(path.read_bytes())
@@ -84,7 +84,7 @@ def flip(place: int) -> Spoil:
 
 
 def member_bit(path: Path) -> None:
-    """One bit in a file of an archive."""
+    """Flip one bit in a file of an archive."""
     with zipfile.ZipFile(path) as archive:
         info = archive.infolist()[-1]
     flip(info.header_offset + 30 + len(info.filename) + info.compress_size // 2)(path)
@@ -110,7 +110,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_files(case: str, sound: Path, tmp_path: Path, run: Run) -> None:
+def test_inspect_names_the_cause_of_a_wrong_file(case: str, sound: Path, tmp_path: Path, run: Run) -> None:
     name, spoil, place, *found = WRONG[case]
     path = Path(shutil.copy(sound / name, tmp_path))
     spoil(path)
@@ -137,7 +137,7 @@ def test_a_scene_that_shows_nothing_is_refused(
     run("compact", scene, "-o", tmp_path / "out.ply", "-q", code=code)
 
 
-def test_what_no_view_shows_is_counted_in_results_alone(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_gaussians_that_no_view_shows_are_counted_in_results_alone(small_scene: Path, tmp_path: Path, run: Run) -> None:
     """Rows of pixels hide each other where views overlap: their cameras show them all the same."""
     out = tmp_path / "compact.ply"
     run("compact", small_scene, "-o", out, "--fit", "none", code=0)

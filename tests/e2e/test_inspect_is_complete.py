@@ -40,7 +40,7 @@ class Kind:
 
 
 def with_one_photo(folder: Path) -> None:
-    """Of several photos those that can be read are used."""
+    """Leave a folder with one photo: of several those that can be read are used."""
     for path in sorted((folder / "images").iterdir())[1:]:
         path.unlink()
 
@@ -72,7 +72,9 @@ def placed(words: tuple[str, ...], folder: Path) -> list[object]:
         *(pytest.param(name, kind.many, marks=pytest.mark.slow) for name, kind in KINDS.items()),
     ],
 )
-def test_what_a_command_refuses_inspect_refuses(name: str, count: int, tmp_path: Path, server: CommandServer) -> None:
+def test_inspect_refuses_what_each_command_refuses(
+    name: str, count: int, tmp_path: Path, server: CommandServer
+) -> None:
     kind, rng = KINDS[name], random.Random(f"{name} {count}")
     folder = tmp_path / "scene"
     SOUNDS[kind.sound].put(folder)
@@ -98,7 +100,7 @@ def test_what_a_command_refuses_inspect_refuses(name: str, count: int, tmp_path:
     assert num_refused or count == COUNT
 
 
-def test_a_file_is_read_with_what_is_beside_it(smallest_scene: Path, tmp_path: Path) -> None:
+def test_inspect_reads_a_file_with_what_is_beside_it(smallest_scene: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
     whole, alone = check_content(folder), check_content(folder / "scene.ply")
     assert (whole.num_views, whole.num_photos, whole.problems, whole.notes) == (3, 3, (), ())

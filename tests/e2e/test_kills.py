@@ -1,4 +1,4 @@
-"""Commands that end before a call that changes their folder, a few of the many of ``tools/kills.py``."""
+"""Commands end well before a call that changes their folder: a few of the many of ``tools/kills.py``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def kill(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("command", ["compact", "extend"])
-def test_nothing_is_half_written_and_the_next_run_succeeds(command: str, root: Path) -> None:
+def test_killed_command_leaves_nothing_that_stops_the_next_run(command: str, root: Path) -> None:
     done = kill(root, "--calls", "3", "--commands", command)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.startswith(f"{command}: kills before 3 calls")

@@ -1,4 +1,4 @@
-"""Rival methods from the command line."""
+"""Rival methods run from the command line."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_every_method_has_a_plan(
         assert (f"method     {method}; fit" in planned) == ("merging" not in planned) == (method != "gsmerge")
 
 
-def test_the_program_may_be_on_the_path(
+def test_splat_transform_is_found_on_the_path(
     smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(put_stand_in(tmp_path, monkeypatch).parent))
@@ -62,7 +62,7 @@ def test_the_program_may_be_on_the_path(
     assert len(read_ply(tmp_path / "a.ply").gaussians) == 50
 
 
-def test_a_failing_program_is_one_line(
+def test_failure_of_splat_transform_is_one_line(
     smallest_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put_stand_in(tmp_path / "program", monkeypatch, "#!{python}\nraise SystemExit('Error: out of\\nmemory')\n")

@@ -32,7 +32,7 @@ def enlarge_cameras(folder: Path) -> Path:
 
 @pytest.fixture
 def moved_scene(tmp_path: Path) -> Path:
-    """The small scene with the camera centres in larger units."""
+    """Return the small scene with the camera centres in larger units."""
     return enlarge_cameras(write_small(tmp_path / "scene"))
 
 
@@ -56,7 +56,7 @@ def test_render_moves_the_cameras(moved_scene: Path, tmp_path: Path, run: Run) -
 
 
 @pytest.mark.slow
-def test_the_frame_of_another_file(moved_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_result_is_drawn_in_the_frame_of_the_scene_beside_it(moved_scene: Path, tmp_path: Path, run: Run) -> None:
     """A compact scene without photos tells no frame by itself, and has that of the scene beside it."""
     elsewhere, alone = tmp_path / "small.ply", tmp_path / "cameras" / "transforms.json"
     alone.parent.mkdir()
@@ -71,7 +71,7 @@ def test_the_frame_of_another_file(moved_scene: Path, tmp_path: Path, run: Run) 
 
 
 @pytest.mark.slow
-def test_preview_and_render_agree_with_photos_that_are_broken(
+def test_render_looks_from_moved_cameras_beside_broken_photos(
     scene_copy: Path, tmp_path: Path, run: Run, floor: Callable[..., None]
 ) -> None:
     moved_scene = enlarge_cameras(scene_copy)

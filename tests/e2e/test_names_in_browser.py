@@ -1,4 +1,4 @@
-"""Names of scenes, files and photos that are programs: in a real browser pages show them and run none."""
+"""A real browser shows names of scenes, files and photos that are programs, and runs none."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the scene is made to under a usual name: each page of one scene is of a run with its name."""
+    """Return what the scene is made to under a usual name: each page of one scene is of a run with its name."""
     folder = tmp_path_factory.mktemp("result")
     small = folder / "small.ply"
     assert main(["compact", str(write_smallest(folder / "scene")), "-o", str(small), *QUICK, "-q"]) == 0
@@ -40,7 +40,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_name_is_no_program(
+def test_page_runs_no_program_in_a_name(
     name: str, smallest_scene: Path, result: Path, tmp_path: Path, run: Run, tab: Browser
 ) -> None:
     """Of a folder, its file, its photos and a result."""

@@ -1,4 +1,4 @@
-"""What a notebook shows of ``result.show()``: a frame in which the page runs, 3D included."""
+"""A notebook shows ``result.show()`` as a frame in which the page runs, 3D included."""
 
 from __future__ import annotations
 

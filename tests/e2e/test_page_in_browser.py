@@ -1,4 +1,4 @@
-"""The page of charts in a real browser: nothing is fetched, nothing complains."""
+"""The page of charts works in a real browser, which fetches nothing and complains of nothing."""
 
 from __future__ import annotations
 
@@ -18,9 +18,15 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield opened
 
 
-def test_nothing_is_fetched_and_nothing_complains(shown: Browser) -> None:
+def test_page_fetches_nothing(shown: Browser) -> None:
     assert [url for url in shown.requests() if not url.startswith(("file:", "data:", "about:"))] == []
+
+
+def test_page_makes_the_browser_complain_of_nothing(shown: Browser) -> None:
     assert shown.complaints() == []
+
+
+def test_page_shows_all_figures_within_its_width(shown: Browser) -> None:
     assert shown.run("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
     heights = shown.run("[...document.querySelectorAll('figure > img')].map(img => img.getBoundingClientRect().height)")
     assert len(heights) >= 2

@@ -1,4 +1,4 @@
-"""Photos twice as large as the grid: sharper seen from near, as good at the grid's size (floors.csv, dB)."""
+"""Photos twice as large as the grid make it sharper from near, as good at its own size (floors.csv, dB)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ERRORS = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene of 96 x 64 with photos and targets of 192 x 128. Read only."""
+    """Return a scene of 96 x 64 with photos and targets of 192 x 128. Read only."""
     options = GenerateOptions(views=NUM_VIEWS, width=96, height=64, ranges=ERRORS, photo_scale=2)
     out = generate_scene(tmp_path_factory.mktemp("large") / "scene", options, seed=2)
     ply = out / "scene.ply"
@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def scores(folder: Path, ply: Path) -> tuple[float, float]:
-    """PSNR (dB) of the targets at the grid's size and at twice that."""
+    """Return the PSNR (dB) of the targets at the grid's size and at twice that."""
     targets, gaussians = folder / "targets", gsmerge.read_ply(ply).gaussians
     camera_file = gsmerge.read_cameras(targets)
     photos, values = read_images(targets, camera_file.names), []

@@ -1,4 +1,4 @@
-"""What has to stay sharp: ``--protect`` spends Gaussians and steps where its pictures are white."""
+"""``--protect`` spends Gaussians and steps where its pictures are white."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_batch_takes_no_masks_of_other_scenes(run: Run, tmp_path: Path) -> Non
         assert (f"--masks {tmp_path}/halls/masks" in done.out) == (folder == "halls")
 
 
-def test_a_batch_takes_what_each_scene_has(run: Run, tmp_path: Path) -> None:
+def test_batch_takes_masks_and_protected_parts_of_each_scene(run: Run, tmp_path: Path) -> None:
     """Masks and what is to be protected, as of ``compact``: the same bytes."""
     for number in (0, 1):
         room = write_scene(tmp_path / "rooms" / f"room{number}", num_views=3, width=24, height=16, seed=number)

@@ -1,4 +1,4 @@
-"""A batch, and the blocks of a scene, on a real Ray cluster of two nodes, of which a node or processes are killed."""
+"""A batch and the blocks of a scene survive lost nodes and processes of a real Ray cluster of two nodes."""
 
 from __future__ import annotations
 
@@ -66,20 +66,22 @@ def run_on_cluster(root: Path, *words: object) -> int:
     return int(done.stdout.rpartition("killed: ")[2])
 
 
-def test_a_lost_node_is_survived(rooms: Path, tmp_path: Path, root: Path, undisturbed: dict[str, str]) -> None:
+def test_batch_survives_the_loss_of_a_node(
+    rooms: Path, tmp_path: Path, root: Path, undisturbed: dict[str, str]
+) -> None:
     assert run_on_cluster(root, "batch", rooms, "--output", tmp_path, *FAST, "--engine", "ray") == 1
     assert results(tmp_path) == undisturbed
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
 
 
-def test_no_cluster_at_the_address_is_one_line(rooms: Path, tmp_path: Path) -> None:
+def test_missing_cluster_is_one_line_of_error(rooms: Path, tmp_path: Path) -> None:
     process = start(rooms, "--output", tmp_path / "out", *FAST, "--engine", "ray", "--set", "address=127.0.0.1:1", "-q")
     errors = process.communicate()[1]
     assert process.returncode == 3
     assert names(errors, "127.0.0.1:1", "Ray")
 
 
-def test_a_cluster_makes_the_same_bytes(tmp_path: Path, root: Path) -> None:
+def test_cluster_makes_the_same_bytes(tmp_path: Path, root: Path) -> None:
     """Though three processes are lost."""
     scene = write_scene(tmp_path / "room", num_views=8, width=96, height=64, seed=2)
     pairs = ("blocks=4", "superpixels=5%", "fit_steps=60", "seed=3")

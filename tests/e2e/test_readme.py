@@ -1,4 +1,4 @@
-"""The README's blocks, run as printed in the folder that it names, from its own installations."""
+"""The README's blocks run as printed in the folder that it names, from its own installations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt" or not shutil
 
 @pytest.fixture(scope="module")
 def project(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the project as it is cloned, in a path with a space."""
+    """Return a copy of the project as it is cloned, in a path with a space."""
     ignored = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "kernels-*", "demo")
     return Path(shutil.copytree(root, tmp_path_factory.mktemp("a b") / "gsmerge", ignore=ignored))
 
@@ -35,7 +35,7 @@ def find_block(root: Path, words: str, page: str = "README.md") -> str:
     return block
 
 
-def test_one_minute_and_then_python(root: Path, project: Path) -> None:
+def test_demo_of_the_readme_makes_the_scene_of_the_python_guide(root: Path, project: Path) -> None:
     run(find_block(root, "tasks.py demo"), project)
     assert (project / "demo" / "preview.png").exists()
     guide = (root / "docs" / "guide" / "python.md").read_text()
@@ -44,7 +44,7 @@ def test_one_minute_and_then_python(root: Path, project: Path) -> None:
     assert (project / "demo" / "small.ply").exists()
 
 
-def test_install_and_then_every_command(root: Path, project: Path, tmp_path: Path) -> None:
+def test_every_command_of_the_readme_runs_after_its_install(root: Path, project: Path, tmp_path: Path) -> None:
     """In the folder that the project is cloned into, where ``gsmerge`` is not the package."""
     run(f'"{sys.executable}" -m venv venv', tmp_path)
     path = f"{tmp_path / 'venv' / 'bin'}:{os.environ['PATH']}"

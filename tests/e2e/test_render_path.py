@@ -1,4 +1,4 @@
-"""Clips of `render`: videos, GIFs and frames along a path, of one scene, or of several under lines that move."""
+"""``render`` makes videos, GIFs and frames along a path, of one scene, or of several under lines that move."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_video_shows_the_frames_of_its_path(
 
 
 @pytest.mark.slow
-def test_a_line_moves_between_two_scenes(small_copy: Path, tmp_path: Path, run: Run) -> None:
+def test_line_moves_between_two_scenes_of_a_clip(small_copy: Path, tmp_path: Path, run: Run) -> None:
     """Left of it is the first, right of it the second, each with its caption; it starts in the middle."""
     scene, dark = small_copy / "scene.ply", tmp_path / "dark.ply"
     gaussians = gsmerge.read_ply(scene).gaussians[::2]
@@ -105,7 +105,7 @@ def test_a_clip_is_an_orbit_by_default(small_scene: Path, tmp_path: Path, run: R
 
 
 @pytest.mark.slow
-def test_the_path_of_a_file_is_placed_as_held_out_views_are(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+def test_path_of_a_file_is_placed_as_held_out_views_are(scene_copy: Path, tmp_path: Path, run: Run) -> None:
     """The cameras of the scene, and those of the path in their world, are in larger units than the Gaussians."""
     targets = tmp_path / "targets"
     shutil.move(scene_copy / "targets", targets)
@@ -191,7 +191,7 @@ def test_cameras_of_views_that_the_file_lacks_are_drawn(small_copy: Path, tmp_pa
 
 
 @pytest.mark.parametrize(("name", "size"), [("a.mp4", (50, 34)), ("a.gif", (49, 33))])
-def test_even_sides_of_videos_are_said(
+def test_videos_of_odd_sides_are_made_even_with_a_note(
     name: str, size: tuple[int, int], small_scene: Path, tmp_path: Path, run: Run
 ) -> None:
     call = ("render", small_scene, "--size", "49x33", "--frames", 2, "-o", tmp_path / name, "--json")
@@ -210,7 +210,7 @@ def test_even_sides_of_videos_are_said(
         (("--background", "nan"), "folder", ()),
     ],
 )  # fmt: skip
-def test_options_that_do_not_fit_are_refused(
+def test_views_and_backgrounds_that_do_not_fit_are_refused(
     flags: tuple[str | int, ...], name: str, words: tuple[str, ...], small_scene: Path, tmp_path: Path, run: Run
 ) -> None:
     """Nothing that is asked for is left out without a word."""

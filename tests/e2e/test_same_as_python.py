@@ -17,7 +17,7 @@ from .conftest import Run
 
 @pytest.fixture(scope="module")
 def one_photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene of one view, whose number of Gaussians goes by other rules. Read only."""
+    """Return a scene of one view, whose number of Gaussians goes by other rules. Read only."""
     folder = write_smallest(tmp_path_factory.mktemp("one") / "scene")
     alone = subset(gsmerge.read_scene(folder), [0]).gaussians
     gsmerge.write_ply(folder / "scene.ply", alone, overwrite=True)

@@ -1,4 +1,4 @@
-"""The same bytes from every processor: eight results, which take two to three seconds together.
+"""Every processor writes the same bytes of eight results, which take two to three seconds together.
 
 Other processors are stood for by targets of the native library and by what NumPy, its BLAS, OpenCV, its IPP and torch
 leave unused (also tools/processors.py).
@@ -25,7 +25,7 @@ EXACT = "c861febcc6fe28c56361e2f0b94bd287"
 
 
 def plain() -> dict[str, str]:
-    """Settings of the libraries that take all that only some processors have from them."""
+    """Return settings of the libraries that take all that only some processors have from them."""
     return {
         "NPY_DISABLE_CPU_FEATURES": " ".join(np._core._multiarray_umath.__cpu_dispatch__),
         "OPENBLAS_CORETYPE": "Sandybridge",

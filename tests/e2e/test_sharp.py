@@ -1,4 +1,4 @@
-"""Files of SHARP as it leaves them: one with its photo, and several of one place as one scene."""
+"""Files of SHARP are read as it leaves them: one with its photo, and several of one place as one scene."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIT = ("--set", "fit_steps=30", "--budget", "700", "--threads", 1)
 
 @pytest.fixture(scope="module")
 def sharp(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``out/`` with two files, ``photos/`` with what they were made of, and a file of another place. Read only."""
+    """Return ``out/`` with two files, ``photos/`` that they were made of, and a file of another place. Read only."""
     folder = tmp_path_factory.mktemp("sharp")
     for name in ("out", "photos", "other"):
         (folder / name).mkdir()
@@ -63,13 +63,13 @@ def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -
     np.testing.assert_allclose(written, both.cameras.viewmats, atol=1e-12)
 
 
-def test_a_plan_counts_all_files(run: Run, sharp: Path) -> None:
+def test_dry_run_counts_all_files(run: Run, sharp: Path) -> None:
     files = [sharp / "out" / f"{name}.ply" for name in NAMES]
     plan = json.loads(run("compact", *files, "--images", sharp / "photos", "--dry-run", "--json", code=0).out)
     assert plan["input"]["num_gaussians"] == 2 * 2 * SIDE * SIDE
 
 
-def test_what_cannot_be_joined(run: Run, sharp: Path, tmp_path: Path) -> None:
+def test_files_that_cannot_be_joined_are_refused(run: Run, sharp: Path, tmp_path: Path) -> None:
     first, second = (sharp / "out" / f"{name}.ply" for name in NAMES)
     stranger, out = sharp / "other/IMG_0009.ply", tmp_path / "a.ply"
     photos = ("--images", sharp / "photos")

@@ -1,4 +1,4 @@
-"""``-o small.html``: one file that opens from disk, and from any web server."""
+"""``-o small.html`` writes one file that opens from disk, and from any web server."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_compact_writes_one_file_to_send(run: Run, smallest_copy: Path) -> None:
     assert document["output"]["bytes"] == page.stat().st_size < 1_100_000
 
 
-def test_a_size_counts_the_viewer_of_a_page(run: Run, smallest_copy: Path) -> None:
+def test_budget_in_bytes_counts_the_viewer_of_a_page(run: Run, smallest_copy: Path) -> None:
     page = smallest_copy / "a.html"
     words = ("compact", smallest_copy, "-o", page, *QUICK, "--set", "fill=true", "--budget")
     run(*words, "930KB", code=0)
@@ -72,14 +72,14 @@ def served() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """Of a small window: a processor draws its 3D."""
+    """Yield a browser with a small window: a processor draws its 3D."""
     flags = "--enable-unsafe-swiftshader", "--window-size=400,300"
     with browser(CHROMIUM, tmp_path_factory.mktemp("profile"), *flags) as opened:
         yield opened
 
 
 @needs_browser()
-def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(tab: Browser, served: str, small_scene: Path) -> None:
+def test_page_from_a_server_draws_the_scene_as_render_does(tab: Browser, served: str, small_scene: Path) -> None:
     tab.open(served)
     tab.wait(SETTLED)
     host = served.removesuffix("one.html")
@@ -118,7 +118,7 @@ def test_the_camera_stays_where_photos_stood(tab: Browser, served: str) -> None:
 
 @pytest.mark.slow
 @needs_browser()
-def test_on_a_phone_one_finger_turns_and_two_come_nearer(tab: Browser, served: str) -> None:
+def test_fingers_turn_and_enlarge_the_scene_on_a_phone(tab: Browser, served: str) -> None:
     tab.open(served)
     tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)
     tab.call("Emulation.setTouchEmulationEnabled", enabled=True)
@@ -145,7 +145,7 @@ def test_on_a_phone_one_finger_turns_and_two_come_nearer(tab: Browser, served: s
 
 
 @needs_browser()
-def test_one_file_opens_from_disk(tab: Browser) -> None:
+def test_page_opens_from_disk(tab: Browser) -> None:
     site = make_once("site", make_site)
     before = len(tab.requests())
     tab.open(site / "one.html")

@@ -1,4 +1,4 @@
-"""``extend``, and what every command makes of a state, on scenes that the project makes itself."""
+"""``extend`` makes states of scenes that the project makes itself, and every command takes them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,6 @@ from .conftest import Run, assert_refused, listing
 
 SMALL = ("--set", "superpixels=60", "--set", "checkpoint=none")
 PAPER = ("--set", "recipe=paper", "--set", "superpixels=60")
-PATIENCE = 120  # seconds, on a machine that is busy with other things
 
 
 def write_walks(folder: Path) -> list[Path]:
@@ -48,7 +47,7 @@ def write_states(folder: Path) -> None:
 
 @pytest.fixture(scope="session")
 def walks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
-    """The scenes of :func:`write_walks`. Read only, which is checked."""
+    """Yield the scenes of :func:`write_walks`. Read only, which is checked."""
     folder = tmp_path_factory.mktemp("walks")
     scenes = write_walks(folder)
     before = digests(folder)
@@ -58,13 +57,13 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
 
 @pytest.fixture(scope="session")
 def states() -> list[Path]:
-    """The states of :func:`write_states`. Read only."""
+    """Return the states of :func:`write_states`. Read only."""
     return [make_once("states", write_states) / name for name in ("1.gsm", "2.gsm")]
 
 
 @pytest.fixture(scope="session")
 def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Feature Gaussians of two batches. Read only."""
+    """Return Feature Gaussians of two batches. Read only."""
     path = tmp_path_factory.mktemp("features") / "room.gsm"
     assert main(["extend", str(path), *map(str, write_walks(path.parent)), *PAPER, "--quiet"]) == 0
     return path
@@ -72,7 +71,7 @@ def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """A state of one batch that a test may spoil."""
+    """Return a state of one batch that a test may spoil."""
     (tmp_path / "work").mkdir()
     return Path(shutil.copy(make_once("states", write_states) / "1.gsm", tmp_path / "work" / "state.gsm"))
 
@@ -84,7 +83,7 @@ def digests(folder: Path) -> dict[str, str]:
 # batches
 
 
-def test_several_batches_in_order(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+def test_extend_adds_several_batches_in_order(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
     """The states are those of two batches, made here for the module."""
     outcome = run("extend", tmp_path / "state.gsm", *walks, *SMALL)
     assert (outcome.code, outcome.out.count("\n")) == (0, 2), outcome.err
@@ -95,7 +94,7 @@ def test_several_batches_in_order(states: list[Path], walks: list[Path], tmp_pat
     assert (tmp_path / "state.gsm").read_bytes() == states[1].read_bytes()
 
 
-def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: Run) -> None:
+def test_json_of_extend_is_alone_on_stdout(walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = tmp_path / "state.gsm"
     outcome = run("extend", state, *walks, *SMALL, "--json")
     assert (outcome.code, outcome.err) == (0, "")
@@ -117,7 +116,7 @@ def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: 
                     for one in batches]  # fmt: skip
 
 
-def test_a_batch_is_added_once(states: list[Path], state: Path, walks: list[Path], run: Run) -> None:
+def test_batch_is_added_once_under_any_name(states: list[Path], state: Path, walks: list[Path], run: Run) -> None:
     """Also under another name."""
     again = Path(shutil.copytree(walks[0], state.parent / "again"))
     outcome = run("extend", state, again, *SMALL, code=0)
@@ -125,7 +124,7 @@ def test_a_batch_is_added_once(states: list[Path], state: Path, walks: list[Path
     assert state.read_bytes() == states[0].read_bytes()
 
 
-def test_a_dry_run_writes_nothing_and_goes_on_with_what_it_made(walks: list[Path], state: Path, run: Run) -> None:
+def test_dry_run_plans_the_second_batch_on_the_first_without_writing(walks: list[Path], state: Path, run: Run) -> None:
     outcome = run("extend", state.parent / "new.gsm", *walks, *SMALL, "--dry-run", code=0)
     first, second = outcome.out.splitlines()
     assert ("would be batch 1, 3 views" in first, "would be batch 2, 4 views" in second) == (True, True)
@@ -138,7 +137,7 @@ def test_inspect_lists_batches(states: list[Path], run: Run) -> None:
     assert ["3 views" in listed[0], "view_003.png; 1,536 ->" in listed[1]] == [True, True], listed
 
 
-def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
+def test_named_cameras_and_photos_of_a_batch_are_used(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
     scene = Path(shutil.copytree(walks[1], tmp_path / "scene"))
     moved = shutil.move(scene / "transforms.json", tmp_path / "poses.json")
     run("extend", state, scene / "scene.ply", "--cameras", moved, "--images", scene / "images", code=0)
@@ -158,7 +157,9 @@ def test_the_same_gaussians_with_other_photos_are_another_batch(
 # what a state is, for the other commands: a scene
 
 
-def test_a_state_is_a_scene(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+def test_every_command_takes_a_state_as_a_scene(
+    states: list[Path], walks: list[Path], tmp_path: Path, run: Run
+) -> None:
     """Any budget, a score, cameras beside the result, levels, other formats; without the files of the batches."""
     alone, out = Path(shutil.copy(states[1], tmp_path / "alone.gsm")), tmp_path / "out.ply"
     few = ("--budget", "40", "--set", "fit_steps=4")
@@ -180,7 +181,7 @@ def test_a_state_is_a_scene(states: list[Path], walks: list[Path], tmp_path: Pat
     assert len(whole) == len(load_state(alone))
 
 
-def test_masks_of_a_state_are_used(state: Path, run: Run) -> None:
+def test_named_masks_of_a_state_are_used(state: Path, run: Run) -> None:
     masks = state.parent / "half"
     masks.mkdir()
     for name in read_cameras(state).names:
@@ -191,17 +192,17 @@ def test_masks_of_a_state_are_used(state: Path, run: Run) -> None:
     assert "masks leave out 50 %" in outcome.err
 
 
-def test_batch_takes_states(state: Path, tmp_path: Path, run: Run) -> None:
+def test_batch_compacts_states(state: Path, tmp_path: Path, run: Run) -> None:
     run("batch", state, "-o", tmp_path / "out", "--effort", "draft", "--jobs", "1", code=0)
     assert list((tmp_path / "out").rglob("*.ply"))
 
 
-def test_a_word_makes_a_result_and_its_page(state: Path, run: Run) -> None:
+def test_state_without_a_command_makes_a_result_with_its_page(state: Path, run: Run) -> None:
     run(state, "--effort", "draft", "--quiet", code=0)
     assert {"state.compact.ply", "state.compact.compare.html"} <= set(listing(state.parent))
 
 
-def test_no_folder_of_this_machine_is_in_the_file(states: list[Path]) -> None:
+def test_state_file_names_no_folder_of_this_machine(states: list[Path]) -> None:
     assert str(states[0].parents[1]).encode() not in states[1].read_bytes()
 
 
@@ -246,7 +247,9 @@ def test_feature_gaussians_in_every_kind_of_output(
     )
 
 
-def test_what_feature_gaussians_are_not_made_into(features: Path, states: list[Path], tmp_path: Path, run: Run) -> None:
+def test_feature_gaussians_refuse_results_they_cannot_make(
+    features: Path, states: list[Path], tmp_path: Path, run: Run
+) -> None:
     for words, place, *found in (
         (("compact", features, "--budget", "10"), "--budget", features),
         (("compact", features, states[0], "-o", tmp_path / "a.ply"), features, "only input", 2),
@@ -261,7 +264,7 @@ def test_what_feature_gaussians_are_not_made_into(features: Path, states: list[P
 
 
 @pytest.mark.parametrize("spoil", [cut(0.5), negate("sh0")], ids=["half", "a changed byte"])
-def test_a_damaged_state_is_refused_by_all(spoil: Change, state: Path, walks: list[Path], run: Run) -> None:
+def test_damaged_state_is_refused_by_every_command(spoil: Change, state: Path, walks: list[Path], run: Run) -> None:
     spoil(state)
     (out := state.parent / "out.ply").write_text("precious")
     before = digests(state.parent)
@@ -273,7 +276,9 @@ def test_a_damaged_state_is_refused_by_all(spoil: Change, state: Path, walks: li
     assert digests(state.parent) == before
 
 
-def test_batches_before_a_broken_one_stay(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+def test_batches_before_a_broken_one_stay_in_the_state(
+    states: list[Path], walks: list[Path], tmp_path: Path, run: Run
+) -> None:
     broken = Path(shutil.copytree(walks[1], tmp_path / "broken"))
     (broken / "scene.ply").write_bytes(b"ply\n")
     outcome = run("extend", tmp_path / "state.gsm", walks[0], broken, *SMALL)
@@ -286,7 +291,7 @@ def test_batches_before_a_broken_one_stay(states: list[Path], walks: list[Path],
 
 
 @pytest.mark.parametrize("exists", [False, True])
-def test_two_at_once_lose_no_batch(exists: bool, state: Path, walks: list[Path], tmp_path: Path) -> None:
+def test_two_extensions_at_once_lose_no_batch(exists: bool, state: Path, walks: list[Path], tmp_path: Path) -> None:
     """The second waits for the first, and adds to what that one has made."""
     from gsmerge.states.files import extend_file
 

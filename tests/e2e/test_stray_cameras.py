@@ -1,4 +1,4 @@
-"""Cameras beside a file that belong to another one: a note, and with ``--strict`` a doubt."""
+"""Cameras beside a file that belong to another one are a note, and with ``--strict`` a doubt."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ FEW = ("--budget", "20%", "--fit", "none", "--effort", "draft", "--threads", 1)
 
 @pytest.fixture(autouse=True)
 def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process of a batch takes a second to start."""
+    """Run batches in this process: another takes a second to start."""
     monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
 
 
 @pytest.fixture
 def stray(tmp_path: Path) -> Path:
-    """A scene beside a damaged camera file."""
+    """Return a scene beside a damaged camera file."""
     folder = write_smallest(tmp_path / "room")
     shutil.rmtree(folder / "images")
     (folder / "transforms.json").write_text('{"frames": [')
     return folder
 
 
-def test_a_note_and_with_strict_a_doubt(stray: Path, run: Run) -> None:
+def test_stray_cameras_are_noted_and_end_strict_runs_with_code_4(stray: Path, run: Run) -> None:
     words = ("compact", stray, "-o", stray / "small.ply", "--overwrite", *FEW)
     document = json.loads(run(*words, "--json", code=0).out)
     (note,) = document["doubts"]
@@ -48,7 +48,7 @@ def test_a_note_and_with_strict_a_doubt(stray: Path, run: Run) -> None:
     assert_refused(run(*words, "--cameras", stray / "transforms.json"), 3, "transforms.json", "--cameras none")
 
 
-def test_a_batch_says_so_again_where_it_is_done(stray: Path, run: Run) -> None:
+def test_batch_repeats_the_note_on_stray_cameras_of_a_finished_scene(stray: Path, run: Run) -> None:
     words = ("batch", stray, "-o", stray.parent / "out", *FEW[:2], "--set", "fit=none", *FEW[4:])
     for _ in range(2):
         outcome = run(*words, code=0)
@@ -74,7 +74,7 @@ def test_photos_that_do_not_show_the_scene_are_a_doubt_too(smallest_copy: Path, 
 
 
 @pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")])
-def test_commands_that_take_cameras_run_beside_them(words: tuple[str, ...], stray: Path, run: Run) -> None:
+def test_commands_that_take_cameras_run_beside_stray_ones(words: tuple[str, ...], stray: Path, run: Run) -> None:
     small = stray / "small.ply"
     shutil.copy(stray / "scene.ply", small)
     (stray / "small.cameras.json").write_text("nonsense")
@@ -93,11 +93,13 @@ def test_commands_that_take_cameras_run_beside_them(words: tuple[str, ...], stra
     ("words", "place", "value"),
     [("--hint opacity=raw", "scene.ply", "--hint opacity=raw"), ("--set checkpoint=nosuch", "nosuch", "checkpoint")],
 )
-def test_what_cannot_be_is_refused(words: str, place: str, value: str, smallest_copy: Path, run: Run) -> None:
+def test_wrong_hint_or_missing_checkpoint_is_refused(
+    words: str, place: str, value: str, smallest_copy: Path, run: Run
+) -> None:
     assert_refused(run("compact", smallest_copy, *words.split()), 3, place, value)
 
 
 @pytest.mark.parametrize("command", ["compact A", "extend A.gsm A", "render A", "view A B", "batch A", "lab chart A"])
-def test_one_output(command: str, run: Run, tmp_path: Path) -> None:
+def test_second_output_is_refused(command: str, run: Run, tmp_path: Path) -> None:
     assert_refused(run(*command.split(), "-o", tmp_path / "a.ply", "-o", tmp_path / "b.spz"), 2, "")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""``compact -o scene/lod-meta.json``: levels that stream, from the command line."""
+"""``compact -o scene/lod-meta.json`` writes levels that stream."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ QUICK = ("--set", "superpixels=200", "--fit", "none", "--set", "checkpoint=none"
 
 @pytest.fixture(autouse=True)
 def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stand-in for splat-transform, in each test that does not take the program itself."""
+    """Put a stand-in for splat-transform in each test that does not take the program itself."""
     run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
 
 
@@ -32,7 +32,7 @@ def index(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @needs_program()
-def test_the_program_itself_writes_them(
+def test_splat_transform_itself_writes_the_levels(
     small_scene: Path, index: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.undo()
@@ -43,7 +43,7 @@ def test_the_program_itself_writes_them(
     assert json.loads(run("inspect", index, "--json", code=0).out)["count"] == counts[0]
 
 
-def test_three_levels_in_a_folder_of_their_own(small_scene: Path, index: Path, run: Run) -> None:
+def test_compact_writes_three_levels_into_a_folder(small_scene: Path, index: Path, run: Run) -> None:
     document = json.loads(run("compact", small_scene, "-o", index, *QUICK, "--json", code=0).out)
     levels = read_index(index).levels
     counts = [document["output"]["num_gaussians"], *(level["num_gaussians"] for level in document["levels"])]
@@ -64,7 +64,7 @@ def test_three_levels_in_a_folder_of_their_own(small_scene: Path, index: Path, r
 
 
 @pytest.mark.parametrize(("more", "number"), [(("--levels", 2), 2), (("--set", "method=random"), 1), ((), 3)])
-def test_the_plan_says_how_many(
+def test_dry_run_says_how_many_levels_are_written(
     more: tuple[object, ...], number: int, small_scene: Path, index: Path, run: Run
 ) -> None:
     said = run("compact", small_scene, "-o", index, *QUICK[:2], *more, "--dry-run", code=0)
@@ -73,7 +73,7 @@ def test_the_plan_says_how_many(
 
 
 @pytest.mark.slow
-def test_what_takes_a_scene_takes_its_finest_level(small_scene: Path, index: Path, run: Run) -> None:
+def test_other_commands_take_the_finest_level(small_scene: Path, index: Path, run: Run) -> None:
     run("compact", small_scene, "-o", index, *QUICK, code=0)
     said = json.loads(run("evaluate", small_scene, index, "--lpips", "none", "--json", code=0).out)
     finest = len(read_gaussians(index).gaussians)
@@ -85,7 +85,7 @@ def test_what_takes_a_scene_takes_its_finest_level(small_scene: Path, index: Pat
     assert picture.stat().st_size > 1000
 
 
-def test_a_batch_writes_no_levels(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_batch_writes_no_streamed_levels(small_scene: Path, tmp_path: Path, run: Run) -> None:
     words = ("batch", small_scene, "--output", tmp_path, "--name", "{stem}/lod-meta.json")
     assert_refused(run(*words), 2, "--name", ".ply")
 

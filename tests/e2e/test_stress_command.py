@@ -1,4 +1,4 @@
-"""``gsmerge lab stress`` as users call it."""
+"""``gsmerge lab stress`` works as users call it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_json_and_quiet(small_scene: Path, run: Run) -> None:
     assert (outcome.out, outcome.err) == ("", "")
 
 
-def test_a_case_that_fails_is_a_target_not_met(small_copy: Path, run: Run) -> None:
+def test_failed_case_ends_as_a_target_not_met(small_copy: Path, run: Run) -> None:
     poor = ("--set", "fit=none", "--set", "superpixels=1%")
     outcome = run("lab", "stress", small_copy, *poor, "--cases", "order,views-1,unchanged")
     failed = [line for line in outcome.out.splitlines() if line.startswith("FAILED")]

@@ -1,4 +1,4 @@
-"""Quality targets, devices and levels of detail, from the command line and from Python."""
+"""Quality targets, devices and levels of detail are met from the command line and from Python."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
 
 
-def test_levels_are_a_chain(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_each_level_has_a_quarter_of_the_gaussians_of_the_one_before(
+    small_scene: Path, tmp_path: Path, run: Run
+) -> None:
     out = tmp_path / "chain.ply"
     sizes = ("--levels", 3, "--set", "fit_steps=20", "--set", "superpixels=300")
     said = run("compact", small_scene, "-o", out, *sizes, "--json", code=0)
@@ -41,7 +43,7 @@ def test_levels_are_a_chain(small_scene: Path, tmp_path: Path, run: Run) -> None
     assert psnrs == sorted(psnrs, reverse=True)
 
 
-def test_no_level_replaces_a_file(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_level_replaces_no_file(small_scene: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "chain.level2.ply").write_text("mine")
     said = run("compact", small_scene, "-o", tmp_path / "chain.ply", "--levels", 3, code=2)
     assert "chain.level2.ply: exists" in said.err
@@ -55,14 +57,14 @@ def test_the_finest_level_is_the_result_without_levels(scene: Scene) -> None:
     assert alone.coarser == ()
 
 
-def test_no_more_are_made_than_there_are(scene: Scene) -> None:
+def test_budget_beyond_the_scene_makes_no_more_gaussians_than_it_has(scene: Scene) -> None:
     result = compact(scene, budget="1M", fit="none")
     assert len(result.gaussians) <= scene.num_gaussians
     assert noted(result.report.notes, "1M", f"{scene.num_gaussians:,}")
     assert not noted(compact(scene, budget=200, fit="none").report.notes, "200")
 
 
-def test_sizes_and_shares_are_limits(tmp_path: Path, run: Run) -> None:
+def test_sizes_and_shares_limit_the_automatic_count(tmp_path: Path, run: Run) -> None:
     """No more Gaussians are taken than new views gain from, unless all are asked for; a number is met exactly."""
     scene = write_scene(tmp_path / "scene", num_views=5, width=24, height=16)
     out, quick = tmp_path / "limited.ply", ("--set", "fit_steps=8", "--overwrite", "--json")
@@ -84,7 +86,7 @@ def test_sizes_and_shares_are_limits(tmp_path: Path, run: Run) -> None:
     assert compacted("--budget", "2%") == (int(0.02 * total), [])
 
 
-def test_a_psnr_is_met_with_few(scene: Scene) -> None:
+def test_psnr_target_is_met_with_fewer_gaussians(scene: Scene) -> None:
     usual = compact(scene, fit_steps=20)
     expected = usual.report.psnr_after - 1
     actual = compact(scene, fit_steps=20, quality=f"{expected}dB")
@@ -94,7 +96,7 @@ def test_a_psnr_is_met_with_few(scene: Scene) -> None:
     assert actual.report.choices["search"]["met"]
 
 
-def test_a_psnr_is_that_of_photos_left_out() -> None:
+def test_psnr_target_is_measured_on_photos_left_out() -> None:
     """Of four or more; the result is made of all views, with the number that two builds without some reach it with."""
     wide = scenes.make_scene(scenes.room(), scenes.arc(6, 32, 24), noise=0.01)
     easy, hard = (compact(wide, fit_steps=20, quality=asked, checkpoint="none").report for asked in ("12dB", "50dB"))
@@ -109,7 +111,7 @@ def test_a_psnr_is_that_of_photos_left_out() -> None:
     assert hard.psnr_after > max(psnr for _, psnr in hard.choices["search"]["tried"])  # own photos, which the fit saw
 
 
-def test_a_target_out_of_reach_ends_with_4(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_target_out_of_reach_ends_with_code_4_and_the_best_result(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "best.ply"
     said = run(
         "compact", small_scene, "-o", out, "--quality", "90dB", "--set", "fit_steps=8", "--budget", "20KB", code=4
@@ -121,7 +123,7 @@ def test_a_target_out_of_reach_ends_with_4(small_scene: Path, tmp_path: Path, ru
 
 
 @pytest.mark.slow
-def test_a_loss_is_read_off_a_curve(scene: Scene) -> None:
+def test_psnr_loss_is_read_off_a_curve(scene: Scene) -> None:
     result = compact(scene, fit_steps=6, quality="-2dB")
     curve = result.report.choices["curve"]
     assert curve[0]["count"] < len(result.gaussians) < curve[-1]["count"]
@@ -134,13 +136,13 @@ def test_auto_without_a_fit_reports_its_curve(small_scene: Path, tmp_path: Path,
     assert len(re.findall(r"^ *[\d,]+  +\d+\.\d\d  \d\.\d{3}", said.out, re.MULTILINE)) == 4
 
 
-def test_a_device_is_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_budget_of_a_device_limits_the_count(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     assert scenes.identical(compact(scene, fit="none", budget="quest3").gaussians, compact(scene, fit="none").gaussians)
     monkeypatch.setitem(DEVICES, "quest3", 30)
     assert len(compact(scene, fit_steps=12, budget="quest3").gaussians) == 30
 
 
-def test_quality_without_photos_and_pixels_is_that_from_the_input(scene: Scene) -> None:
+def test_quality_without_photos_is_measured_against_the_input(scene: Scene) -> None:
     rows = replace(scene, images=None, pixels=None)
     low, high = (compact(rows, quality=quality, fit_steps=20).report for quality in ("20dB", "28dB"))
     for report, asked in ((low, 20), (high, 28)):

@@ -1,4 +1,4 @@
-"""What a person sees in a terminal of 80 columns: commands run in a pseudo-terminal, their bytes become a screen."""
+"""A person sees whole lines in a terminal of 80 columns: commands run in one, and their bytes become a screen."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS, ROWS = 80, 50
 
 
 def screen(data: bytes) -> list[str]:
-    """The lines of a terminal after these bytes: cursor up, erase line, wrapping at the last column."""
+    """Return the lines of a terminal after these bytes: cursor up, erase line, wrapping at the last column."""
     lines, row, column = [""], 0, 0
     text = data.decode("utf-8")
     for match in re.finditer(r"\x1b\[([\d;?]*)([A-Za-z])|(.)", text, re.DOTALL):
@@ -46,7 +46,7 @@ def screen(data: bytes) -> list[str]:
 def in_terminal(
     *words: object, interrupt_at: bytes | None = None, kind: str = "xterm", columns: int = COLUMNS
 ) -> tuple[int, bytes]:
-    """Exit code and bytes of Python in a terminal; Ctrl-C is typed once ``interrupt_at`` has been printed."""
+    """Return exit code and bytes of Python in a terminal; type Ctrl-C once ``interrupt_at`` has been printed."""
     import fcntl
     import termios
 
@@ -72,7 +72,7 @@ def in_terminal(
     return code, output
 
 
-def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
+def test_compact_ends_with_a_table_of_its_result(small_copy: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
     sizes = ("--set", "superpixels=200", "--set", "fit_steps=20")
     code, output = in_terminal("-m", "gsmerge", "compact", small_copy, "-o", out, *sizes)
@@ -92,7 +92,7 @@ def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["", "dumb", "unknown", "xterm"])
 @pytest.mark.parametrize("words", ["--help", "compact --help", "lab --help", "compact", "inspect {scene}"])
-def test_a_narrow_terminal_of_any_kind(kind: str, words: str, small_scene: Path) -> None:
+def test_lines_fit_a_narrow_terminal_of_any_kind(kind: str, words: str, small_scene: Path) -> None:
     """Nothing is wider than it, and one without a known name gets no escape sequences."""
     given = words.format(scene=small_scene).split()
     code, output = in_terminal("-m", "gsmerge", *given, kind=kind, columns=40)
@@ -124,7 +124,7 @@ def test_lines_are_wrapped_between_words() -> None:
 
 
 @pytest.mark.slow
-def test_a_compact_scene_is_known_again(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_inspect_recognises_a_compact_scene(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out, words = tmp_path / "small.ply", ("--fit", "none", "--set", "superpixels=200")
     assert "already" not in run("compact", small_scene, "-o", out, *words).err
     views = ("--cameras", small_scene / "transforms.json", "--images", small_scene / "images")

@@ -1,4 +1,4 @@
-"""``gsmerge lab train`` and ``checkpoint`` as users call them."""
+"""``gsmerge lab train`` and ``checkpoint`` work as users call them."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ PAPER = {
 
 
 def words(settings: dict[str, Any]) -> list[str]:
-    """``--set`` for every setting."""
+    """Return ``--set`` for every setting."""
     return [word for name, value in settings.items() for word in ("--set", f"{name}={json.dumps(value)}")]
 
 
 @pytest.mark.slow
-def test_the_paper_s_training_then_compact(small_copy: Path, run: Run) -> None:
+def test_networks_trained_as_in_the_paper_compact_a_scene(small_copy: Path, run: Run) -> None:
     """Absolute heads, clusters; settings of the networks change the preset's."""
     out = small_copy / "run"
     call = ("lab", "train", "--data", small_copy, "--output", out, *words(PAPER), "--preset", "paper")
@@ -121,7 +121,7 @@ def test_data_may_be_a_folder_of_scenes(small_copy: Path, tmp_path: Path, run: R
     assert "--validation" in run("lab", "train", *held, "--output", out, code=2).err
 
 
-def test_a_checkpoint_is_not_replaced(small_copy: Path, run: Run) -> None:
+def test_training_replaces_no_checkpoint(small_copy: Path, run: Run) -> None:
     path = written(small_copy / "a.safetensors", noisy(SMALL))
     before = path.read_bytes()
     assert run("compact", small_copy, *FAST, "--set", f"checkpoint={path}", "-o", path, "--overwrite").code == 2

@@ -1,4 +1,4 @@
-"""Scenes in no order from files to files, with floors (floors.csv, dB) on photos that no stage has seen."""
+"""Scenes in no order reach floors (floors.csv, dB) on photos that no stage has seen, from files to files."""
 
 from __future__ import annotations
 
@@ -26,12 +26,10 @@ from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run
 
-Measure = Callable[[Path, Path], float]
-
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The made scene as voxels."""
+    """Return the made scene as voxels."""
     folder = write_made(tmp_path_factory.mktemp("unaligned") / "scene")
     scene = gsmerge.read_scene(folder)
     gsmerge.write_ply(folder / "scene.ply", unaligned_scenes.voxels(scene, 0.03).gaussians, overwrite=True)
@@ -39,7 +37,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @sweep("settings", [{}, {"budget": "2%"}, {"k": 2}])
-def test_floor(settings: dict, made: Path, tmp_path: Path, floor: Callable[..., None]) -> None:
+def test_result_reaches_the_floor_on_held_out_photos(
+    settings: dict, made: Path, tmp_path: Path, floor: Callable[..., None]
+) -> None:
     """300 steps, as users' fits have."""
     scene = read_scene(made, order="none")
     result = gsmerge.compact(scene, fit_steps=300, **settings)
@@ -140,12 +140,12 @@ def test_a_result_compacted_again_shows_the_photos_as_it_did(
 
 
 @pytest.mark.slow
-def test_a_poor_result_is_a_warning(compacted_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_result_unlike_its_input_is_a_warning(compacted_scene: Path, tmp_path: Path, run: Run) -> None:
     words = ("compact", compacted_scene / "small.ply", "-o", tmp_path / "few.ply", "--budget", "5%", "--strict")
     assert names(run(*words, code=4).err, "looks different from its input", "below 30 dB")
 
 
-def test_dry_run_says_what_decides_the_count(compacted_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_dry_run_names_the_psnr_that_decides_the_count(compacted_scene: Path, tmp_path: Path, run: Run) -> None:
     words = ("compact", compacted_scene / "small.ply", "-o", tmp_path / "few.ply", "--dry-run")
     assert names(run(*words, code=0).out, "or more until the PSNR against the input is 32.5 dB", "fit: full")
     assert "or more until" not in run(*words, "--budget", "5%", code=0).out

@@ -1,4 +1,4 @@
-"""``gsmerge view``: what it writes and replaces, pages without the scene's Gaussians."""
+"""``gsmerge view`` writes pages, also without the scene's Gaussians, and replaces no other file."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .conftest import Run, assert_refused
 
 
 def sources(page: Path) -> list[tuple[str, str | None]]:
-    """Names of what a page shows, each with the place of its Gaussians."""
+    """Return names of what a page shows, each with the place of its Gaussians."""
     data = json.loads(re.findall('<script type="application/json" id="data">(.*?)</script>', page.read_text())[0])
     return [(one["name"], one["splats"]) for one in data["sources"]]
 
 
-def test_a_page_is_replaced_and_nothing_else(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_view_replaces_its_own_page_alone(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     page = tmp_path / "page.html"
     call = ("view", smallest_scene, "--no-open", "-o", page)
     run(*call, code=0)

@@ -1,4 +1,4 @@
-"""The page of ``gsmerge view`` in a real browser: stills, 3D as our own renderer draws it, jumps, the swipe."""
+"""The page of ``gsmerge view`` shows stills, 3D as our own renderer draws it, jumps and the swipe in a browser."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, An
 
 
 def with_one_from_outside(gaussians: gsmerge.Gaussians, camera: gsmerge.Cameras) -> gsmerge.Gaussians:
-    """With a long Gaussian that reaches into the camera's picture from three half pictures to its right.
+    """Add a long Gaussian that reaches into the camera's picture from three half pictures to its right.
 
     Another one is far behind the camera, where no view sees it.
     """
@@ -91,7 +91,7 @@ def with_one_from_outside(gaussians: gsmerge.Gaussians, camera: gsmerge.Cameras)
 
 
 def picture(tab: Browser) -> np.ndarray:
-    """``[h,w,3]`` what the stage shows, in [0, 1], once it is the same twice: a busy browser is late."""
+    """Return what the stage shows ``[h,w,3]``, in [0, 1], once it is the same twice: a busy browser is late."""
     tab.wait(f"({SETTLED}) || state.solid === '' && [...document.images].every(image => image.complete)")
     shown = np.empty(0)
     for _ in range(100):
@@ -106,7 +106,7 @@ def picture(tab: Browser) -> np.ndarray:
 @pytest.mark.parametrize(
     "views", [slice(1), pytest.param(slice(1, None), marks=pytest.mark.slow)], ids=["the first view", "all other views"]
 )
-def test_3d_is_what_we_render_at_every_input_view(views: slice, page: tuple[Browser, Any]) -> None:
+def test_3d_shows_every_input_view_as_render_does(views: slice, page: tuple[Browser, Any]) -> None:
     """The browser draws without a GPU."""
     tab, (scene, small, _) = refreshed(page)
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo')")
@@ -126,7 +126,7 @@ def test_3d_is_what_we_render_at_every_input_view(views: slice, page: tuple[Brow
 
 
 @pytest.mark.slow
-def test_a_gaussian_reaches_in_from_outside(page: tuple[Browser, Any]) -> None:
+def test_gaussian_reaches_into_the_picture_from_outside(page: tuple[Browser, Any]) -> None:
     tab, (scene, small, wide) = refreshed(page)
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); set('solid', '1'); set('other', false)")
     name = scene.names[0].rpartition("/")[2].removesuffix(".png")
@@ -166,7 +166,7 @@ def test_step_back_shows_the_side_without_photos(page: tuple[Browser, Any]) -> N
     assert tab.run("view().outside") is False
 
 
-def test_what_cannot_be_seen_from_here_gives_way(page: tuple[Browser, Any]) -> None:
+def test_side_in_stills_alone_gives_way_once_the_camera_moves(page: tuple[Browser, Any]) -> None:
     """Without a GPU a large scene is in stills alone: once the camera has moved, both sides show the result."""
     tab, _ = refreshed(page)
     tab.run("set('mode', 'swipe'); set('solid', '1'); jump(0)")
@@ -184,7 +184,7 @@ def test_what_cannot_be_seen_from_here_gives_way(page: tuple[Browser, Any]) -> N
     assert tab.run("[state.atCamera, id('back').hidden, solid.camera.matrix.equals(solid.poses[0])]") == [True] * 3
 
 
-def test_another_result_brings_its_figures(page: tuple[Browser, Any]) -> None:
+def test_choosing_a_result_changes_picture_and_figures(page: tuple[Browser, Any]) -> None:
     """By the slider, from the smallest, or the table: picture, figures and 3D."""
     tab, _ = refreshed(page)
     assert tab.run("data.sizes") == [2, 3]  # one Gaussian more
@@ -209,7 +209,7 @@ def test_another_result_brings_its_figures(page: tuple[Browser, Any]) -> None:
     assert counts[0] in tab.run("id('figures').textContent")  # of the one on the right
 
 
-def test_the_speed_of_this_device_is_in_the_headline(page: tuple[Browser, Any]) -> None:
+def test_headline_has_the_speed_of_this_device(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run("[solid.frameTime, solid.software] = [source => source === 1 ? 18 : 2, false]; measureSpeed()")
     assert tab.run("id('speed').textContent").replace("\u00a0", " ") == ", about 9 \u00d7 faster to draw"
@@ -222,7 +222,7 @@ def test_the_speed_of_this_device_is_in_the_headline(page: tuple[Browser, Any]) 
     tab.run("solid.software = true")
 
 
-def test_swipe_shows_each_on_its_side(page: tuple[Browser, Any]) -> None:
+def test_swipe_shows_each_scene_on_its_side(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run(f"{BARE} jump(0); set('solid', ''); set('other', false); set('mode', 'blink'); set('pixels', 'photo')")
     left = picture(tab)
@@ -248,7 +248,7 @@ def test_a_difference_of_a_scene_with_itself_is_black(page: tuple[Browser, Any])
         tab.run("set('left', state.right - 1)")
 
 
-def test_keys(page: tuple[Browser, Any]) -> None:
+def test_keys_move_the_swipe_and_choose_view_mode_and_3d(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run("jump(0); set('solid', ''); set('mode', 'swipe'); swipeTo(0.5)")
     for key in ("ArrowLeft", "ArrowDown", "2", "v"):
@@ -257,7 +257,7 @@ def test_keys(page: tuple[Browser, Any]) -> None:
     assert tab.run("[...id('strip').children].filter(one => one.ariaCurrent === 'true').length") == 1
 
 
-def test_grey_controls_say_why(page: tuple[Browser, Any]) -> None:
+def test_disabled_controls_say_why(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run("jump(data.views.findIndex(view => view.outside)); set('solid', '')")
     grey = "[...document.querySelectorAll('button:disabled, input:disabled')].filter(one => one.checkVisibility())"
@@ -271,7 +271,7 @@ def test_grey_controls_say_why(page: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_full_screen(page: tuple[Browser, Any]) -> None:
+def test_full_screen_shows_the_whole_picture(page: tuple[Browser, Any]) -> None:
     """Where the buttons take two lines as well."""
     tab, _ = refreshed(page)
     for width in (1280, 520):
@@ -307,10 +307,15 @@ def test_the_picture_fits_the_window(size: tuple[int, int], page: tuple[Browser,
     assert tab.run("document.documentElement.scrollWidth") == size[0]
 
 
-def test_a_phone(page: tuple[Browser, Any]) -> None:
-    """The headline and the picture come first, with its controls in sight; the table begins with what matters most."""
+def on_phone(page: tuple[Browser, Any]) -> Browser:
+    """Return the page as it opens in a window of a phone, held upright."""
     tab, _ = refreshed(page)
-    resize(tab, 390, 844)
+    resize(tab, 390, 844)  # CSS pixels of a common phone
+    return tab
+
+
+def test_phone_shows_headline_and_picture_first_with_its_controls_in_sight(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
     assert tab.box("headline")["y"] < 40
     assert 60 < tab.box("stage")["y"] < 844 / 3
     alts = tab.run("[id('left').alt, id('right').alt, id('canvas').getAttribute('aria-label')]")
@@ -318,6 +323,10 @@ def test_a_phone(page: tuple[Browser, Any]) -> None:
     assert alts[2].endswith(" in 3D")
     for control in ("id('left-source')", "id('right-source')"):  # in sight with the headline and the picture
         assert 0 < tab.box(control)["y"] < 844
+
+
+def test_phone_stacks_the_scenes_that_are_shown_side_by_side(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
     for mode, shown in {"swipe": 2, "side": 2, "blink": 1, "difference": 2}.items():
         side = mode == "side"
         expected = [[0, 0, 1, 0.5], [0, 0.5, 1, 0.5]] if side else [[0, 0, 1, 1]] * shown
@@ -333,6 +342,9 @@ def test_a_phone(page: tuple[Browser, Any]) -> None:
             assert np.allclose(tab.run("panes().map(pane => pane.box)"), expected)
             assert tab.run("stage.classList.contains('stacked')") is side
 
+
+def test_phone_shows_the_score_in_the_table_and_that_there_is_more(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
     heads = "[...document.querySelectorAll('.results th')]"
     assert tab.run(f"{heads}.map(one => one.textContent)")[:2] == ["File", "PSNR (dB)"]
     assert tab.run(f"{heads}[1].getBoundingClientRect().right") < 390
@@ -340,23 +352,30 @@ def test_a_phone(page: tuple[Browser, Any]) -> None:
     ground = tab.run("getComputedStyle(document.querySelector('.results .scroll')).backgroundAttachment")
     assert ground == "local, local, scroll, scroll"  # a shadow says that there is more
 
-    tab.run("set('solid', ''); zoomTo(2)")
+
+def test_controls_on_a_phone_are_large_enough_for_fingers(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
+    tab.run("set('mode', 'difference'); zoomTo(2)")
     small = "[...document.querySelectorAll('button, select, summary, input')].filter(one => one.checkVisibility())"
     small += ".map(one => [one.id || one.textContent, one.getBoundingClientRect()])"
     assert tab.run(f"{small}.length") > 20
+    # WCAG 2.5.5 asks for 44 CSS pixels
     assert tab.run(f"{small}.filter(([, box]) => box.height < 44 || box.width < 44).map(([name]) => name)") == []
     assert tab.run("id('strip').scrollWidth > id('strip').clientWidth")
 
+
+def test_picture_fills_a_phone_that_is_turned(page: tuple[Browser, Any]) -> None:
+    tab = on_phone(page)
     tab.call("Emulation.setDeviceMetricsOverride", width=844, height=390, deviceScaleFactor=1, mobile=True)
     tab.wait("innerWidth === 844")
     tab.run("set('mode', 'swipe'); zoomTo(1); scrollTo(0, 0)")
     tab.wait("stage.getBoundingClientRect().bottom <= innerHeight")
-    assert tab.run("stage.getBoundingClientRect().height") > 0.85 * 390
+    assert tab.run("stage.getBoundingClientRect().height") > 0.85 * 390  # the rest is for the controls
     assert tab.run("document.documentElement.scrollWidth") == 844
 
 
 @pytest.mark.slow
-def test_the_colours_follow_the_system_and_the_switch(page: tuple[Browser, Any]) -> None:
+def test_colours_follow_the_system_unless_the_switch_is_set(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     grounds = []
     for system, scheme in (("dark", ""), ("light", ""), ("light", "dark"), ("dark", "light")):
@@ -369,7 +388,7 @@ def test_the_colours_follow_the_system_and_the_switch(page: tuple[Browser, Any])
 
 
 def point(tab: Browser, x: float, y: float, kind: str = "mousePressed", **more: Any) -> None:
-    """An event of the mouse at a place of the stage, in shares of it."""
+    """Send an event of the mouse at a place of the stage, in shares of it."""
     box = tab.box("stage")
     place = {"x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"]}
     tab.call("Input.dispatchMouseEvent", type=kind, **place, **more)
@@ -428,7 +447,7 @@ def test_fingers_zoom_stills(page: tuple[Browser, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_moving_framing_and_turning_about_a_point(page: tuple[Browser, Any]) -> None:
+def test_keys_and_clicks_move_frame_and_turn_the_camera(page: tuple[Browser, Any]) -> None:
     tab, _ = refreshed(page)
     tab.run("delete solid.request; set('mode', 'blink'); choose(2); set('left', 2); set('solid', '1')")
     tab.wait(SETTLED)
@@ -464,11 +483,15 @@ def test_moving_framing_and_turning_about_a_point(page: tuple[Browser, Any]) -> 
     assert within > 0.8 * total
 
 
-def test_nothing_is_fetched_and_nothing_complains(page: tuple[Browser, Any]) -> None:
-    """After all that the others did."""
+def test_page_fetches_nothing(page: tuple[Browser, Any]) -> None:
+    """After all that the others did, as below."""
     tab, _ = refreshed(page)
     assert [url[:60] for url in tab.requests() if not url.startswith(("file:", "data:", "blob:"))] == []
     assert [url for url in tab.requests() if url.startswith("file:")][1:] == []
+
+
+def test_page_makes_the_browser_complain_of_nothing(page: tuple[Browser, Any]) -> None:
+    tab, _ = refreshed(page)
     assert [one for one in tab.complaints() if '"level": "warning"' not in one] == []  # of the driver, about its speed
     assert [event for event in tab.events if event.get("method") == "Runtime.consoleAPICalled"] == []
     assert tab.run("document.querySelectorAll('b b, select b').length") == 0

@@ -23,7 +23,7 @@ Run = Callable[..., Any]
 QUICK = ("--set", "superpixels=40", "--fit", "none", "--set", "checkpoint=none")
 
 
-def test_the_views_are_written_and_named(smallest_copy: Path, run: Run) -> None:
+def test_compact_writes_the_input_views_beside_its_result(smallest_copy: Path, run: Run) -> None:
     done = run("compact", smallest_copy, "-o", smallest_copy / "small.ply", *QUICK, code=0)
     assert done.out.splitlines()[-1].endswith("small.cameras.json")
     scene = gsmerge.read_scene(smallest_copy)
@@ -35,7 +35,7 @@ def test_the_views_are_written_and_named(smallest_copy: Path, run: Run) -> None:
     np.testing.assert_allclose(back.viewmats, scene.cameras.viewmats, atol=1e-9)
 
 
-def test_they_have_a_principal_point_that_is_not_in_the_middle(smallest_copy: Path) -> None:
+def test_viewer_cameras_keep_a_principal_point_off_the_middle(smallest_copy: Path) -> None:
     cameras = gsmerge.read_scene(smallest_copy).cameras
     Ks = cameras.Ks.copy()
     Ks[1, :2, 2] += (3.25, -2.5)
@@ -45,7 +45,7 @@ def test_they_have_a_principal_point_that_is_not_in_the_middle(smallest_copy: Pa
     np.testing.assert_allclose(gsmerge.read_cameras(smallest_copy / "a.json").Ks, Ks, atol=1e-6)
 
 
-def test_they_are_in_the_frame_of_the_gaussians(smallest_copy: Path, run: Run) -> None:
+def test_viewer_cameras_are_in_the_frame_of_the_gaussians(smallest_copy: Path, run: Run) -> None:
     path = smallest_copy / "transforms.json"
     with edited_json(path) as content:
         for frame in content["frames"]:
@@ -57,7 +57,7 @@ def test_they_are_in_the_frame_of_the_gaussians(smallest_copy: Path, run: Run) -
     assert np.abs(back.viewmats[:, :3, 3]).max() < 0.5 * np.abs(gsmerge.read_cameras(path).viewmats[:, :3, 3]).max()
 
 
-def test_none_are_written_unless_there_are_any(smallest_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_no_viewer_cameras_are_written_where_unwanted_or_unknown(smallest_copy: Path, run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     done = run("compact", smallest_copy, "-o", out / "a.ply", "--set", "viewer_cameras=false", *QUICK, "--json", code=0)
@@ -68,7 +68,7 @@ def test_none_are_written_unless_there_are_any(smallest_copy: Path, run: Run, tm
     assert sorted(path.name for path in out.iterdir()) == ["a.ply", "b.ply", "scene.ply"]
 
 
-def test_a_second_format_shares_them(smallest_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_result_in_a_second_format_shares_the_cameras(smallest_copy: Path, run: Run, tmp_path: Path) -> None:
     """They are there, with the same content; those of other views are no result's own."""
     out = tmp_path / "out"
     out.mkdir()
@@ -109,7 +109,7 @@ def test_conversions_beside_a_result_share_its_cameras(smallest_copy: Path, run:
 @pytest.mark.parametrize(
     ("output", "expected"), [("small.compressed", "small"), ("a/x.compact", "a/x.compact"), ("a" * 251, "a" * 242)]
 )
-def test_their_name_is_made_of_the_result_s(output: str, expected: str) -> None:
+def test_file_of_viewer_cameras_is_named_after_the_result(output: str, expected: str) -> None:
     assert viewer_cameras_path(Path(f"{output}.ply")) == Path(f"{expected}.cameras.json")
 
 

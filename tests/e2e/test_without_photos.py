@@ -1,4 +1,4 @@
-"""Scenes with cameras and without photos: the rows' own colours stand in, which every command says."""
+"""Scenes without photos are compacted by the rows' own colours, which every command says."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CLOSE = 0.3  # dB between a result fitted to photos and one fitted to colours th
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene without its photos. Read only."""
+    """Return a scene without its photos. Read only."""
     folder = write_smallest(tmp_path_factory.mktemp("bare") / "scene")
     shutil.rmtree(folder / "images")
     return folder
@@ -43,7 +43,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("--set", "method=unmerged-fit"), ("--levels", 2),
     ],
     ids=lambda options: " ".join(map(str, options)), often=3)  # fmt: skip
-def test_every_setting_works(options: tuple[object, ...], bare: Path, tmp_path: Path, run: Run) -> None:
+def test_every_setting_works_without_photos(options: tuple[object, ...], bare: Path, tmp_path: Path, run: Run) -> None:
     sizes = QUICK if options[0] not in ("--effort", "--budget") else QUICK[2:]
     said = run("compact", bare, "-o", tmp_path / "small.ply", *sizes, *options, "--json", code=0)
     document = json.loads(said.out)
@@ -55,7 +55,7 @@ def test_every_setting_works(options: tuple[object, ...], bare: Path, tmp_path: 
 
 @pytest.mark.slow
 @sweep("effort", ["draft", "fast"])
-def test_as_good_as_with_photos(effort: str, small_scene: Path, tmp_path: Path) -> None:
+def test_result_without_photos_is_as_good_as_with_them(effort: str, small_scene: Path, tmp_path: Path) -> None:
     """Judged by photos that neither has seen, over five seeds, between which results so small differ by 0.5 dB."""
     scene, differences = gsmerge.read_scene(small_scene), []
     for seed in range(5):
@@ -68,7 +68,7 @@ def test_as_good_as_with_photos(effort: str, small_scene: Path, tmp_path: Path) 
     assert sum(differences) / 5 > -CLOSE
 
 
-def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_path: Path, run: Run) -> None:
+def test_summary_says_what_the_result_is_measured_against(bare: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "small.ply"
     psnr = json.loads(run("compact", bare, "-o", out, *QUICK, "--json", code=0).out)["psnr_input_views"]
     said = run("compact", bare, "-o", out, *QUICK, "--overwrite", code=0)

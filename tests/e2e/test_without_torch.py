@@ -1,4 +1,4 @@
-"""Where torch is not installed: what runs all the same, and what says how to install it."""
+"""Without torch most commands run all the same, and the others say how to install it."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def make_work(folder: Path) -> None:
 
 @pytest.fixture
 def call(tmp_path: Path) -> Call:
-    """``call("-m", "gsmerge", ...)`` runs Python in a copy of that folder, as if there were no torch.
+    """Return ``call("-m", "gsmerge", ...)``, which runs Python in a copy of that folder, as if there were no torch.
 
     Nor is there in the processes that it starts.
     """
@@ -78,7 +78,7 @@ def call(tmp_path: Path) -> Call:
 
 
 def write_lpips_weights(folder: Path) -> None:
-    """Weights of no meaning, where the package of them would be."""
+    """Write weights of no meaning where the package of them would be."""
     rng, inputs = np.random.default_rng(0), 3
     trunk, tree = {}, {}
     for i, conv in enumerate(lpips._ARCHITECTURES["alex"].convs):
@@ -94,9 +94,7 @@ def write_lpips_weights(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_networks_and_lpips_need_no_torch_and_what_does_says_how_to_install_it(
-    call: Call, tmp_path: Path, torch: Any
-) -> None:
+def test_commands_without_torch_run_or_say_how_to_install_it(call: Call, tmp_path: Path, torch: Any) -> None:
     """In one process, which takes a second to start."""
     write_lpips_weights(tmp_path / "start")
     done = call("-c", EACH, json.dumps(COMMANDS))
@@ -112,7 +110,7 @@ def test_networks_and_lpips_need_no_torch_and_what_does_says_how_to_install_it(
 
 
 @pytest.mark.slow
-def test_other_commands_need_no_torch(call: Call, tmp_path: Path) -> None:
+def test_commands_other_than_training_need_no_torch(call: Call, tmp_path: Path) -> None:
     done = call("-c", EACH, json.dumps(OTHERS))
     assert done.returncode == 0, done.stderr
     for words, (code, _, said) in zip(OTHERS, json.loads(done.stdout), strict=True):
@@ -121,7 +119,7 @@ def test_other_commands_need_no_torch(call: Call, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_tensors_say_how_to_install_it(call: Call) -> None:
+def test_tensors_without_torch_say_how_to_install_it(call: Call) -> None:
     """The error is the library's own, so a caller that catches these reads one line."""
     code = """import gsmerge
 try:

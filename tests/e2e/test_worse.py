@@ -1,4 +1,4 @@
-"""Results that show the scene's own photos worse than the input: never without a word about it."""
+"""Results that show the scene's own photos worse than the input are never written without a word about it."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ SAID = "worse"
 
 @pytest.fixture(scope="module")
 def one_photo(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """The second of three views alone."""
+    """Return the second of three views alone."""
     folder = write_scene(tmp_path_factory.mktemp("three") / "scene", num_views=3, width=60, height=40)
     return subset(gsmerge.read_scene(folder), [1])
 
 
 @pytest.mark.slow
 @sweep("effort", ["draft", "fast"])
-def test_without_photos_and_a_fit_networks_keep_what_the_views_show(made_scene: Path, effort: str) -> None:
+def test_networks_keep_what_the_views_show_without_photos_or_fit(made_scene: Path, effort: str) -> None:
     """Judged by the photos that the run did not get."""
     scene = gsmerge.read_scene(made_scene)
     bare = replace(scene, images=None, large_photos=None)
@@ -65,16 +65,14 @@ def test_one_photo_without_a_long_fit_gets_more_gaussians(one_photo: Scene, sett
     assert actual.report.psnr_after > fewer.report.psnr_after
 
 
-def test_a_long_fit_a_number_that_is_asked_for_and_several_cameras_change_no_k(
-    one_photo: Scene, smallest_scene: Path
-) -> None:
+def test_k_stays_1_with_a_long_fit_a_count_or_several_cameras(one_photo: Scene, smallest_scene: Path) -> None:
     asked = ({"fit_steps": 100}, {"effort": "fast", "budget": 200}, {"fit": "none", "superpixels": 100})
     cases = [*((one_photo, settings) for settings in asked), (gsmerge.read_scene(smallest_scene), {"fit": "none"})]
     for scene, settings in cases:
         assert gsmerge.compact(scene, threads=1, **settings).report.options["k"] == 1
 
 
-def test_a_worse_result_is_named(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_summary_names_a_worse_result(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "few.ply"
     said = run("compact", smallest_scene, "-o", out, *FEW, code=0)
     document = json.loads(run("compact", smallest_scene, "-o", out, *FEW, "--overwrite", "--json", code=0).out)
@@ -88,7 +86,7 @@ def test_a_worse_result_is_named(smallest_scene: Path, tmp_path: Path, run: Run)
         assert run("compact", smallest_scene, "-o", out, *FEW, "--overwrite", option, code=0).err == ""
 
 
-def test_strict_ends_with_code_4_and_writes_the_result(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_strict_ends_with_code_4_and_keeps_a_worse_result(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "few.ply"
     said = run("compact", smallest_scene, "-o", out, *FEW, "--strict", code=4)
     assert said.err.count(SAID) == 1
@@ -98,7 +96,7 @@ def test_strict_ends_with_code_4_and_writes_the_result(smallest_scene: Path, tmp
 
 
 @pytest.mark.slow
-def test_levels_are_compared_as_well(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_worse_level_is_named(small_scene: Path, tmp_path: Path, run: Run) -> None:
     usual = ("--set", "fit_steps=60", "--threads", 1, "--budget", 120, "--levels", 3, "--json")
     said = run("compact", small_scene, "-o", tmp_path / "x.ply", *usual, code=0)
     document = json.loads(said.out)
@@ -108,7 +106,7 @@ def test_levels_are_compared_as_well(small_scene: Path, tmp_path: Path, run: Run
     assert any(document["worse"] in level["notes"] for level in document["levels"])
 
 
-def test_what_is_left_out_on_purpose_is_no_loss(smallest_scene: Path) -> None:
+def test_cropped_result_is_not_called_worse(smallest_scene: Path) -> None:
     """Scores are of what a crop leaves, so a result is as good as without one."""
     scene = gsmerge.read_scene(smallest_scene)
     x, y, z = scene.gaussians.means[len(scene.gaussians) // 2]
@@ -136,7 +134,7 @@ def test_a_batch_names_worse_results(
 
 
 @pytest.mark.slow
-def test_pages_and_documents_of_comparisons_name_worse_results(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_evaluate_and_view_name_a_worse_result(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     small = tmp_path / "few.ply"
     run("compact", smallest_scene, "-o", small, *FEW, "-q", code=0)
     report = tmp_path / "report.json"

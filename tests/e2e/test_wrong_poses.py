@@ -1,4 +1,4 @@
-"""Scenes whose cameras are wrong, as users meet them: moved with a note, written on request, or refused."""
+"""Scenes whose cameras are wrong are moved with a note, written on request, or refused."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ FAST = ("--effort", "fast", "--set", "fit_steps=20", "--json")
 
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Large enough that what cameras are turned by is more than a pixel and a half. Read only."""
+    """Return a scene in which what cameras are turned by is more than a pixel and a half. Read only."""
     return write_scene(tmp_path_factory.mktemp("poses") / "scene", num_views=3, width=108, height=72)
 
 
 def turn_cameras(folder: Path, degrees: float, only: int | None = None) -> None:
-    """The cameras of a scene, or one of them, turned about their centres."""
+    """Turn the cameras of a scene, or one of them, about their centres."""
     path, rng = folder / "transforms.json", np.random.default_rng(0)
     with edited_json(path) as data:
         for i, frame in enumerate(data["frames"]):
@@ -44,7 +44,7 @@ def turn_cameras(folder: Path, degrees: float, only: int | None = None) -> None:
                 frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
 
 
-def test_cameras_that_are_a_little_off_are_moved_and_written(exact: Path, tmp_path: Path, run: Run) -> None:
+def test_slightly_wrong_cameras_are_moved_and_written(exact: Path, tmp_path: Path, run: Run) -> None:
     """Two scenes are compacted and scored at the size at which poses can be told."""
     wrong = Path(shutil.copytree(exact, tmp_path / "wrong"))
     turn_cameras(wrong, 0.8)
@@ -65,7 +65,7 @@ def test_cameras_that_are_a_little_off_are_moved_and_written(exact: Path, tmp_pa
     assert load_scene(wrong).moves == ()
 
 
-def test_results_are_measured_from_where_they_were_made(exact: Path, tmp_path: Path, run: Run) -> None:
+def test_result_is_measured_from_the_cameras_that_compact_moved(exact: Path, tmp_path: Path, run: Run) -> None:
     """Views that do not agree with each other: ``compact`` moves them, and writes the cameras beside the result."""
     scene = load_scene(exact).scene
     wrong = motions.disagreeing(scene, 0.8, 0.01)

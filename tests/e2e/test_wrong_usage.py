@@ -1,4 +1,4 @@
-"""Every kind of wrong usage of every command: its exit code, one clear line, nothing written."""
+"""Wrong usage of every command ends in its exit code and one clear line, with nothing written."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ NEED_THE_SCENE = {  # to be known as wrong: refused by the plan, all others befo
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that the calls are run in. Read only."""
+    """Return the folder that the calls are run in. Read only."""
     folder = tmp_path_factory.mktemp("prepared") / "work"
     room = write_small(folder / "room")
     write_without_grid(room / "scene.ply", folder / "alone.ply")
@@ -210,7 +210,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("words", [*USAGE, *PLACES])
-def test_wrong_usage_is_one_line_and_writes_nothing(
+def test_wrong_usage_is_refused_in_one_line_before_the_work(
     words: str, prepared: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def work(*_: object, **__: object) -> None:
@@ -229,7 +229,7 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     assert listing(prepared) == before
 
 
-def test_a_tilde_is_the_home_folder_wherever_a_path_begins(
+def test_tilde_is_the_home_folder_wherever_a_path_begins(
     smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(smallest_copy.parent))
@@ -240,20 +240,22 @@ def test_a_tilde_is_the_home_folder_wherever_a_path_begins(
         assert document["output"]["path"] == str(smallest_copy.parent / "x.ply")
 
 
-def test_help_is_a_word_too(run: Run) -> None:
+def test_help_as_a_word_prints_what_the_option_prints(run: Run) -> None:
     assert run("help", code=0).out == run("--help", code=0).out == run(code=0).out
     assert run("help", "convert", code=0).out == run("convert", "--help", code=0).out
 
 
 def commands(command: Any, *words: str) -> Iterator[tuple[list[str], Any]]:
-    """Each command with the words that call it, its arguments among them."""
+    """Return each command with the words that call it, its arguments among them."""
     needed = [f"{param.name}.ply" for param in command.params if param.param_type_name == "argument" and param.required]
     yield [*words, *needed], command
     for word, inner in getattr(command, "commands", {}).items():
         yield from commands(inner, *words, word)
 
 
-def test_half_typed_options_of_every_command(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_half_typed_option_is_refused_by_every_command(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No value, an empty or another option's, a switch with a value, another last letter."""
     made = app.make_command()
     monkeypatch.setattr(app, "make_command", lambda only=None: made)
@@ -272,6 +274,6 @@ def test_half_typed_options_of_every_command(run: Run, tmp_path: Path, monkeypat
     assert not any(tmp_path.iterdir())
 
 
-def test_what_fails_while_an_error_is_explained(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failure_while_an_error_is_explained_is_one_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(app, "usage_message", lambda *_: {}["lost"])
     assert_refused(run("compact", "--k"), 1, "", "unexpected error: KeyError: 'lost'; run again with --debug")

@@ -1,4 +1,4 @@
-"""Files of Gaussians beside which nothing lies, and whose rows are no grid."""
+"""These files of Gaussians have nothing beside them, and their rows are no grid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Batches for tests: tiny scenes, and options under which each takes a fraction of a second."""
+"""Batches for tests are of tiny scenes, under options with which each takes a fraction of a second."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ QUICK = BatchOptions(CompactOptions().with_settings({"effort": "draft", "fit": "
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
-    """All records of an output folder; every line must be whole."""
+    """Return all records of an output folder; every line must be whole."""
     return [json.loads(line) for line in (folder / RECORDS).read_text().splitlines()]
 
 
@@ -38,20 +38,20 @@ def statuses(folder: Path) -> dict[str, list[str]]:
 
 
 def results(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file but the records, a lock's and cameras of results: whatever is left half-done shows."""
+    """Return hashes of every file but the records, a lock's and cameras of results: what is half-done shows."""
     files = [path for path in folder.rglob("*") if path.is_file() and path.name not in (RECORDS, ".gsmerge-lock")]
     files = [path for path in files if path.name.startswith(".") or not path.name.endswith(".cameras.json")]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def start(*arguments: object) -> subprocess.Popen[str]:
-    """``gsmerge batch ...`` in a process of its own."""
+    """Start ``gsmerge batch ...`` in a process of its own."""
     command = [sys.executable, "-m", "gsmerge", "batch", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def finish(*arguments: object) -> int:
-    """Exit code of ``gsmerge batch ...``."""
+    """Return the exit code of ``gsmerge batch ...``."""
     process = start(*arguments)
     process.communicate()
     return process.returncode
@@ -69,7 +69,7 @@ def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
 
 
 def holders(folder: Path) -> list[int]:
-    """Processes that have begun to make results."""
+    """Return processes that have begun to make results."""
     texts = [path.read_text() for path in folder.glob(".batch-*.begun")]
     return [int(text) for text in texts if text.endswith("\n")]
 

@@ -1,4 +1,4 @@
-"""A headless Chromium driven over its debugging pipe: no port, no network, nothing left behind."""
+"""This drives a headless Chromium over its debugging pipe: no port, no network, nothing left behind."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NO_BROWSER = "no Chromium on the PATH"
 
 
 def needs_browser(executable: str | None = CHROMIUM) -> pytest.MarkDecorator:
-    """A mark that skips tests without a browser, which the end of the run says; in CI that is an error."""
+    """Return a mark that skips tests without a browser, which the end of the run says; in CI that is an error."""
     if executable is None and os.environ.get("CI"):
         raise RuntimeError(f"{NO_BROWSER}: .ci/chromium installs it")
     return pytest.mark.skipif(executable is None, reason=NO_BROWSER)
@@ -77,13 +77,13 @@ class Browser:
         self.wait(f"document.readyState === 'complete' && location.href === {json.dumps(url)}")
 
     def run(self, script: str) -> Any:
-        """The value of an expression in the page, or of its promise."""
+        """Return the value of an expression in the page, or of its promise."""
         answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
     def wait(self, condition: str) -> None:
-        """Until an expression in the page is true: 3D takes a while on a processor that other tests use as well."""
+        """Wait until an expression in the page is true: 3D takes a while on a processor that other tests use."""
         end = time.monotonic() + 2 * PATIENCE
         while not self.run(condition):
             assert time.monotonic() < end, f"{condition}: {self.run('document.body.innerText')[:500]}"
@@ -95,7 +95,7 @@ class Browser:
         return box
 
     def screenshot(self, x: float, y: float, width: float, height: float) -> np.ndarray:
-        """``[h,w,3]`` what a part of the page shows, in [0, 1]."""
+        """Return what a part of the page shows ``[h,w,3]``, in [0, 1]."""
         clip = {"x": x, "y": y, "width": width, "height": height, "scale": 1}
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png", clip=clip)["data"])
         return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], np.float32) / 255
@@ -106,19 +106,19 @@ class Browser:
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, modifiers=8 * shift)
 
     def requests(self) -> list[str]:
-        """Addresses that the page asked for."""
+        """Return addresses that the page asked for."""
         sent = [event["params"] for event in self.events if event.get("method") == "Network.requestWillBeSent"]
         return [params["request"]["url"] for params in sent]
 
     def complaints(self) -> list[str]:
-        """Errors that the page's scripts or the browser reported."""
+        """Return errors that the page's scripts or the browser reported."""
         kinds = ("Runtime.exceptionThrown", "Log.entryAdded")
         return [json.dumps(event["params"]) for event in self.events if event.get("method") in kinds]
 
 
 @contextmanager
 def browser(executable: str | None, profile: Path, *flags: str) -> Iterator[Browser]:
-    """A browser with a profile and further flags of its own, ended with the block."""
+    """Yield a browser with a profile and further flags of its own, ended with the block."""
     assert executable is not None
     to_browser, from_browser = os.pipe(), os.pipe()
 

@@ -1,4 +1,4 @@
-"""A folder of ``gsmerge lab chart``, drawn once in a run, since drawing takes seconds."""
+"""A folder of ``gsmerge lab chart`` is drawn once in a run, since drawing takes seconds."""
 
 from __future__ import annotations
 

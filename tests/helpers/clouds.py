@@ -1,4 +1,4 @@
-"""Gaussians without a scene."""
+"""These Gaussians belong to no scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsmerge.geometry.transforms import normalize
 
 
 def some(count: int, seed: int = 0, degree: int = 1) -> Gaussians:
-    """Random ones about the origin, of any shape, opacity and colour."""
+    """Return random Gaussians about the origin, of any shape, opacity and colour."""
     rng = np.random.default_rng(seed)
     columns = (
         rng.normal(size=(count, 3)),

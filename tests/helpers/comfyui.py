@@ -1,4 +1,4 @@
-"""What the nodes of ``examples/comfyui`` use of ComfyUI 0.27, as modules that stand in for it."""
+"""These modules stand in for what the nodes of ``examples/comfyui`` use of ComfyUI 0.27."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def schema(
     *, node_id: str, display_name: str, category: str, description: str, inputs: list[Any], outputs: list[Any],
     search_aliases: tuple[str, ...] | list[str] = (), is_input_list: bool = False, is_output_node: bool = False,
 ) -> SimpleNamespace:  # fmt: skip
-    """ComfyUI's ``IO.Schema``, with the arguments that the nodes use."""
+    """Return ComfyUI's ``IO.Schema``, with the arguments that the nodes use."""
     return SimpleNamespace(**locals())
 
 

@@ -1,4 +1,4 @@
-"""Nine results of a scene of exact numbers, the same on every machine: ``python tests/helpers/exact_results.py``.
+"""``python tests/helpers/exact_results.py`` makes nine results of exact numbers, the same on every machine.
 
 It prints their hashes as JSON, and one of all. Another processor than this one, or an emulated one, runs it with the
 package and the native library for it.

@@ -1,4 +1,4 @@
-"""Records of made-up experiments."""
+"""These records are of made-up experiments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LN2 = elementary.log(2)
 
 
 def make_record(scene: str, method: str, settings: dict[str, Any] | None = None) -> RunRecord:
-    """A run whose numbers follow from its settings: PSNR rises by 0.5 dB with each doubling of the budget."""
+    """Make a run whose numbers follow from its settings: PSNR rises by 0.5 dB with each doubling of the budget."""
     settings = settings or {}
     ratio = float(settings["budget"].rstrip("%")) / 100 if "budget" in settings else 1.0 if method == "input" else 0.044
     quality = GAINS[method] + LEVELS[scene] + 0.5 * elementary.log(ratio / 0.044) / LN2 * (method != "input")
@@ -32,7 +32,7 @@ def make_record(scene: str, method: str, settings: dict[str, Any] | None = None)
 
 
 def make_grid(budgets: tuple[str, ...] = ("1%", "4.4%", "20%")) -> list[RunRecord]:
-    """Three scenes, the input, ours with and without a fit, and two baselines."""
+    """Make runs of three scenes: the input, ours with and without a fit, and two baselines."""
     records = []
     for scene in SCENES:
         records.append(make_record(scene, "input"))

@@ -1,4 +1,4 @@
-"""Exports of made scenes: rows of a file as exporters write them, before any reader has touched them."""
+"""Exports of made scenes have rows as exporters write them, before any reader has touched them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Smooth(Tiny):
 
 
 def smooth_scene(width: int, height: int, K: np.ndarray | None = None) -> Smooth:
-    """Three views of a smooth surface with smooth colours, jitter a quarter of a pixel; K None: oblong pixels."""
+    """Return three views of a smooth, coloured surface, jitter a quarter of a pixel; K None: oblong pixels."""
     tiny, rng = make_tiny(width, height), np.random.default_rng(5)
     K = tiny.K if K is None else K
     y, x = np.mgrid[:height, :width]
@@ -53,7 +53,7 @@ def smooth_scene(width: int, height: int, K: np.ndarray | None = None) -> Smooth
 
 
 def with_intrinsics(tiny: Smooth, K: np.ndarray) -> Smooth:
-    """The same pixels and depths, seen through another lens."""
+    """Return the same pixels and depths, seen through another lens."""
     means = []
     for pose, points in zip(tiny.c2w, tiny.gaussians.means.astype(np.float64).reshape(3, -1, 3), strict=True):
         camera = matmul((points - pose[:3, 3]), pose[:3, :3])
@@ -73,7 +73,7 @@ def depth_map_mask(depth: np.ndarray) -> np.ndarray:
 
 
 def export_rows(tiny: Tiny, index: np.ndarray | None = None, rest: int = 0, normals: str = "f4") -> np.ndarray:
-    """The scene's Gaussians, those of ``index`` in its order, as the 17 columns of nearly all exporters."""
+    """Return the scene's Gaussians, those of ``index`` in its order, as the 17 columns of nearly all exporters."""
     g = tiny.gaussians if index is None else tiny.gaussians[np.ascontiguousarray(index)]
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest)),
              "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]  # fmt: skip
@@ -90,7 +90,7 @@ def export_rows(tiny: Tiny, index: np.ndarray | None = None, rest: int = 0, norm
 
 
 def turned(rows: np.ndarray, turn: np.ndarray, *, scale: float = 1.0, shift: np.ndarray | None = None) -> np.ndarray:
-    """The rows in another world: ``scale * turn @ x + shift``."""
+    """Return the rows in another world: ``scale * turn @ x + shift``."""
     out = rows.copy()
     means = matmul(scale * np.stack([rows[c] for c in "xyz"], 1), turn.T) + (0 if shift is None else shift)
     for i, name in enumerate("xyz"):
@@ -104,7 +104,7 @@ def turned(rows: np.ndarray, turn: np.ndarray, *, scale: float = 1.0, shift: np.
 
 
 def with_surface_rotations(tiny: Tiny) -> Tiny:
-    """Discs that lie in the surface."""
+    """Return discs that lie in the surface."""
     h, w = tiny.height, tiny.width
     grid = tiny.gaussians.means.astype(np.float64).reshape(-1, h, w, 3)
     across, down = np.gradient(grid, axis=2), np.gradient(grid, axis=1)
@@ -131,13 +131,13 @@ def save_export(folder: Path, tiny: Tiny, rows: np.ndarray, *, cameras: bool = T
 
 
 def home(scene: Scene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
-    """Share of the stored (or of the kept) pixels whose Gaussian is the one made for them, known by its opacity."""
+    """Return the share of the stored (or kept) pixels whose Gaussian was made for them, known by its opacity."""
     same = np.abs(of_pixels(scene, "opacities") - tiny.gaussians.opacities) < 1e-5
     return float(same[scene.pixels.shown.reshape(-1) if kept is None else kept].mean())
 
 
 def of_pixels(scene: Scene, name: str) -> np.ndarray:
-    """A column of the Gaussian in front of each pixel, over all views; 0 where there is none."""
+    """Return a column of the Gaussian in front of each pixel, over all views; 0 where there is none."""
     assert scene.pixels is not None
     values = getattr(scene.gaussians, name)[scene.pixels.fronts.reshape(-1)].copy()
     values[~scene.pixels.shown.reshape(-1)] = 0
@@ -145,6 +145,6 @@ def of_pixels(scene: Scene, name: str) -> np.ndarray:
 
 
 def da3_rows(tiny: Smooth, depths: np.ndarray | None = None) -> np.ndarray:
-    """Rows of the pixels that Depth Anything 3 keeps, by these or the scene's own depth maps."""
+    """Return rows of the pixels that Depth Anything 3 keeps, by these or the scene's own depth maps."""
     maps = tiny.depths if depths is None else depths
     return np.concatenate([np.flatnonzero(depth_map_mask(d)) + i * d.size for i, d in enumerate(maps)])

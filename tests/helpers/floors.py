@@ -1,4 +1,4 @@
-"""Least values of what depends on rounding: means over ten runs less three standard deviations.
+"""Floors are least values of what depends on rounding: means over ten runs less three standard deviations.
 
 Results are the same bytes on every processor, but any change of the code may round elsewhere, and a fit of hundreds of
 steps makes tenths of a dB of that. So a floor is no figure that somebody once saw, but one that ``python
@@ -27,7 +27,7 @@ LEAST_SD = 0.02  # what ten runs may not show of the spread; dB for most
 
 
 def nudged(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians, in runs that measure floors moved by a thousandth of their size."""
+    """Return the Gaussians, in runs that measure floors moved by a thousandth of their size."""
     seed = int(os.environ.get(NUDGE, "0"))
     if seed == 0:
         return gaussians

@@ -1,4 +1,4 @@
-"""Commands in processes of their own and in limits, forked from one process that has imported what they need."""
+"""Commands run in processes and limits of their own, forked from one that has imported what they need."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Outcome:
 
     @property
     def error(self) -> str:
-        """The lines on stderr, without those that decoders of pictures print themselves."""
+        """Return the lines on stderr, without those that decoders of pictures print themselves."""
         lines = self.err.splitlines(keepends=True)
         ours = "gsmerge: ", "note: ", "Traceback"
         return "".join(line for line in lines if line.startswith(ours) or "Warning: " in line)
@@ -61,7 +61,7 @@ def refused_by_inspect(refusal: Outcome, outcome: Outcome) -> None:
 
 
 def _memory() -> list[int]:
-    """Address space and resident memory of this process, bytes."""
+    """Return address space and resident memory of this process, bytes."""
     return [int(pages) * resource.getpagesize() for pages in Path("/proc/self/statm").read_text().split()[:2]]
 
 
@@ -113,7 +113,7 @@ class CommandServer:
             self._ask({"warm": [str(word) for word in words]})
 
     def run(self, words: Sequence[object], limits: Limits) -> Outcome:
-        """The outcome of a command."""
+        """Return the outcome of a command."""
         return Outcome(**self._ask({"words": [str(word) for word in words], "limits": asdict(limits)}))
 
     def __enter__(self) -> CommandServer:

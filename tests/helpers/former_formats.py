@@ -1,4 +1,4 @@
-"""Files that gsmerge reads and no longer writes: packed ``.ply`` of PlayCanvas, and ``.spz`` of version 4."""
+"""gsmerge reads these files and no longer writes them: packed ``.ply`` of PlayCanvas, ``.spz`` of version 4."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmerge.types import Gaussians
 
 
 def spz4_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
-    """A ``.spz`` of version 4: a header in the clear, a table of sizes, and a Zstandard stream for each column."""
+    """Return a ``.spz`` of version 4: a clear header, a table of sizes, and a Zstandard stream for each column."""
     import zstandard
 
     header, columns = spz_columns(gaussians, 4, mip=mip)
@@ -27,7 +27,7 @@ def spz4_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
 
 
 def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """A ``.compressed.ply``: four words for each Gaussian, between the ends of its 256 neighbours along a curve."""
+    """Return a ``.compressed.ply``: four words for a Gaussian, between the ends of 256 neighbours along a curve."""
     columns = arrays.to_columns(gaussians, 3).along_curve()
     count, num_rest = len(columns), 3 * columns.harmonics.shape[1]
     ranged = [_ranged(values) for values in (columns.means, columns.log_scales, columns.colors)]
@@ -49,7 +49,7 @@ def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> byte
 
 
 def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The float32 minima and maxima ``[c,3]`` of each chunk, and all values between 0 and 1."""
+    """Return the float32 minima and maxima ``[c,3]`` of each chunk, and all values between 0 and 1."""
     starts = np.arange(0, len(values), CHUNK)
     low, high = (end.reduceat(values, starts).astype(np.float32).astype(float) for end in (np.minimum, np.maximum))
     ids, span = np.arange(len(values)) // CHUNK, high - low
@@ -57,7 +57,7 @@ def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Words of numbers between 0 and 1; the first number is in the highest bits."""
+    """Return words of numbers between 0 and 1; the first number is in the highest bits."""
     words = np.zeros(len(shares), np.uint32)
     for column, width in zip(shares.T, bits, strict=True):
         top = 2**width - 1

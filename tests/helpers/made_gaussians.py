@@ -1,4 +1,4 @@
-"""Random Gaussians before a camera, as the tests of this folder draw them."""
+"""These functions draw random Gaussians before a camera for the tests of kernels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmerge.kernels import elementary
 def random_gaussians(
     n: int, seed: int, *, degree: int = 0, opacity: float = 0.5, size: float = -3.0, jitter: float = 0.9
 ) -> Gaussians:
-    """Around (0, 0, 3), of all sizes and flatnesses; one in twenty is behind the camera."""
+    """Draw Gaussians around (0, 0, 3), of all sizes and flatnesses; one in twenty is behind the camera."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(n, 3)) * [0.9, 0.8, 1.0] + [0.0, 0.0, 3.0]
     means[: n // 20, 2] -= 4

@@ -1,4 +1,4 @@
-"""What a message has to say wherever its wording is not the subject: the kind of error, its place and its value.
+"""A message has to say the kind of error, its place and its value wherever its wording is not the subject.
 
 A message begins with its place, such as ``k: expected 1 to 8, got 9`` and ``a/b.ply: no such file``; after it come the
 values, which are numbers, names and options, or one word that tells it from others of that place.
@@ -39,7 +39,7 @@ def says(text: str, place: object, *values: object) -> bool:
 
 @contextmanager
 def refuses(kind: type[BaseException], place: object, *values: object) -> Iterator[pytest.ExceptionInfo[Any]]:
-    """A block that ends in an error of a kind whose message is one line with a place and values, as :func:`says`."""
+    """Check that a block ends in an error of a kind, in one line with a place and values, as :func:`says`."""
     with pytest.raises(kind) as raised:
         yield raised
     text = str(raised.value)

@@ -1,4 +1,4 @@
-"""Made scenes as some forty models and programs leave them, written from what their saving code does.
+"""Some forty models and programs leave made scenes, written here from what their saving code does.
 
 Each writer of ``MODELS`` takes a folder, and returns what a user would name, with the truth about it.
 """

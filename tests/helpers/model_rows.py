@@ -1,4 +1,4 @@
-"""Made scenes as rows of files: what programs keep of their pixels, in which order, world and encoding."""
+"""Programs keep rows of made scenes: of which pixels, in which order, world and encoding."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Saver:
 
 @cache
 def made(width: int = 48, height: int = 36, views: int = 3) -> Smooth:
-    """Views with the principal point in the middle and square pixels, discs in the surface, one in nine faint."""
+    """Make views of square pixels and a middle principal point, discs in the surface, one in nine faint."""
     focal = 1.1 * max(width, height)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return take_views(with_surface_rotations(replace(smooth_scene(width, height, K), names=NAMES)), views)

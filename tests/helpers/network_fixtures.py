@@ -1,4 +1,4 @@
-"""Networks with weights that do something, and Feature Gaussians of a made scene for them."""
+"""Networks have weights that do something, and a made scene has Feature Gaussians for them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LAST = ("out", "shift")  # layers that begin as zeros; that of latents does not
 
 
 def noisy(options: NetworkOptions = SMALL, scale: float = 0.3, seed: int = 0) -> NetworkWeights:
-    """Networks of random weights, with last layers of that deviation: before training they are zero."""
+    """Return networks of random weights, with last layers of that deviation: before training they are zero."""
     rng, arrays, inputs = np.random.default_rng(seed), dict[str, np.ndarray](), 1.0
     for name, shape in weight_shapes(options).items():
         layer, kind = name.split(".")[-2:]
@@ -38,17 +38,17 @@ def noisy(options: NetworkOptions = SMALL, scale: float = 0.3, seed: int = 0) ->
 
 
 def untrained(options: NetworkOptions | None = None) -> NetworkWeights:
-    """Networks that correct nothing, as before training."""
+    """Return networks that correct nothing, as before training."""
     return noisy(options or NetworkOptions(), 0.0)
 
 
 def scaled(networks: NetworkWeights, factor: float) -> NetworkWeights:
-    """The networks with every weight times a factor."""
+    """Return the networks with every weight times a factor."""
     return replace(networks, arrays={name: array * np.float32(factor) for name, array in networks.arrays.items()})
 
 
 def written(path: Path, networks: NetworkWeights) -> Path:
-    """A checkpoint of the networks."""
+    """Write a checkpoint of the networks, and return its path."""
     save_checkpoint(path, networks, {"steps": 0})
     return path
 
@@ -62,12 +62,12 @@ class Made:
     features: FeatureGaussians
 
     def networks(self, networks: NetworkWeights, seed: int = 0) -> NetworkContext:
-        """The networks for this scene."""
+        """Return the networks for this scene."""
         return NetworkContext(networks, self.members, self.scene.cameras, seed)
 
 
 def made(num_views: int = 2) -> Made:
-    """Groups of 1 to 40 members."""
+    """Make groups of 1 to 40 members."""
     scene = make_scene(room(), arc(num_views, 24, 18))
     members = scene_members(scene)
     sizes = [1, 2, 3, 5, 8, 9, 13, 17, 30, 40]

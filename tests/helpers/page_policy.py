@@ -1,4 +1,4 @@
-"""What a page lets a browser run."""
+"""A page's policy says what a browser may run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import re
 
 
 def check_policy(page: str) -> None:
-    """Its own scripts and styles alone, which the policy names by their hashes; no attribute holds any."""
+    """Check that its own scripts and styles alone run, named by hashes in the policy; no attribute holds any."""
     policy = html.unescape(re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)[0])
     rules = {words.split()[0]: words.split()[1:] for words in policy.split(";")}
     for kind in ("script", "style"):

@@ -1,4 +1,4 @@
-"""A camera file of each format with a declared layout: three views with the same poses and intrinsics."""
+"""Camera files of each format with a declared layout have three views of the same poses and intrinsics."""
 
 from __future__ import annotations
 

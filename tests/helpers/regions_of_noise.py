@@ -1,4 +1,4 @@
-"""The error that superpixels minimise, slowly, and what touches what."""
+"""These functions compute the error that superpixels minimise, slowly, and what touches what."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ SPREAD = np.float32(COMPACTNESS**0.5)
 
 
 def features(pixels: np.ndarray) -> np.ndarray:
-    """``[n,5]`` float64: colours and weighted positions."""
+    """Return ``[n,5]`` float64: colours and weighted positions."""
     y, x = np.mgrid[: pixels.shape[0], : pixels.shape[1]] * float(SPREAD)
     return np.concatenate([pixels.reshape(-1, 3).astype(np.float64), y.reshape(-1, 1), x.reshape(-1, 1)], 1)
 

@@ -1,4 +1,4 @@
-"""Cameras as ``transforms.json``."""
+"""These functions write cameras as ``transforms.json``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmerge.types import Cameras
 
 
 def transforms_document(cameras: Cameras, names: Sequence[str]) -> dict[str, Any]:
-    """Nerfstudio's ``transforms.json`` with all intrinsics."""
+    """Return Nerfstudio's ``transforms.json`` with all intrinsics."""
     frames = [
         {
             "file_path": name, "w": cameras.width, "h": cameras.height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]),

@@ -1,4 +1,4 @@
-"""Tiny synthetic scenes in memory, and what must hold of every compact scene.
+"""Tiny synthetic scenes are made in memory, and checks say what must hold of every compact scene.
 
 The maker is the product's own (:mod:`gsmerge.research.generate`): its rays, and its Gaussians with the errors set to
 zero. Surfaces here have colours that are functions of the place alone, so photos are exact, and every pixel gets one
@@ -47,7 +47,7 @@ class Surface:
 
 
 def waves(seed: int = 0, rate: float = 6.0) -> Texture:
-    """A smooth, colourful texture of world positions that does not repeat."""
+    """Return a smooth, colourful texture of world positions that does not repeat."""
     rng = np.random.default_rng(seed)
     turns, phases = rng.normal(size=(3, 4, 3)) * rate, rng.uniform(0, 6.28, (3, 4))
 
@@ -59,32 +59,32 @@ def waves(seed: int = 0, rate: float = 6.0) -> Texture:
 
 
 def flat(*rgb: float) -> Texture:
-    """One colour."""
+    """Return one colour."""
     return lambda points: np.broadcast_to(np.array(rgb), points.shape)
 
 
 def plane(depth: float, texture: Texture, *, left: float = -WIDE, right: float = WIDE) -> Surface:
-    """The plane z = depth between two x."""
+    """Return the plane z = depth between two x."""
     return Surface(shapes.quad(((left + right) / 2, 0, depth), ((right - left) / 2, WIDE), UNPAINTED), texture)
 
 
 def ball(centre: Sequence[float], radius: float, texture: Texture) -> Surface:
-    """A sphere."""
+    """Return a sphere."""
     return Surface(shapes.ball(centre, (radius, radius, radius), UNPAINTED), texture)
 
 
 def wall(seed: int = 0) -> list[Surface]:
-    """A textured wall."""
+    """Return a textured wall."""
     return [plane(3.0, waves(seed))]
 
 
 def two_planes() -> list[Surface]:
-    """Half of the view is nearer."""
+    """Return two planes, of which the one in half of the view is nearer."""
     return [plane(2.2, waves(1), right=0.0), plane(3.2, waves(2))]
 
 
 def pole(width: float = 0.13) -> list[Surface]:
-    """A thin white pole in front of a darker textured wall."""
+    """Return a thin white pole in front of a darker textured wall."""
     dim = waves(3)
     return [
         plane(2.0, flat(0.95, 0.95, 0.9), left=-width / 2, right=width / 2),
@@ -93,12 +93,12 @@ def pole(width: float = 0.13) -> list[Surface]:
 
 
 def room() -> list[Surface]:
-    """A ball in front of a wall."""
+    """Return a ball in front of a wall."""
     return [ball((0.2, 0.1, 2.6), 0.5, waves(5, 8.0)), plane(3.4, waves(4))]
 
 
 def arc(num_views: int, width: int = 48, height: int = 36, *, span: float = 0.8, start: float = -0.5) -> Cameras:
-    """Cameras side by side over ``span`` of x, looking at (0, 0, 3)."""
+    """Return cameras side by side over ``span`` of x, looking at (0, 0, 3)."""
     viewmats = []
     for view in range(num_views):
         x = span * (start + (view / (num_views - 1) if num_views > 1 else 0.5))
@@ -107,19 +107,19 @@ def arc(num_views: int, width: int = 48, height: int = 36, *, span: float = 0.8,
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """World to camera, OpenCV axes, y down."""
+    """Return world to camera, OpenCV axes, y down."""
     return invert(camera_to_world(eye, target))
 
 
 def intrinsics(num_views: int, width: int, height: int) -> np.ndarray:
-    """A lens whose focal length is the image's width."""
+    """Return a lens whose focal length is the image's width."""
     return np.stack([photograph.Pinhole(width, height, width).intrinsics] * num_views)
 
 
 def views_of(
     surfaces: Sequence[Surface], cameras: Cameras
 ) -> tuple[photograph.Pinhole, list[tuple[np.ndarray, photograph.Hits, np.ndarray]]]:
-    """The lens; for every view its camera to world, what its rays meet, and the colours ``[h,w,3]`` of that."""
+    """Return the lens; for every view its camera to world, what its rays meet, and the colours ``[h,w,3]`` of that."""
     lens = photograph.Pinhole(cameras.width, cameras.height, float(cameras.Ks[0, 0, 0]))
     assert np.allclose(cameras.Ks, lens.intrinsics)
     packed, actual = shapes.pack_shapes([surface.shape for surface in surfaces]), []
@@ -135,14 +135,14 @@ def views_of(
 
 
 def world_points(depth: np.ndarray, c2w: np.ndarray, lens: photograph.Pinhole) -> np.ndarray:
-    """World positions ``[h,w,3]`` of pixels' centres at depths ``[h,w]``."""
+    """Return world positions ``[h,w,3]`` of pixels' centres at depths ``[h,w]``."""
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     rays = matmul(np.stack([x, y, np.ones_like(x)], -1), invert(lens.intrinsics).T)  # of unit depth
     return c2w[:3, 3] + matmul(depth[..., None] * rays, c2w[:3, :3].T)
 
 
 def trace(surfaces: Sequence[Surface], cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """World positions ``[v,hw,3]``, depths ``[v,hw]`` and colours ``[v,hw,3]`` of every pixel's centre."""
+    """Return world positions ``[v,hw,3]``, depths ``[v,hw]`` and colours ``[v,hw,3]`` of every pixel's centre."""
     lens, actual = views_of(surfaces, cameras)
     points = np.stack([world_points(hits.depth, c2w, lens).reshape(-1, 3) for c2w, hits, _ in actual])
     return points, np.stack([h.depth.ravel() for _, h, _ in actual]), np.stack([c.reshape(-1, 3) for *_, c in actual])
@@ -158,7 +158,7 @@ def make_scene(
     degree: int = 0,
     photos: bool = True,
 ) -> Scene:
-    """One Gaussian per pixel on the surfaces.
+    """Make a scene with one Gaussian per pixel on the surfaces.
 
     Args:
         surfaces: What is seen.
@@ -191,24 +191,24 @@ def make_scene(
 
 
 def shown_in(scene: Scene, mask: np.ndarray) -> Scene:
-    """The scene with only the Gaussians of the pixels ``mask [v,h,w]``."""
+    """Return the scene with only the Gaussians of the pixels ``mask [v,h,w]``."""
     assert scene.pixels is not None
     return take_rows(scene, np.flatnonzero(mask.reshape(-1)[scene.pixels.homes]))
 
 
 def names(count: int) -> tuple[str, ...]:
-    """Names of views."""
+    """Return names of views."""
     return tuple(f"{view:03d}.png" for view in range(count))
 
 
 def take_views(scene: Scene, order: Sequence[int]) -> Scene:
-    """The scene's views in another order, repeated or left out."""
+    """Return the scene's views in another order, repeated or left out."""
     taken = subset(scene, order)
     return replace(taken, names=names(len(order)))
 
 
 def move_gaussians(gaussians: Gaussians, rotation: np.ndarray, factor: float, shift: np.ndarray) -> Gaussians:
-    """Gaussians after x -> factor · rotation x + shift, in float64; higher harmonics must be zero."""
+    """Move Gaussians by x -> factor · rotation x + shift, in float64; higher harmonics must be zero."""
     turns = matmul(rotation, quat_to_rotmat(gaussians.quats.astype(np.float64)))
     return replace(
         gaussians,
@@ -219,7 +219,7 @@ def move_gaussians(gaussians: Gaussians, rotation: np.ndarray, factor: float, sh
 
 
 def move(scene: Scene, rotation: np.ndarray, factor: float, shift: np.ndarray) -> Scene:
-    """The scene with its cameras after the same."""
+    """Move the scene with its cameras in the same way."""
     viewmats = scene.cameras.viewmats.copy()
     viewmats[:, :3, :3] = matmul(viewmats[:, :3, :3], rotation.T)
     viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], shift)
@@ -228,18 +228,18 @@ def move(scene: Scene, rotation: np.ndarray, factor: float, shift: np.ndarray) -
 
 
 def random_rotation(seed: int) -> np.ndarray:
-    """``[3,3]``."""
+    """Draw a rotation ``[3,3]``."""
     return objects.random_rotation(np.random.default_rng(seed))
 
 
 def images_of(gaussians: Gaussians, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Images ``[c,h,w,3]`` and alphas ``[c,h,w]`` over black, float64."""
+    """Return images ``[c,h,w,3]`` and alphas ``[c,h,w]`` over black, float64."""
     drawn = render(gaussians, cameras)
     return drawn.images.astype(np.float64), drawn.alphas[..., 0].astype(np.float64)
 
 
 def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
-    """All parameters off by some of what a fit may move them."""
+    """Move all parameters off by some of what a fit may move them."""
     rng = np.random.default_rng(seed)
 
     def noise(like: np.ndarray, sigma: float) -> np.ndarray:
@@ -258,7 +258,7 @@ def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
 
 @cache
 def self_made(degree: int, views: int = 3) -> tuple[Scene, Gaussians]:
-    """A scene whose photos show exactly these Gaussians."""
+    """Return a scene whose photos show exactly these Gaussians."""
     scene = make_scene(room(), arc(views, 48, 36), degree=degree)
     gaussians = plain(scene, superpixels="8%")
     gaussians = replace(gaussians, means=gaussians.means.astype(np.float32), scales=1.2 * gaussians.scales)
@@ -267,42 +267,35 @@ def self_made(degree: int, views: int = 3) -> tuple[Scene, Gaussians]:
 
 
 def pair_of(scene: Scene) -> tuple[Photos, Photos]:
-    """The photos at full and at half size, as the fit takes them."""
+    """Return the photos at full and at half size, as the fit takes them."""
     return scene_photos(scene), scene_photos(scene, 2)
 
 
 def tuned(options: FitOptions, **constants: float) -> FitOptions:
-    """The options with other constants of the fit."""
+    """Return the options with other constants of the fit."""
     return replace(options, tuning=replace(options.tuning, **constants))  # type: ignore[arg-type]
 
 
 def run_for(photos: tuple[Photos, ...], options: FitOptions, count: int = 0, **job: Any) -> FitRun:
-    """A fit to photos, prepared; ``job``: more of it."""
+    """Return a fit to photos, prepared; ``job``: more of it."""
     return prepare_fit(FitJob(photos, options, count, **job))
 
 
 def bare(gaussians: Gaussians) -> Scene:
-    """Gaussians without views."""
+    """Return Gaussians without views."""
     none = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 8, 8)
     return Scene(gaussians, none, None, None, ())
 
 
-def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
-    """Photos of noise: nothing that is learned of one patch holds in another."""
-    rng = np.random.default_rng(0)
-    made = [rng.choice([0.0, 1.0], p.images.shape).astype(np.float32) for p in photos]
-    return replace(photos[0], images=made[0]), replace(photos[1], images=made[1])
-
-
 def psnr_of(gaussians: Gaussians, scene: Scene) -> float:
-    """PSNR (dB) over all views of a scene with photos."""
+    """Return the PSNR (dB) over all views of a scene with photos."""
     assert scene.images is not None
     image = np.clip(images_of(gaussians, scene.cameras)[0], 0, 1)
     return float(-10 * elementary.log10(((image - scene.images.astype(np.float64)) ** 2).mean()))
 
 
 def compacted(scene: Scene, **settings: Any) -> CompactResult:
-    """``compact`` with the invariants checked; a tenth of the pixels unless told."""
+    """Call ``compact`` and check the invariants; a tenth of the pixels unless told."""
     if "superpixels" not in settings:
         settings = {"superpixels": "10%", **settings}
     result = compact(scene, **settings)
@@ -312,13 +305,13 @@ def compacted(scene: Scene, **settings: Any) -> CompactResult:
 
 
 def plain(scene: Scene, **settings: Any) -> Gaussians:
-    """The merge alone: no networks, no fit, cameras as they are."""
+    """Return the merge alone: no networks, no fit, cameras as they are."""
     alone = {"fit": "none", "checkpoint": "none", "poses": "fixed"}
     return compacted(scene, **{**alone, **settings}).gaussians
 
 
 def identical(a: Gaussians, b: Gaussians) -> bool:
-    """To the last bit."""
+    """Return whether Gaussians are the same to the last bit."""
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in FIELDS)
 
 
@@ -342,7 +335,7 @@ def assert_invariants(gaussians: Gaussians, scene: Scene) -> None:
 
 
 def assert_consistent(report: CompactReport, scene: Scene, gaussians: Gaussians) -> None:
-    """The report tells what the run did."""
+    """Check that the report tells what the run did."""
     assert (report.num_input, report.num_output) == (scene.num_gaussians, len(gaussians))
     unmeasured = (scene.images is None and not scene.has_own_pixels) or "nothing is scored" in (report.worse or "")
     assert (report.psnr_before is None) == (report.psnr_after is None) == unmeasured
@@ -351,7 +344,7 @@ def assert_consistent(report: CompactReport, scene: Scene, gaussians: Gaussians)
 
 
 def assert_same_set(one: Gaussians, other: Gaussians, *, atol: float, unit: float = 1.0) -> None:
-    """The same Gaussians in any order: each has a partner with all fields within ``atol``, lengths in ``unit``."""
+    """Check for the same Gaussians in any order: all fields of partners within ``atol``, lengths in ``unit``."""
     assert len(one) == len(other)
     a, b = (_rows(g, unit) for g in (one, other))
     nearest = np.array([np.abs(row - b).max(1).argmin() for row in a], int)
@@ -369,7 +362,7 @@ def _rows(gaussians: Gaussians, unit: float) -> np.ndarray:
 def make_features(
     means: Any, *, sizes: Any = 0.01, views: Any = None, colors: Any = 0.5, opacities: Any = 0.8, degree: int = 0
 ) -> FeatureGaussians:
-    """Ball-shaped Feature Gaussians of one member each (row i of the scene), one view each unless told.
+    """Make ball-shaped Feature Gaussians of one member each (row i of the scene), one view each unless told.
 
     Args:
         means: ``[g,3]``.

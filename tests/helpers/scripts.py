@@ -1,4 +1,4 @@
-"""Scripts of examples/ and benchmarks/ as modules."""
+"""Scripts of examples/ and benchmarks/ are loaded as modules."""
 
 from __future__ import annotations
 

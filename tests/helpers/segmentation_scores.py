@@ -1,4 +1,4 @@
-"""Photos that come with scikit-image and scikit-learn, and what superpixels of them are worth."""
+"""Photos that come with scikit-image and scikit-learn tell what superpixels of them are worth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DENSITIES = (5_000, 12_000, 23_000)
 
 
 def photos() -> dict[str, np.ndarray]:
-    """Six photos, ``[h,w,3]`` uint8, the longer side 476 pixels."""
+    """Return six photos, ``[h,w,3]`` uint8, the longer side 476 pixels."""
     import skimage.data  # here, since the two take seconds that each process of a run of tests would spend
     import sklearn.datasets
 
@@ -22,14 +22,14 @@ def photos() -> dict[str, np.ndarray]:
 
 
 def shrink(image: np.ndarray) -> np.ndarray:
-    """A photo whose longer side is 476 pixels."""
+    """Return a photo whose longer side is 476 pixels."""
     height, width, _ = image.shape
     scale = SIDE / max(height, width)
     return cv2.resize(image, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
 
 
 def count_at(image: np.ndarray, density: int) -> int:
-    """Superpixels of ``image`` at so many per 476 x 476 pixels."""
+    """Return the number of superpixels of ``image`` at so many per 476 x 476 pixels."""
     return round(density * image.shape[0] * image.shape[1] / SIDE**2)
 
 
@@ -42,7 +42,7 @@ def _psnr(image: np.ndarray, other: np.ndarray) -> float:
 
 
 def proxy_psnr(image: np.ndarray, labels: np.ndarray) -> float:
-    """PSNR of the picture in which every superpixel has its mean colour, dB.
+    """Return the PSNR of the picture in which every superpixel has its mean colour, dB.
 
     Args:
         image: ``[h,w,3]`` uint8.
@@ -55,7 +55,7 @@ def proxy_psnr(image: np.ndarray, labels: np.ndarray) -> float:
 
 
 def splat_psnr(image: np.ndarray, labels: np.ndarray) -> float:
-    """PSNR of the picture blended from one Gaussian per superpixel, dB: does its shape suit a Gaussian?
+    """Return the PSNR of the picture blended from one Gaussian per superpixel, dB: does its shape suit a Gaussian?
 
     Each Gaussian has the mean, the halved covariance (of the pixels' areas, hence + 1/12) and the mean colour of its
     superpixel; weights are normalised, and cut at three standard deviations.

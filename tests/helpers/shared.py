@@ -1,4 +1,4 @@
-"""Folders that are made once in a run, whichever process needs them first: scenes, and what commands make of them."""
+"""Folders of scenes and of what commands make of them are made once in a run, by the process that needs them first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files as SHARP saves them: one photo each, two layers of Gaussians on a square grid, the camera inside."""
+"""SHARP saves files of one photo each, two layers of Gaussians on a square grid, and the camera inside."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS = ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale
 
 
 def split_views(scene: Scene, scales: Sequence[float]) -> list[Scene]:
-    """Every view of an aligned scene as a scene of its own, in its camera's frame and a unit of its own."""
+    """Return every view of an aligned scene as a scene of its own, in its camera's frame and a unit of its own."""
     size, parts = scene.pixels_per_view, []
     for view, (scale, viewmat) in enumerate(zip(scales, scene.cameras.viewmats, strict=True)):
         g = scene.gaussians[view * size : (view + 1) * size]

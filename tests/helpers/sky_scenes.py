@@ -1,4 +1,4 @@
-"""A room under a painted sky."""
+"""This room is under a painted sky."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OVERCAST, CEILING = np.array([0.85, 0.86, 0.88]), np.array([0.85, 0.83, 0.78])
 
 
 def painted(top: np.ndarray, bottom: np.ndarray, depth: float = 1.0) -> tuple[Scene, np.ndarray]:
-    """A room whose upper part is painted over, from one colour to another, at so many times its depth; and where."""
+    """Paint over a room's upper part, from one colour to another, at so many times its depth; return where, too."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
     images, colors = scene.images.copy(), scene.gaussians.sh0.copy()
     shade = np.linspace(0, 1, HORIZON)[:, None, None]

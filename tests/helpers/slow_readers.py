@@ -1,4 +1,4 @@
-"""Slow, obvious readers of formats, and Gaussians to write: drawn at random, and with extreme values."""
+"""Slow, obvious readers check formats, and Gaussians to write are random or have extreme values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsmerge.types import SH_C0
 
 
 def drawn(scene: Scene, degree: int) -> Gaussians:
-    """Merged Gaussians with random rotations, sizes and harmonics."""
+    """Return merged Gaussians with random rotations, sizes and harmonics."""
     rng = np.random.default_rng(degree)
     g = scenes.plain(scene, superpixels="10%")
     quats = normalize(rng.normal(size=g.quats.shape).astype(np.float32))
@@ -79,7 +79,7 @@ def read_back(path: Path) -> Gaussians:
 
 
 def corners() -> Gaussians:
-    """Opacities of 0 and 1, scales of 0, colours beyond the range, one coordinate far away, a zero quaternion."""
+    """Return Gaussians of extreme values: opacities 0 and 1, scales 0, colours beyond the range, a zero quaternion."""
     return Gaussians(
         means=np.array([[0.0, 0, 0], [1e5, -3, 2], [-7, 1e-8, 0.5]], np.float32),
         quats=np.array([[0.0, 0, 0, 0], [-0.6, 0, 0.8, 0], [0, 0, 0, -1.0]], np.float32),

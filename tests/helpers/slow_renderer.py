@@ -1,4 +1,4 @@
-"""A slow renderer to check the fast one against: float64, one Gaussian after the other, over all pixels.
+"""A slow renderer checks the fast one: in float64, one Gaussian after the other, over all pixels.
 
 Written from the published formulas: EWA splatting (Zwicker et al. 2001), 3DGS (Kerbl et al. 2023) and gsplat's
 conventions. It knows no tiles, boxes or early exits, and torch can differentiate it: the second half makes gradients
@@ -32,7 +32,7 @@ class Reference:
 
 
 def harmonics(directions: Tensor) -> Tensor:
-    """``[n,25]`` real spherical harmonics of ``[n,3]`` unit vectors (Sloan 2013, appendix A2)."""
+    """Return ``[n,25]`` real spherical harmonics of ``[n,3]`` unit vectors (Sloan 2013, appendix A2)."""
     x, y, z = directions.unbind(-1)
     z2 = z * z
     c1, s1 = x, y
@@ -59,14 +59,14 @@ def harmonics(directions: Tensor) -> Tensor:
 
 
 def view_colors(means: Tensor, sh: Tensor, viewmat: Tensor) -> Tensor:
-    """``[n,3]`` colours of ``[n,k,3]`` coefficients seen from a camera, not below 0."""
+    """Return ``[n,3]`` colours of ``[n,k,3]`` coefficients seen from a camera, not below 0."""
     eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
     basis = harmonics(torch.nn.functional.normalize(means - eye, dim=-1))[:, : sh.shape[1]]
     return torch.clamp(torch.einsum("nk,nkc->nc", basis, sh) + 0.5, min=0)
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """``[n,3,3]`` of quaternions ``[n,4]`` of any length and standard deviations ``[n,3]``."""
+    """Return covariances ``[n,3,3]`` of quaternions ``[n,4]`` of any length and standard deviations ``[n,3]``."""
     w, (x, y, z) = quats[:, 0], quats[:, 1:].T
     zero = torch.zeros_like(w)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
@@ -78,7 +78,7 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
 def footprints(
     means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Image positions ``[n,2]``, undilated covariances ``[n,2,2]`` and depths ``[n]``."""
+    """Return image positions ``[n,2]``, undilated covariances ``[n,2,2]`` and depths ``[n]``."""
     camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = camera[:, 2]
     slopes = camera[:, :2] / depth[:, None]
@@ -95,7 +95,7 @@ def footprints(
 def render_arrays(
     gaussians: Gaussians, viewmat: np.ndarray, K: np.ndarray, width: int, height: int, **options: Any
 ) -> Reference:
-    """:func:`render_reference` of arrays, in the colours that their harmonics show; gives arrays."""
+    """Call :func:`render_reference` with arrays, in the colours that their harmonics show; return arrays."""
     means, quats, scales, opacities, sh0, shN = (t.double() for t in vars(gaussians.to("cpu")).values())
     view, lens = torch.from_numpy(viewmat).double(), torch.from_numpy(K).double()
     colors = view_colors(means, torch.cat([sh0, shN], 1), view)
@@ -159,7 +159,7 @@ BACKGROUND = (0.2, 0.5, 0.9)
 
 
 def random_gaussians(n: int, degree: int = 0, seed: int = 0) -> Gaussians:
-    """Around (0, 0, 3), of many sizes, quaternions of any length, some outside the image and behind the camera."""
+    """Draw Gaussians around (0, 0, 3), of many sizes and quaternions of any length, some outside the image."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -178,7 +178,7 @@ def random_gaussians(n: int, degree: int = 0, seed: int = 0) -> Gaussians:
 
 
 def turned_cameras(count: int = 2) -> Cameras:
-    """Side by side, turned, with unequal focal lengths and the centre beside the middle."""
+    """Return cameras side by side, turned, with unequal focal lengths and the centre beside the middle."""
     viewmats = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
     for view in range(count):
         angle = torch.tensor(0.2 - 0.3 * view, dtype=torch.float64)
@@ -197,7 +197,7 @@ def pixel_gradients(cameras: Cameras, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 def leaves(gaussians: Gaussians, cameras: Cameras, dtype: torch.dtype | None = None) -> list[Tensor]:
-    """Tensors of the Gaussians and the view matrices that collect gradients."""
+    """Return tensors of the Gaussians and the view matrices that collect gradients."""
     tensors = [tensor.to(dtype or tensor.dtype) for tensor in vars(gaussians).values()]
     return [tensor.detach().clone().requires_grad_() for tensor in (*tensors, cameras.viewmats)]
 
@@ -210,7 +210,7 @@ def reference_gradients(
     *,
     antialiased: bool = False,
 ) -> list[Tensor]:
-    """Gradients of the images and alphas times :func:`pixel_gradients`, in the order of NAMES, float64."""
+    """Return gradients of the images and alphas times :func:`pixel_gradients`, in the order of NAMES, float64."""
     tensors = leaves(gaussians, cameras, torch.float64)
     means, quats, scales, opacities, sh0, shN, viewmats = tensors
     grad_images, grad_alphas = pixel_gradients(cameras, seed)
@@ -226,7 +226,7 @@ def reference_gradients(
 
 
 def assert_close(actual: Sequence[Tensor], expected: Sequence[Tensor], most: float = 1e-3) -> None:
-    """Relative L2 error below ``most``, tensor by tensor."""
+    """Check that the relative L2 error is below ``most``, tensor by tensor."""
     for name, one, other in zip(NAMES, actual, expected, strict=False):
         assert torch.isfinite(one).all(), name
         error, size = float((one.double() - other).norm()), float(other.norm())

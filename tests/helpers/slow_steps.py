@@ -1,4 +1,4 @@
-"""The slow, obvious twin of a step of the full fit: single calls of the kernels, one after the other."""
+"""The slow, obvious twin of a step of the full fit calls one kernel after the other."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def move_slowly(optimiser: Optimiser, state: FitState, g: Gradients, step: Step)
 def image_gradient(
     image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float, edge_weight: float = 0.0
 ) -> tuple[np.ndarray, float]:
-    """The gradient ``[h,w,3]`` of the fit's loss on an image ``[h,w,3]``, and the sum of squared errors."""
+    """Return the gradient ``[h,w,3]`` of the fit's loss on an image ``[h,w,3]``, and the sum of squared errors."""
     height, width = weight.shape
     gradient, errors = np.empty((height, 3 * width), np.float32), np.empty(height, np.float32)
     flat, goal = (np.ascontiguousarray(a, np.float32).reshape(height, -1) for a in (image, photo))

@@ -32,7 +32,7 @@ stand_in(sys.argv[1:])
 
 
 def needs_program() -> pytest.MarkDecorator:
-    """A mark that skips tests without the program; where one is named, that is an error."""
+    """Return a mark that skips tests without the program; where one is named, that is an error."""
     try:
         found = bool(find_program())
     except UsageError:

@@ -1,4 +1,4 @@
-"""Tests over many cases: a few in every run, all others in the sweeps (``-m slow``)."""
+"""Of tests over many cases a few run always, and all others in the sweeps (``-m slow``)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 
 def sweep(names: str | Sequence[str], values: Iterable[Any], *, often: int = 1, **options: Any) -> pytest.MarkDecorator:
-    """``pytest.mark.parametrize``, of whose values the first few are in the default run."""
+    """Return ``pytest.mark.parametrize``, of whose values the first few are in the default run."""
     one_name = isinstance(names, str) and "," not in names
     cases = [
         value if i < often else pytest.param(*([value] if one_name else value), marks=pytest.mark.slow)

@@ -1,4 +1,4 @@
-"""A tiny per-pixel scene, and writers of every camera format, as the formats' own documents describe them."""
+"""A tiny per-pixel scene is written in every camera format, as the formats' own documents describe them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Tiny:
 
 
 def rotation(x: float, y: float, z: float) -> np.ndarray:
-    """``[3,3]`` of a rotation vector, radians."""
+    """Return the matrix ``[3,3]`` of a rotation vector, radians."""
     angle = math.sqrt(x * x + y * y + z * z)
     half = elementary.sin(angle / 2) / angle if angle else 0.0
     return quat_to_rotmat(np.array([elementary.cos(angle / 2), half * x, half * y, half * z]))
@@ -176,7 +176,7 @@ def save_json(path: Path, data: object) -> Path:
 
 @contextmanager
 def edited_json(path: Path) -> Iterator[Any]:
-    """The content of a file, which is written again after the block."""
+    """Yield the content of a file, and write it again after the block."""
     data = json.loads(path.read_text())
     yield data
     path.write_text(json.dumps(data))

@@ -1,4 +1,4 @@
-"""Networks, examples and runs that take a second; tests that import this are skipped where torch is missing."""
+"""Networks, examples and runs take a second; tests that import this are skipped where torch is missing."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ PAPER = replace(
 
 
 def modules_of(weights: NetworkWeights) -> Networks:
-    """Networks that can be trained, with these weights."""
+    """Return networks that can be trained, with these weights."""
     modules = Networks(weights.options)
     modules.load_state_dict({name: torch.from_numpy(array) for name, array in weights.arrays.items()})
     return modules
 
 
 def noisy_networks(options: NetworkOptions, scale: float = 0.3, seed: int = 0) -> Networks:
-    """Networks as they are before training, with random last layers; they collect no gradients yet."""
+    """Return networks as they are before training, with random last layers; they collect no gradients yet."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         networks = Networks(options)
@@ -53,13 +53,13 @@ def noisy_networks(options: NetworkOptions, scale: float = 0.3, seed: int = 0) -
 
 
 def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
-    """A window of a whole photo, with all Feature Gaussians."""
+    """Return a window of a whole photo, with all Feature Gaussians."""
     height, width = example.images.shape[1:3]
     return Window(photo, Box(0, 0, width, height), Crop(example, k, np.arange(len(example.features))))
 
 
 def written(example: Example, folder: Path) -> Shard:
-    """The example as a shard, in a file that is named after it."""
+    """Write the example as a shard, in a file that is named after it."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{hashlib.sha256(example.images.tobytes()).hexdigest()[:8]}-{len(example.features)}.safetensors"
     return Shard(path, example.name, write_shard(path, example))

@@ -1,4 +1,4 @@
-"""Made scenes whose Gaussians are in no order of pixels."""
+"""These made scenes have Gaussians in no order of pixels."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
 def without_order(scene: Scene, order: np.ndarray | None = None) -> Scene:
-    """The same Gaussians without their order."""
+    """Return the same Gaussians without their order."""
     gaussians = scene.gaussians if order is None else scene.gaussians[order]
     return Scene(gaussians, scene.cameras, scene.images, None, scene.names)
 
 
 def shuffled(scene: Scene, seed: int = 0) -> Scene:
-    """In a random order."""
+    """Return the Gaussians in a random order."""
     return without_order(scene, np.random.default_rng(seed).permutation(len(scene.gaussians)))
 
 
 def voxels(scene: Scene, size: float) -> Scene:
-    """One Gaussian per occupied cell: the means of what it holds."""
+    """Return one Gaussian per occupied cell: the means of what it holds."""
     g = scene.gaussians
     cells = np.floor(g.means / size).astype(np.int64)
     _, inverse = np.unique(cells, axis=0, return_inverse=True)
@@ -42,6 +42,6 @@ def voxels(scene: Scene, size: float) -> Scene:
 
 
 def far_behind(gaussians: Gaussians, count: int) -> Gaussians:
-    """Some of the Gaussians, put where no camera of :func:`scenes.arc` looks."""
+    """Return some of the Gaussians, put where no camera of :func:`scenes.arc` looks."""
     some = gaussians[:count]
     return replace(some, means=some.means - np.array([0, 0, 30], some.means.dtype))

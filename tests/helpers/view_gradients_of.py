@@ -1,4 +1,4 @@
-"""The view of the turned camera, tiled, and its gradients row by row."""
+"""These functions tile the view of the turned camera, and give its gradients row by row."""
 
 from __future__ import annotations
 

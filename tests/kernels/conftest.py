@@ -1,4 +1,4 @@
-"""Kernels with the library of every target that this processor runs."""
+"""A fixture runs kernels with the library of every target of this processor."""
 
 from __future__ import annotations
 

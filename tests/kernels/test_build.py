@@ -1,4 +1,4 @@
-"""The build: every platform, other compilers, and what it says where it cannot."""
+"""The build works for every platform and other compilers, and says where it cannot."""
 
 from __future__ import annotations
 
@@ -46,19 +46,19 @@ def test_another_compiler_can_be_named(tmp_path: Path, monkeypatch: pytest.Monke
         assert ctypes.c_char_p.in_dll(ctypes.CDLL(str(path)), "sources_hash").value == hash_sources().encode()
 
 
-def test_a_compiler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_compiler_of_the_variable_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_CC", "no-such-compiler -O2")
     with refuses(OSError, "GSMERGE_CC", "'no-such-compiler'"):
         build_libraries(tmp_path)
 
 
-def test_an_error_of_the_compiler_is_shown_and_nothing_is_left(tmp_path: Path) -> None:
+def test_failed_build_shows_the_compiler_s_error_and_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"(?s)building kernels-.* failed\n.*error:"):
         build_libraries(tmp_path, ("-include", "no-such-header.h"))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_a_compiler_the_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_the_error_names_the_package_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GSMERGE_CC", raising=False)
     monkeypatch.setitem(module.sys.modules, "ziglang", None)
     with refuses(OSError, "", "ziglang", "none"):

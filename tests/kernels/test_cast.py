@@ -1,4 +1,4 @@
-"""Rays against shapes: the kernel, and looking at every point of a ray for what the shape's definition says."""
+"""Rays meet shapes where a look at every point of a ray finds the shape's definition."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def rotation(rng: np.random.Generator) -> np.ndarray:
 
 
 def random_shape(kind: int, rng: np.random.Generator) -> Shape:
-    """Around (0, 0, 4), about 1 large, in any attitude."""
+    """Draw a shape around (0, 0, 4), about 1 large, in any attitude."""
     waves = NO_WAVES
     if kind == BLOB:
         numbers = rng.normal(0, 2, (4, 3))
@@ -32,7 +32,7 @@ def random_shape(kind: int, rng: np.random.Generator) -> Shape:
 
 
 def sides(shape: Shape, points: np.ndarray) -> np.ndarray:
-    """On which side of the surface points in its frame are; the surface is where that changes."""
+    """Return on which side of the surface points in its frame are; the surface is where that changes."""
     (x, y, z), (a, b, c, taper) = points.T, shape.size
     number, phase, height = shape.waves[:, :3], shape.waves[:, 3], shape.waves[:, 4]
     if shape.kind == BOX:
@@ -105,7 +105,7 @@ def test_depth_is_where_the_side_changes(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_normals_are_those_of_the_depth(name: str) -> None:
+def test_normals_match_the_slopes_of_the_depth(name: str) -> None:
     """A step along the surface is at right angles to the normal, which looks at the camera."""
     shape, (w, h, f) = random_shape(KINDS[name], np.random.default_rng(KINDS[name])), (120, 90, 120.0)
     depth, ids, _, normals = run(pack_shapes([shape]), w, h, f)
@@ -135,7 +135,7 @@ def test_the_nearest_of_several_shapes_is_seen() -> None:
     np.testing.assert_array_equal(ids, np.where(alone.min(0) < 1e6, alone.argmin(0), -1))
 
 
-def test_light_reaches_what_nothing_is_before() -> None:
+def test_light_reaches_points_with_nothing_before_them() -> None:
     rng = np.random.default_rng(0)
     axes = np.stack([rotation(rng) for _ in range(3)])
     maps = rng.uniform(-0.5, 0.5, (3, 8, 8)).astype(np.float32)
@@ -173,7 +173,7 @@ def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type:
     assert (lit > 0).any()
 
 
-def test_no_shapes_and_no_points() -> None:
+def test_kernels_take_no_pixels_and_no_points() -> None:
     shapes = pack_shapes([random_shape(BOX, np.random.default_rng(0))])
     assert run(shapes, 0, 0, 1.0)[0].shape == (0, 0)
     empty = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32), np.empty((0, 3, 3)), np.zeros(3), 1.0

@@ -1,4 +1,4 @@
-"""Comparison of the pixels of views, against plain formulas."""
+"""Comparison of the pixels of views matches plain formulas."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Views:
         return x / z, y / z, z, K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2], world
 
     def compared(self, pair: int) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """Curvature, slope, cost and flow of one pair, by arrays."""
+        """Return curvature, slope, cost and flow of one pair, by arrays."""
         a, b = PAIRS[pair]
         x, y, z, u, v, world = self.places(self.viewmats, a, b)
         inside = (z > NEAR) & (u > BORDER) & (u < WIDTH - BORDER) & (v > BORDER) & (v < HEIGHT - BORDER)
@@ -80,7 +80,7 @@ class Views:
 
 
 @pytest.mark.parametrize("seed", range(4, 9))
-def test_pairs_are_those_of_the_formula_bit_for_bit(seed: int) -> None:
+def test_comparisons_of_pairs_match_the_formula_bit_for_bit(seed: int) -> None:
     views = Views(seed)
     curvatures, slopes, costs, flows = views.compare()
     for row, (a, _) in enumerate(PAIRS):
@@ -92,7 +92,7 @@ def test_pairs_are_those_of_the_formula_bit_for_bit(seed: int) -> None:
         assert (flow == 0) == (a == 3)  # too few pixels
 
 
-def test_a_view_that_is_not_there_and_too_little_room_are_refused() -> None:
+def test_missing_view_or_too_little_room_is_refused() -> None:
     views = Views(0)
     with pytest.raises(ValueError, match="compare_views"):
         views.compare(np.array([[0, 1], [1, VIEWS]]))
@@ -101,7 +101,7 @@ def test_a_view_that_is_not_there_and_too_little_room_are_refused() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_surfaces_are_those_of_the_formula(seed: int) -> None:
+def test_surfaces_of_views_match_the_formula(seed: int) -> None:
     rng, pixels = np.random.default_rng(seed), HEIGHT * WIDTH
     means, others = (rng.uniform((-1.5, -1, 1.8), (1.5, 1, 2.4), (pixels, 3)).astype(np.float32) for _ in range(2))
     means[:2], valid = np.nan, rng.random(pixels) < 0.8
@@ -123,7 +123,7 @@ def test_surfaces_are_those_of_the_formula(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_differences_are_those_of_the_formula_bit_for_bit(seed: int) -> None:
+def test_differences_of_views_match_the_formula_bit_for_bit(seed: int) -> None:
     rng = np.random.default_rng(seed)
     picture, colors = rng.random((HEIGHT, WIDTH, 3), np.float32), rng.random((POINTS, 3), np.float32)
     pixels = rng.permutation(HEIGHT * WIDTH)[:POINTS]

@@ -1,4 +1,4 @@
-"""Elementary functions against NumPy's."""
+"""Elementary functions match NumPy's."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_results_are_numpys(each_target, name: str) -> None:  # type: ignore[no-untyped-def]
+def test_functions_match_numpy_s(each_target, name: str) -> None:  # type: ignore[no-untyped-def]
     """Within two units of the last place; powers within as many as the exponent of e."""
     function, slow, arrays = CASES[name]
     with np.errstate(all="ignore"):
@@ -68,7 +68,7 @@ def test_float32_is_within_two_units_of_the_last_place(each_target, name: str) -
         lambda values: power(values, 2),
     ],
 )
-def test_shapes_and_types_are_kept(function: Callable[[np.ndarray], np.ndarray]) -> None:
+def test_functions_keep_shapes_and_types_of_arrays(function: Callable[[np.ndarray], np.ndarray]) -> None:
     for dtype in (np.float32, np.float64):
         values = RNG.uniform(0.5, 1, (4, 3)).astype(dtype)
         for view in (values, values[:, ::2], values[:0]):
@@ -76,14 +76,14 @@ def test_shapes_and_types_are_kept(function: Callable[[np.ndarray], np.ndarray])
     np.testing.assert_allclose(function(values[:, ::2]), function(values)[:, ::2], rtol=0)
 
 
-def test_numbers_are_float64() -> None:
+def test_functions_of_numbers_give_float64() -> None:
     assert type(log10(2)) is np.float64
     assert exp(1.0) == pytest.approx(np.e, rel=1e-15)
     assert arctan2(1.0, 1.0) == pytest.approx(np.pi / 4, rel=1e-15)
     assert power(np.float32([2]), 0.5).dtype == np.float32
 
 
-def test_powers() -> None:
+def test_powers_have_known_values() -> None:
     values = np.array([0.0, 0.25, 1.0, 4.0])
     np.testing.assert_allclose(power(values, 0.5), [0, 0.5, 1, 2], rtol=1e-15)
     np.testing.assert_array_equal(power(np.array([0.0, 3.0, np.nan]), 0), 1)

@@ -1,4 +1,4 @@
-"""Which library is loaded, and what is said where none fits."""
+"""The right library is loaded, and where none fits the error says what to do."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def set_level(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
     monkeypatch.setattr(module._open_library, "cache_clear", lambda: None, raising=False)
 
 
-def test_the_most_demanding_target_is_taken() -> None:
+def test_most_demanding_target_of_the_processor_is_loaded() -> None:
     assert load_library()._name == str(FOLDER / find_platform().library_name(module._runnable_targets()[-1]))
 
 
@@ -60,7 +60,7 @@ def test_a_target_can_be_forced(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("target", ["v5", "V3", "x86-64-v3"])
-def test_other_targets_are_refused(target: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_target_is_refused(target: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_TARGET", target)
     with refuses(UsageError, "GSMERGE_TARGET", f"'{target}'"):
         load_library()
@@ -106,7 +106,9 @@ def test_memory_that_does_not_suffice_for_the_library_is_called_so(monkeypatch: 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a library that is there")
-def test_the_library_of_somebody_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_library_without_our_functions_names_the_command_that_builds_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     for target in find_platform().targets:
         shutil.copy(mtrand.__file__, tmp_path / find_platform().library_name(target))
     monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
@@ -120,12 +122,12 @@ def test_a_library_of_other_sources_names_the_command_that_builds_it(monkeypatch
         load_library()
 
 
-def test_a_wheel_without_sources_is_not_asked_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_library_of_a_wheel_is_loaded_without_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "hash_sources", lambda: "")
     assert ctypes.c_char_p.in_dll(load_library(), "sources_hash").value == hash_sources().encode()
 
 
-def test_the_command_line_says_it_in_one_line(tmp_path: Path, small_scene: Path) -> None:
+def test_command_line_refuses_an_unknown_target_in_one_line(tmp_path: Path, small_scene: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "gsmerge", "compact", str(small_scene), "-o", str(tmp_path / "x.ply")],
         capture_output=True, text=True, check=False, env={**os.environ, "GSMERGE_TARGET": "v5"},
@@ -134,7 +136,7 @@ def test_the_command_line_says_it_in_one_line(tmp_path: Path, small_scene: Path)
     assert done.stderr.startswith(f"{ERROR}GSMERGE_TARGET: ")
 
 
-def test_platforms_of_wheels() -> None:
+def test_tags_of_wheels_name_platform_targets_and_library() -> None:
     tags = {
         "manylinux_2_17_x86_64": Platform("linux", "x86_64"), "linux-aarch64": Platform("linux", "arm64"),
         "macosx_11_0_arm64": Platform("macosx", "arm64"), "macosx-10.13-x86_64": Platform("macosx", "x86_64"),

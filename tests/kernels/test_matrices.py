@@ -1,4 +1,4 @@
-"""Small linear algebra against NumPy's."""
+"""Small linear algebra matches NumPy's."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ RNG = np.random.default_rng(0)
         ((1, 3, 3), (7, 3, 1)), ((0, 3, 3), (3,)),
     ],
 )  # fmt: skip
-def test_products_are_numpys(each_target, left, right):
+def test_products_match_numpy_s(each_target, left, right):
     a, b = RNG.normal(size=left), RNG.normal(size=right)
     (actual,) = each_target(lambda: (matmul(a, b),))
     assert actual.shape == (a @ b).shape
     np.testing.assert_allclose(actual, a @ b, rtol=1e-12, atol=1e-12)
 
 
-def test_products_of_views_and_other_types():
+def test_products_of_strided_and_integer_arrays_match_numpy_s():
     a, b = RNG.normal(size=(6, 8)).astype(np.float32), RNG.integers(0, 9, (6, 3))
     np.testing.assert_allclose(matmul(a.T[::2], b), a.T[::2].astype(float) @ b, rtol=1e-12)
 
@@ -40,7 +40,7 @@ def test_every_sum_has_the_order_of_its_terms():
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 6, 16, 17, 40])
-def test_solutions_are_numpys(each_target, size):
+def test_solutions_match_numpy_s(each_target, size):
     a, b = RNG.normal(size=(4, size, size)), RNG.normal(size=(4, size, 2))
     a[0, :, 0] = 0
     a[0, -1, 0] = 1  # takes a pivot from below
@@ -50,7 +50,7 @@ def test_solutions_are_numpys(each_target, size):
     np.testing.assert_allclose(solve(a[1], b[1, :, 0]), actual[1, :, 0], rtol=1e-15)
 
 
-def test_equations_with_few_neighbours(each_target):
+def test_banded_equations_match_numpy_s(each_target):
     a = np.diag(np.full(90, 4.0)) - np.diag(np.ones(89), 1) - np.diag(np.ones(89), -1)
     (actual,) = each_target(lambda: (solve(a, np.arange(90.0)),))
     np.testing.assert_allclose(a @ actual, np.arange(90.0), atol=1e-12)
@@ -61,14 +61,14 @@ def test_singular_matrices_are_refused():
         invert(np.stack([np.eye(3), np.ones((3, 3))]))
 
 
-def test_what_is_not_finite_stays_so():
+def test_inverse_of_a_matrix_that_is_not_finite_is_not_finite():
     assert np.isnan(invert(np.full((2, 2), np.nan))).all()
     assert not np.isfinite(invert(np.array([[1.0, np.nan], [0, 1]]))).all()
     assert invert(np.empty((0, 4, 4))).shape == (0, 4, 4)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 9])
-def test_eigenvectors_make_the_matrix(each_target, size):
+def test_eigenvalues_and_eigenvectors_rebuild_the_matrix(each_target, size):
     a = RNG.normal(size=(20, size, size))
     a += a.swapaxes(1, 2)
     a[0], a[1] = np.eye(size), 0
@@ -86,7 +86,7 @@ def test_eigenvalues_of_numbers_that_are_not_finite():
 
 
 @pytest.mark.parametrize("rank", [3, 2, 0])
-def test_least_squares_are_numpys(each_target, rank):
+def test_least_squares_match_numpy_s(each_target, rank):
     columns = RNG.normal(size=(30, rank)) @ RNG.normal(size=(rank, 3))
     a, b = columns.T @ columns, columns.T @ RNG.normal(size=(30, 2))
     (actual,) = each_target(lambda: (solve_symmetric(a, b),))
@@ -94,7 +94,7 @@ def test_least_squares_are_numpys(each_target, rank):
     np.testing.assert_allclose(solve_symmetric(a, b[:, 0]), actual[:, 0], atol=1e-12)
 
 
-def test_determinants_are_numpys():
+def test_determinants_match_numpy_s():
     a = RNG.normal(size=(4, 5, 3, 3))
     np.testing.assert_allclose(determinant(a), np.linalg.det(a), rtol=1e-10)
 
@@ -113,7 +113,7 @@ def test_the_closest_rotation_is_that_of_singular_values(rank):
             np.testing.assert_allclose(actual, slow, atol=1e-6)
 
 
-def test_float32_stays_float32():
+def test_results_of_float32_are_float32():
     a = RNG.normal(size=(2, 3, 3)).astype(np.float32)
     results = matmul(a, a), solve(a, a), invert(a), eigh(a + a.swapaxes(1, 2))[1]
     assert {one.dtype for one in results} == {np.dtype(np.float32)}

@@ -1,4 +1,4 @@
-"""Gaussians as the numbers of a page, against NumPy on the columns of a ``.spz``."""
+"""Gaussians as the numbers of a page match NumPy on the columns of a ``.spz``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ N = 300
 
 
 def numbers(moved: np.ndarray) -> np.ndarray:
-    """Sums of differences ``[c,m]`` whose sign is the lowest bit."""
+    """Return sums of differences ``[c,m]`` whose sign is the lowest bit."""
     wide = moved.astype(np.int64)
     return np.cumsum((wide >> 1) ^ -(wide & 1), axis=1)
 
@@ -40,7 +40,9 @@ def some_gaussians(degree: int) -> Gaussians:
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize(("steps", "levels"), [((1, 1, 1), 255), ((16, 2, 2), 31)])
-def test_looks_are_those_of_the_columns(degree: int, steps: tuple[int, ...], levels: int, each_target: Any) -> None:
+def test_packed_looks_are_those_of_spz_columns(
+    degree: int, steps: tuple[int, ...], levels: int, each_target: Any
+) -> None:
     given, rows = some_gaussians(3), np.arange(0, N, 2)
     _, opacities, colors, scales, _, harmonics = spz_columns(given[rows], degree)[1]
     quats = given.quats[rows].astype(np.float64) / np.linalg.norm(given.quats[rows], axis=1, keepdims=True)
@@ -52,7 +54,7 @@ def test_looks_are_those_of_the_columns(degree: int, steps: tuple[int, ...], lev
     np.testing.assert_array_equal(numbers(out).T, np.concatenate([*parts, turns, harmonics], 1))
 
 
-def test_pixels_have_shifts_and_depths(each_target: Any) -> None:
+def test_packed_pixels_have_shifts_and_depths(each_target: Any) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 16, 12), noise=0.05)
     ids, means, (width, height) = np.arange(3 * 16 * 12), scene.gaussians.means.astype(np.float32), (16, 12)
     rows, cameras = ids[5::3].copy(), scene.cameras

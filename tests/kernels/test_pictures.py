@@ -1,4 +1,4 @@
-"""Filters and lookups in pictures against SciPy's and slow loops."""
+"""Filters and lookups in pictures match SciPy's and slow loops."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_derivatives_are_opencvs():
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_lookups_are_those_of_a_loop(each_target, shape):
+def test_bilinear_lookups_match_a_loop(each_target, shape):
     picture = RNG.random(shape).astype(np.float32)
     height, width = shape[:2]
     x, y = (RNG.uniform(-2, n + 1, 60).astype(np.float32) for n in (width, height))
@@ -53,7 +53,7 @@ def test_lookups_are_those_of_a_loop(each_target, shape):
         np.testing.assert_allclose(row, np.tensordot(weights, corners, 2), atol=1e-6)
 
 
-def test_shapes_of_lookups():
+def test_lookups_have_the_shape_of_their_places():
     picture, places = np.ones((4, 5, 3), np.float32), np.zeros((2, 7))
     assert sample_bilinear(picture, places, places).shape == (2, 7, 3)
     assert sample_bilinear(picture[..., 0], places[:0], places[:0]).shape == (0, 7)
@@ -61,7 +61,7 @@ def test_shapes_of_lookups():
         sample_bilinear(picture[:0], places, places)
 
 
-def test_empty_pictures():
+def test_convolved_empty_pictures_keep_their_shape():
     assert convolve(np.empty((0, 4, 3), np.float32), np.ones(3), np.ones(3)).shape == (0, 4, 3)
     assert convolve(np.empty((4, 0), np.float32), np.ones(3), np.ones(3)).shape == (4, 0)
     with pytest.raises(ValueError, match="indices"):

@@ -1,4 +1,4 @@
-"""Projection errors and their derivatives, against plain formulas."""
+"""Projection errors and their derivatives match plain formulas."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def make_poses(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_errors_are_those_of_the_formula_bit_for_bit(seed: int) -> None:
+def test_projection_errors_match_the_formula_bit_for_bit(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points, poses = rng.normal(0, 3, (400, 3)), make_poses(7, rng)
     points[:3] = np.nan, np.inf, 1e300
@@ -69,7 +69,7 @@ def test_marked_pixels_are_those_of_the_points_beyond_the_near_plane(near: float
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_points_are_seen_by_the_formula_bit_for_bit(seed: int) -> None:
+def test_projected_points_match_the_formula_bit_for_bit(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points, poses, Ks = rng.normal(0, 3, (400, 3)), make_poses(7, rng), np.tile(K, (7, 1, 1))
     points[:3] = np.nan, np.inf, 1e300

@@ -1,3 +1,5 @@
+"""Arguments of kernels are checked before the call."""
+
 import numpy as np
 import pytest
 from messages import refuses

@@ -1,4 +1,4 @@
-"""Rows by the native conversion, against the same rows column by column, bit for bit."""
+"""Rows by the native conversion are the same rows as column by column, bit for bit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ODD = {
 
 
 def make_rows(num_higher: int, seed: int = 0) -> np.ndarray:
-    """Rows of plain Gaussians with two columns beside what is used, all columns in a mixed order."""
+    """Make rows of plain Gaussians with two columns beside what is used, all columns in a mixed order."""
     rng = np.random.default_rng(seed)
     names = [*arrays.REQUIRED_COLUMNS, *arrays.NORMALS[:2], *(f"f_rest_{i}" for i in range(3 * num_higher))]
     rows = np.empty(N, [(name, "<f4") for name in rng.permutation(names)])
@@ -56,7 +56,7 @@ def test_rows_from_an_odd_one_on_are_taken_by_columns(name: str, value: float, r
 
 
 @pytest.mark.parametrize("size", [0, 1e-20, 1e-16, 1e-14])
-def test_rotations_of_zero_and_tiny_ones(size: float) -> None:
+def test_rows_of_zero_or_tiny_rotations_are_taken_by_columns(size: float) -> None:
     rows = make_rows(0)
     for name in arrays.QUATS:
         rows[name][70] *= np.float32(size)

@@ -1,4 +1,4 @@
-"""Whatever the picture and the budget: the exact count, every view kept, and smaller budgets nest in larger ones."""
+"""Any picture and budget gives the exact count with every view kept, and smaller budgets nest in larger ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def random_tree(seed: int, num_views: int, colours: int) -> RegionTree:
-    """Small views; few colours and depths make ties, some pixels do not count."""
+    """Draw a tree of small views; few colours and depths make ties, some pixels do not count."""
     rng = np.random.default_rng(seed)
     height, width = rng.integers(3, 16, 2)
     shape = (num_views, height, width)
@@ -41,7 +41,7 @@ def is_union_of(coarse: Groups, fine: Groups) -> bool:
 
 @FEW
 @given(seeds, st.integers(1, 4), st.integers(1, 5), st.floats(0, 1), st.floats(0, 1))
-def test_counts_are_exact_and_nest(seed: int, num_views: int, colours: int, low: float, high: float) -> None:
+def test_cuts_have_exact_counts_that_nest(seed: int, num_views: int, colours: int, low: float, high: float) -> None:
     tree = random_tree(seed, num_views, colours)
     few, many = sorted(num_views + int(share * (len(tree) - num_views)) for share in (low, high))
     coarse, fine = cut_tree(tree, few), cut_tree(tree, many)
@@ -58,7 +58,7 @@ def test_counts_are_exact_and_nest(seed: int, num_views: int, colours: int, low:
 
 
 def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:
-    """Up to 12 groups of up to 20 members, some of them alike."""
+    """Draw up to 12 groups of up to 20 members, some of them alike."""
     rng = np.random.default_rng(seed)
     sizes = rng.integers(1, 20, rng.integers(1, 12))
     n, g = int(sizes.sum()), len(sizes)
@@ -74,7 +74,7 @@ def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:
 
 @FEW
 @given(seeds, st.integers(0, 60), st.integers(0, 60), st.integers(1, 8))
-def test_splits_are_exact_and_monotone(seed: int, one: int, other: int, max_children: int) -> None:
+def test_split_counts_are_exact_and_grow_with_the_budget(seed: int, one: int, other: int, max_children: int) -> None:
     features, members = random_groups(seed)
     most = split_counts(features, members, 10**6, max_children)
     few, many = (split_counts(features, members, extra, max_children) for extra in sorted((one, other)))

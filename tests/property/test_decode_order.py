@@ -20,7 +20,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def random_group(rng: np.random.Generator, count: int) -> tuple[FeatureGaussians, Members]:
-    """One group of ``count`` members."""
+    """Draw one group of ``count`` members."""
     columns = (
         rng.normal(size=(count, 3)) * 0.1, rng.normal(size=(count, 4)), exp(0.3 * rng.normal(size=(count, 3)) - 4),
         rng.uniform(0.2, 0.9, count), rng.normal(size=(count, 1, 3)) * 0.3, np.zeros((count, 0, 3)),
@@ -34,7 +34,7 @@ def random_group(rng: np.random.Generator, count: int) -> tuple[FeatureGaussians
 
 @FEW
 @given(seeds, st.integers(1, 60), st.sampled_from([2, 3, 4, 8]))
-def test_order_of_members(seed: int, count: int, k: int) -> None:
+def test_children_do_not_depend_on_the_order_of_members(seed: int, count: int, k: int) -> None:
     rng = np.random.default_rng(seed)
     feature, members = random_group(rng, count)
     shuffled = replace(feature, members=rng.permutation(count))

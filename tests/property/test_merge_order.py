@@ -32,7 +32,7 @@ def as_sets(actual: Matches, names: np.ndarray) -> set[frozenset[int]]:
 
 @FEW
 @given(seeds, st.integers(1, 80), st.sampled_from(["overlap", "aabb"]))
-def test_order_of_features(seed: int, count: int, method: str) -> None:
+def test_clusters_do_not_depend_on_the_order_of_features(seed: int, count: int, method: str) -> None:
     rng = np.random.default_rng(seed)
     features, options = random_features(rng, count), MatchOptions(match=method, overlap=0.3)
     order = rng.permutation(count)

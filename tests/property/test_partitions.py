@@ -1,4 +1,4 @@
-"""Whatever the picture and the segmentation: the exact number, nothing empty, everything in one piece, every time."""
+"""Any picture and segmentation gives the exact number of superpixels, each in one piece and none empty."""
 
 from __future__ import annotations
 
@@ -57,7 +57,9 @@ def counts_of(num_pixels: int) -> list[int]:
 
 @pytest.mark.parametrize("picture", PICTURES)
 @pytest.mark.parametrize(("segmentation", "rounds"), SEGMENTATIONS)
-def test_exact_count_in_one_piece_each(picture: str, segmentation: str, rounds: dict[str, Any]) -> None:
+def test_partitions_are_exact_for_any_picture_and_segmentation(
+    picture: str, segmentation: str, rounds: dict[str, Any]
+) -> None:
     image = PICTURES[picture]
     height, width, _ = image.shape
     for count in counts_of(height * width):
@@ -67,7 +69,7 @@ def test_exact_count_in_one_piece_each(picture: str, segmentation: str, rounds: 
 
 @pytest.mark.parametrize("compactness", [0.0, 1e-3, 1.0])
 @pytest.mark.parametrize("picture", PICTURES)
-def test_any_compactness(picture: str, compactness: float) -> None:
+def test_partitions_are_exact_for_any_compactness(picture: str, compactness: float) -> None:
     image = PICTURES[picture]
     height, width, _ = image.shape
     for count in counts_of(height * width):
@@ -84,7 +86,9 @@ def test_any_compactness(picture: str, compactness: float) -> None:
     kind=st.sampled_from(SEGMENTATIONS),
     seed=st.integers(0, 999),
 )
-def test_any_size(height: int, width: int, share: float, colours: int, kind: tuple[str, str], seed: int) -> None:
+def test_partitions_are_exact_for_any_size(
+    height: int, width: int, share: float, colours: int, kind: tuple[str, str], seed: int
+) -> None:
     """Few colours make ties; sizes down to one pixel."""
     image = np.random.default_rng(seed).integers(0, colours, (height, width, 3)) / max(colours - 1, 1)
     count = 1 + int(share * (height * width - 1))

@@ -1,4 +1,4 @@
-"""The whole command: order of views, similarity transforms, seeds and threads."""
+"""The whole command does not depend on order of views, similarity transforms, seeds and threads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROOM = scenes.make_scene(scenes.room(), scenes.arc(4, 32, 24), noise=0.005)
 
 @FEW
 @given(st.permutations(range(4)), st.sampled_from([1, 2]))
-def test_order_of_views(order: list[int], k: int) -> None:
+def test_result_does_not_depend_on_the_order_of_views(order: list[int], k: int) -> None:
     one, other = scenes.plain(ROOM, k=k), scenes.plain(scenes.take_views(ROOM, order), k=k)
     scenes.assert_same_set(one, other, atol=1e-4)
 

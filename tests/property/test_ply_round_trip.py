@@ -1,3 +1,5 @@
+"""Gaussians are the same after they were written to a ``.ply`` and read."""
+
 from __future__ import annotations
 
 import tempfile
@@ -48,7 +50,7 @@ def round_trip(before: Gaussians) -> Gaussians:
 
 @given(gaussians())
 @settings(max_examples=15, deadline=None)
-def test_what_is_written_is_read_back(before: Gaussians) -> None:
+def test_written_gaussians_are_read_back(before: Gaussians) -> None:
     after = round_trip(before)
     for name in ("means", "sh0", "shN"):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name

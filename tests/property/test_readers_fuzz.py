@@ -31,5 +31,5 @@ def test_changed_files_are_read_or_refused(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(FINDINGS.glob("*")), ids=lambda path: path.name)
-def test_findings_stay_fixed(path: Path, tmp_path: Path) -> None:
+def test_files_that_once_failed_are_read_or_refused(path: Path, tmp_path: Path) -> None:
     attempt(path.name.rpartition(".")[0], path.read_bytes(), tmp_path / "read")

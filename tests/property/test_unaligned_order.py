@@ -1,4 +1,4 @@
-"""Gaussians in no order: what a permutation of them must not change."""
+"""Gaussians in no order give the same result after a permutation of them."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_threads_change_no_bit(options: dict) -> None:
 
 @FEW
 @given(st.integers(0, 1000), st.floats(-3, 3))
-def test_similarity(seed: int, exponent: float) -> None:
+def test_result_moves_with_a_similarity_of_the_scene(seed: int, exponent: float) -> None:
     """A world in other units, turned and elsewhere."""
     rng = np.random.default_rng(seed)
     factor = 10.0**exponent

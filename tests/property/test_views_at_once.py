@@ -1,4 +1,4 @@
-"""How many views' results are in memory together is a matter of memory alone: the same to the last bit."""
+"""How many views' results are in memory together changes memory alone: results are the same to the last bit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ def scene() -> Scene:
         {"budget": "8%", "fit_steps": 30, "effort": "best"},  # grows
     ],
 )
-def test_one_view_at_a_time_or_all(scene: Scene, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]) -> None:
+def test_results_of_one_view_at_a_time_are_those_of_all_at_once(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]
+) -> None:
     actual = []
     for at_once in (2, 100):
         monkeypatch.setattr("gsmerge.runtime.threads.AT_ONCE", at_once)
@@ -40,7 +42,9 @@ def test_higher_harmonics_are_not_copied() -> None:
     assert np.shares_memory(members.shN, g.gaussians.shN)
 
 
-def test_of_many_gaussians_one_view_at_a_time(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_gaussians_drawn_one_view_at_a_time_give_the_same_bits(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     actual = []
     for many in (0, 10**9):
         monkeypatch.setattr("gsmerge.raster.images.ONE_AT_A_TIME", many)

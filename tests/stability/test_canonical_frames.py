@@ -1,4 +1,4 @@
-"""Flyaways, coordinates far from zero, scale and orientation (stability.md, cases 13, 37, 38)."""
+"""Flyaways, coordinates far from zero, scale and orientation do no harm (stability.md, cases 13, 37, 38)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def room() -> Scene:
 
 
 @sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "match": "aabb"}])
-def test_flyaways_do_not_disturb_the_rest(room: Scene, settings: dict) -> None:
+def test_flyaways_leave_frame_and_quality_of_the_rest(room: Scene, settings: dict) -> None:
     """Means of three draws: one fit of so few Gaussians differs from another by half a decibel."""
     scores = []
     for seed in range(3):
@@ -47,7 +47,7 @@ def test_flyaways_do_not_disturb_the_rest(room: Scene, settings: dict) -> None:
 
 
 @sweep("settings", [{"fit": "none"}, {"fit": "none", "checkpoint": "none", "k": 2}])
-def test_map_coordinates(room: Scene, settings: dict) -> None:
+def test_scene_in_map_coordinates_gives_the_same_gaussians(room: Scene, settings: dict) -> None:
     far = scenes.move(room, np.eye(3), 1.0, UTM)
     one, other = (scenes.compacted(scene, **settings) for scene in (room, far))
     here, there = one.gaussians, other.gaussians
@@ -62,7 +62,7 @@ def test_map_coordinates(room: Scene, settings: dict) -> None:
 
 
 @pytest.mark.slow
-def test_map_coordinates_with_the_full_fit(room: Scene) -> None:
+def test_scene_in_map_coordinates_is_as_good_with_the_full_fit(room: Scene) -> None:
     """Its steps make much of the last bit, but not of what it reaches."""
     far = scenes.move(room, np.eye(3), 1.0, UTM)
     here, there = scenes.compacted(room, fit_steps=40), scenes.compacted(far, fit_steps=40)
@@ -73,7 +73,7 @@ def test_map_coordinates_with_the_full_fit(room: Scene) -> None:
 # 38: similarity transforms
 
 
-def test_similarity_of_equal_opacities(room: Scene) -> None:
+def test_count_at_equal_opacities_does_not_depend_on_the_axes(room: Scene) -> None:
     """Equal weights: ties must not be broken along the world's axes."""
     even = replace(room, gaussians=replace(room.gaussians, opacities=np.full_like(room.gaussians.opacities, 0.8)))
     counts = [len(scenes.plain(even))]
@@ -83,7 +83,7 @@ def test_similarity_of_equal_opacities(room: Scene) -> None:
 
 
 @sweep("factor", [1e-4, 1.0, 1e4], ids="{:g} times as large".format)
-def test_similarity_with_everything_on(room: Scene, factor: float) -> None:
+def test_turned_and_scaled_scene_is_as_good_with_fit_and_networks(room: Scene, factor: float) -> None:
     moved = scenes.move(room, scenes.random_rotation(2), factor, np.zeros(3))
     one, other = (scenes.compacted(s, k=2, fit_steps=40) for s in (room, moved))
     assert len(other.gaussians) == pytest.approx(len(one.gaussians), rel=0.005)

@@ -1,4 +1,4 @@
-"""Networks that are missing, damaged or badly wrong."""
+"""Networks that are missing, damaged or badly wrong do little harm, or are refused."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_networks_of_the_package_that_cannot_be_used_are_noted(
 
 
 @sweep("options", [{}, {"method": "random", "budget": 40}])
-def test_a_file_that_is_named_must_be_usable(tmp_path: Path, options: dict[str, object]) -> None:
+def test_named_checkpoint_must_be_usable(tmp_path: Path, options: dict[str, object]) -> None:
     with pytest.raises(gsmerge.SceneError, match="nosuch: expected a checkpoint, found no such file"):
         gsmerge.compact(make_scene(room(), arc(2)), **PLAIN | options, checkpoint=str(tmp_path / "nosuch"))
 

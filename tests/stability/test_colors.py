@@ -1,4 +1,4 @@
-"""Exposure, flat and noisy pictures, shine, and what moves (stability.md, cases 29 to 31, 40, 54)."""
+"""Exposure, flat and noisy pictures, shine and motion do little harm (stability.md, cases 29 to 31, 40, 54)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def novel_psnr(gaussians: Gaussians, surfaces: list[scenes.Surface], start: floa
 
 
 def painted(scene: Scene, images: np.ndarray) -> Scene:
-    """With other photos, and Gaussians of their colours."""
+    """Return the scene with other photos, and Gaussians of their colours."""
     sh0 = ((images.reshape(-1, 1, 3) - 0.5) / SH_C0).astype(np.float32)
     return replace(scene, images=images.astype(np.float32), gaussians=replace(scene.gaussians, sh0=sh0))
 
@@ -34,7 +34,7 @@ def room() -> Scene:
 # 29: exposure
 
 
-def test_exposure_of_photos_and_gaussians(room: Scene) -> None:
+def test_fit_evens_out_the_exposure_of_photos_and_gaussians(room: Scene) -> None:
     factors = np.array([0.8, 1.2, 1 / 1.2, 1.25], np.float32)[:, None, None, None]
     scene = painted(room, 0.8 * room.images * factors)
     surfaces = [scenes.Surface(s.shape, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
@@ -47,7 +47,7 @@ def test_exposure_of_photos_and_gaussians(room: Scene) -> None:
 
 @sweep("grey", [0.0, 0.5, 1.0], ids=["black", "grey", "white"])
 @sweep("segmentation", ["rdseg", "bass-st"])
-def test_flat_pictures(room: Scene, grey: float, segmentation: str) -> None:
+def test_flat_photos_are_shown_in_their_colour(room: Scene, grey: float, segmentation: str) -> None:
     flat = painted(room, np.full_like(room.images, grey))
     result = compacted(flat, segmentation=segmentation, superpixels=60, fit_steps=10)
     assert 1 <= len(result.gaussians) <= 4 * 60
@@ -58,7 +58,7 @@ def test_flat_pictures(room: Scene, grey: float, segmentation: str) -> None:
 
 
 @sweep("segmentation", ["rdseg", "bass-st"])
-def test_noise_does_not_explode(room: Scene, segmentation: str) -> None:
+def test_photos_of_noise_make_few_gaussians(room: Scene, segmentation: str) -> None:
     noise = np.random.default_rng(0).random(room.images.shape, np.float32)
     result = compacted(painted(room, noise), segmentation=segmentation, superpixels=60, fit_steps=10)
     assert len(result.gaussians) <= 4 * 60
@@ -68,7 +68,7 @@ def test_noise_does_not_explode(room: Scene, segmentation: str) -> None:
 
 
 def shiny(scene: Scene, strength: float) -> Scene:
-    """Degree 3, the same strong harmonics everywhere, photos rendered from the Gaussians."""
+    """Return the scene with the same strong harmonics of degree 3 everywhere, and photos rendered from them."""
     coefficients = np.random.default_rng(1).normal(0, strength, (1, 15, 3)).astype(np.float32)
     shN = coefficients.repeat(len(scene.gaussians), 0)
     made = replace(scene, gaussians=replace(scene.gaussians, shN=shN))
@@ -77,7 +77,7 @@ def shiny(scene: Scene, strength: float) -> Scene:
 
 
 @sweep("settings", [{"fit_steps": 10}, {}, {"fit": "none"}, {"k": 2}])
-def test_harmonics_survive(room: Scene, settings: dict) -> None:
+def test_strong_harmonics_stay_in_the_result(room: Scene, settings: dict) -> None:
     scene = shiny(room, 0.3)
     actual = compacted(scene, **settings).gaussians
     assert actual.sh_degree == 3
@@ -110,7 +110,7 @@ def test_base_colours_outside_the_range_are_kept(room: Scene) -> None:
 # 54: something that moves
 
 
-def test_passer_by_in_one_view_does_not_haunt_the_others(room: Scene) -> None:
+def test_passer_by_in_one_view_does_not_show_in_the_others(room: Scene) -> None:
     """A red patch in the photo of view 1 and on its Gaussians."""
     images = room.images.copy()
     images[1, 10:24, 14:28] = [1.0, 0.0, 0.0]

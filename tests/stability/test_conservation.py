@@ -1,4 +1,4 @@
-"""What merging keeps: coverage, brightness, detail with K (stability.md, cases 47, 48, 55)."""
+"""Merging keeps coverage, brightness, and more detail with K (stability.md, cases 47, 48, 55)."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def build(name: str, noise: float) -> Scene:
 
 @pytest.fixture(scope="module", params=EACH)
 def scene(request: pytest.FixtureRequest) -> Scene:
-    """With the depth noise of a network."""
+    """Return a scene with the depth noise of a network."""
     return build(request.param, 0.02)
 
 
 @pytest.fixture(scope="module", params=EACH)
 def clean(request: pytest.FixtureRequest) -> Scene:
-    """With hardly any, so that groups are thin."""
+    """Return a scene with hardly any noise, so that groups are thin."""
     return build(request.param, 0.005)
 
 
 def coverage(gaussians: Gaussians, scene: Scene) -> tuple[float, float]:
-    """Mean alpha and luma over all views."""
+    """Return the mean alpha and luma over all views."""
     images, alphas = scenes.images_of(gaussians, scene.cameras)
     return float(alphas.mean()), float((images @ np.array([0.299, 0.587, 0.114])).mean())
 
@@ -62,7 +62,7 @@ def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
 
 
 @sweep("settings", [{}, {"k": 4}, {"match": "none"}])
-def test_photos_keep_coverage_and_brightness(scene: Scene, settings: dict) -> None:
+def test_result_keeps_coverage_and_brightness(scene: Scene, settings: dict) -> None:
     """What is not merged across views loses 1.1 % over four seeds, the rest half of that."""
     before = coverage(scene.gaussians, scene)
     after = coverage(compacted(scene, superpixels="4.4%", **settings).gaussians, scene)
@@ -114,7 +114,7 @@ def test_faint_scenes_keep_their_coverage(clean: Scene, match: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_pass_neither_blurs_nor_darkens(scene: Scene) -> None:
+def test_second_pass_neither_blurs_nor_darkens(scene: Scene) -> None:
     once = compacted(scene, superpixels="4.4%").gaussians
     unaligned = Scene(once, scene.cameras, scene.images, None, scene.names)
     twice = compact(unaligned, budget=len(once)).gaussians

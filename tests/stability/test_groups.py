@@ -1,4 +1,4 @@
-"""Hostile groups: coincident, degenerate, oversized, transparent, torn in depth (stability.md, cases 1 to 17)."""
+"""Hostile groups are coincident, degenerate, oversized, transparent, torn in depth (stability.md, cases 1 to 17)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def one_group_per_view(scene: Scene) -> FeatureGaussians:
 
 
 @sweep("settings", [{"fit_steps": 10}, {}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}])
-def test_all_gaussians_in_one_place(room: Scene, settings: dict) -> None:
+def test_scene_of_gaussians_in_one_place_is_compacted(room: Scene, settings: dict) -> None:
     columns = {name: getattr(room.gaussians, name) for name in scenes.FIELDS}
     first = {name: np.broadcast_to(column[:1], column.shape) for name, column in columns.items()}
     means = np.broadcast_to([0.0, 0.0, 3.0], room.gaussians.means.shape)
@@ -56,7 +56,7 @@ def test_all_gaussians_in_one_place(room: Scene, settings: dict) -> None:
 # 3: rank-deficient groups
 
 
-def test_coincident_members_stack(small: Scene) -> None:
+def test_coincident_members_add_optical_depths(small: Scene) -> None:
     count = small.pixels_per_view
     same = {name: getattr(small.gaussians, name)[:1].repeat(count, 0) for name in scenes.FIELDS}
     same["opacities"] = np.full(count, 0.02, np.float32)
@@ -72,7 +72,7 @@ def test_coincident_members_stack(small: Scene) -> None:
 
 
 @pytest.mark.parametrize("axes", [[0], [0, 1]], ids=["line", "sheet"])
-def test_flat_groups_have_a_smallest_scale(small: Scene, axes: list[int]) -> None:
+def test_flat_groups_get_a_smallest_scale_of_a_tenth_of_a_pixel(small: Scene, axes: list[int]) -> None:
     means = np.tile([0.0, 0.0, 3.0], (len(small.gaussians), 1))
     means[:, axes] = small.gaussians.means[:, axes]
     scene = changed(small, means=means, scales=np.full_like(small.gaussians.scales, 1e-9))
@@ -87,7 +87,7 @@ def test_flat_groups_have_a_smallest_scale(small: Scene, axes: list[int]) -> Non
 
 
 @pytest.mark.parametrize("size", [2, 3, 4, 16], ids="{} Gaussians".format)
-def test_needle_in_a_group(small: Scene, size: int) -> None:
+def test_needle_makes_no_large_merged_gaussian(small: Scene, size: int) -> None:
     """Aspect 1e4: the merged Gaussian keeps within three times the group's extent."""
     pixels = np.arange(small.pixels.shown.size).reshape(small.pixels.shown.shape)
     scene = scenes.shown_in(small, pixels < size)
@@ -133,12 +133,12 @@ def test_transparent_pixels_leave_nothing(room: Scene, k: int) -> None:
 
 @sweep("fit", ["full", "none"], ids="fit={}".format)
 @pytest.mark.parametrize("opacity", [0.0, 1e-5], ids="opacity {:g}".format)
-def test_wholly_transparent_scene(room: Scene, opacity: float, fit: str) -> None:
+def test_wholly_transparent_scene_is_compacted(room: Scene, opacity: float, fit: str) -> None:
     scene = changed(room, opacities=np.full_like(room.gaussians.opacities, opacity))
     scenes.compacted(scene, fit=fit, fit_steps=10)
 
 
-def test_wholly_opaque_scene(room: Scene) -> None:
+def test_wholly_opaque_scene_is_compacted(room: Scene) -> None:
     compacted(changed(room, opacities=np.ones_like(room.gaussians.opacities)), fit_steps=10)
 
 
@@ -173,7 +173,7 @@ def test_tiny_changes_make_tiny_changes(room: Scene) -> None:
 # 14: something huge and near
 
 
-def test_huge_gaussian_in_front_of_one_camera(room: Scene) -> None:
+def test_huge_gaussian_before_one_camera_changes_no_other_view(room: Scene) -> None:
     means, scales = room.gaussians.means.copy(), room.gaussians.scales.copy()
     eye = room.cameras.centres[0]
     means[0] = eye + 0.02 * (means[0] - eye)
@@ -186,7 +186,7 @@ def test_huge_gaussian_in_front_of_one_camera(room: Scene) -> None:
 
 @sweep("where", ["at", "behind"])
 @sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "k": 4}])
-def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: dict) -> None:
+def test_gaussians_at_or_behind_their_own_camera_cost_little_quality(room: Scene, where: str, settings: dict) -> None:
     means = room.gaussians.means.copy().reshape(3, 36, 48, 3)
     eyes = room.cameras.centres[:, None, None]
     part = means[:, :8, :24]

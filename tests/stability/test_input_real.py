@@ -1,4 +1,4 @@
-"""One real scene, where the measuring data is at hand."""
+"""One real scene is read right, where the measuring data is at hand."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def exports(root: Path) -> ModuleType:
     return load_script(root / "benchmarks" / "captures.py")
 
 
-def test_a_plain_export_lines_up(exports: ModuleType, root: Path, tmp_path: Path) -> None:
+def test_plain_export_lines_up_with_its_pixels(exports: ModuleType, root: Path, tmp_path: Path) -> None:
     ply = exports.write_export(capture(root), tmp_path, "plain", max_views=2)
     loaded = load_scene(ply)
     assert len(loaded.scene) == 2
@@ -37,7 +37,7 @@ def test_a_plain_export_lines_up(exports: ModuleType, root: Path, tmp_path: Path
     assert loaded.notes == ()
 
 
-def test_a_pruned_export_is_followed(exports: ModuleType, root: Path, tmp_path: Path) -> None:
+def test_rows_of_a_pruned_export_find_their_pixels(exports: ModuleType, root: Path, tmp_path: Path) -> None:
     ply = exports.write_export(capture(root), tmp_path, "da3", max_views=2, nested=1.7)
     loaded = load_scene(ply)
     assert loaded.alignment.share_within_1px > 0.999

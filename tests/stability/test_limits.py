@@ -1,4 +1,4 @@
-"""At the ends of what may be asked for: budgets of nearly nothing and of everything, views of hardly any pixels."""
+"""Budgets of nearly nothing and of everything, and views of hardly any pixels, give sound results."""
 
 from __future__ import annotations
 
@@ -28,26 +28,31 @@ def unaligned(scene: Scene) -> Scene:
 
 
 @sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}])
-def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
-    """One Gaussian for each view: met, visible, in the colours of the scene; and one fewer is refused."""
+def test_budget_of_one_gaussian_for_each_view_is_met_in_the_scene_s_colours(
+    room: Scene, settings: dict[str, Any]
+) -> None:
     result = scenes.compacted(room, superpixels="auto", budget=VIEWS, **settings)
     assert len(result.gaussians) == VIEWS
     image, alpha = scenes.images_of(result.gaussians, room.cameras)
     assert alpha.mean() > 0.3
     shown = (image * alpha[..., None]).sum((0, 1, 2)) / alpha.sum()
     assert np.abs(shown - room.images.mean((0, 1, 2))).max() < 0.25
+
+
+@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}])
+def test_budget_below_one_gaussian_for_each_view_is_refused(room: Scene, settings: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="budget"):
         compact(room, budget=VIEWS - 1, **settings)
 
 
 @sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}])
-def test_a_budget_of_everything(room: Scene, settings: dict[str, Any]) -> None:
+def test_budget_of_all_gaussians_keeps_the_input_s_quality(room: Scene, settings: dict[str, Any]) -> None:
     result = scenes.compacted(room, superpixels="auto", budget="100%", fill=True, match="none", **settings)
     assert len(result.gaussians) == room.num_gaussians
     assert scenes.psnr_of(result.gaussians, room) > scenes.psnr_of(room.gaussians, room) - 0.1
 
 
-def test_a_budget_of_every_unaligned_gaussian_changes_none(room: Scene) -> None:
+def test_budget_of_every_unaligned_gaussian_changes_none(room: Scene) -> None:
     result = compact(unaligned(room), budget="100%", **PLAIN)
     assert scenes.identical(result.gaussians, compact(unaligned(room), budget=room.num_gaussians, **PLAIN).gaussians)
     np.testing.assert_allclose(result.gaussians.means, room.gaussians.means, atol=1e-6)
@@ -66,7 +71,7 @@ def test_budgets_without_a_fit_are_met(room: Scene, budget: int, settings: dict[
 
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}])
-def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
+def test_scene_of_four_hundred_tiny_views_is_compacted(settings: dict[str, Any]) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(400, 8, 6))
     result = scenes.compacted(scene, **settings)
     assert 400 * 8 * 6 * 0.001 < len(result.gaussians) < 400 * 8 * 6 * 0.2
@@ -76,7 +81,7 @@ def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
 
 @sweep("size", LONG, ids=[f"{width} x {height}" for width, height in LONG])
 @sweep("settings", [PLAIN, {"fit_steps": 10}])
-def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
+def test_views_of_a_long_side_are_covered_to_their_ends(size: tuple[int, int], settings: dict[str, Any]) -> None:
     width, height = size
     cameras = scenes.arc(2, *size)
     if height > width:

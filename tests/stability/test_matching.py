@@ -1,4 +1,4 @@
-"""Clusters that must not form (stability.md, cases 18 to 20)."""
+"""Some clusters must not form (stability.md, cases 18 to 20)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIZE = 0.05
 
 
 def diameters(features: FeatureGaussians, **settings: object) -> np.ndarray:
-    """Largest distance within each cluster, in standard deviations."""
+    """Return the largest distance within each cluster, in standard deviations."""
     clusters = match(features, MatchOptions(**settings)).clusters  # type: ignore[arg-type]
     means = features.means.astype(np.float64)
     own = [means[clusters == c] for c in np.unique(clusters)]
@@ -26,7 +26,7 @@ def diameters(features: FeatureGaussians, **settings: object) -> np.ndarray:
 
 
 def chain(count: int, apart: float) -> FeatureGaussians:
-    """In a row along x, views taking turns, each overlapping the next."""
+    """Return Gaussians in a row along x, views taking turns, each overlapping the next."""
     means = np.stack([apart * SIZE * np.arange(count), np.zeros(count), np.full(count, 3.0)], 1)
     return scenes.make_features(means, sizes=SIZE, views=np.arange(count) % 7)
 
@@ -76,7 +76,7 @@ def test_wall_seen_by_many_views_does_not_collapse() -> None:
 
 
 def opposite_cameras(width: int = 32, height: int = 24) -> Cameras:
-    """In front of and behind z = 3."""
+    """Return cameras in front of and behind z = 3."""
     centre = np.array([0.0, 0.0, 3.0])
     viewmats = [scenes.look_at(np.array([0.0, 0.0, z]), centre) for z in (0.0, 6.0)]
     return Cameras(np.stack(viewmats), scenes.intrinsics(2, width, height), width, height)

@@ -35,7 +35,7 @@ def shuffle_rows(ply: Path) -> None:
     ids=[f"{width} x {height} seed {seed}" for width, height in SIZES for seed in SEEDS],
     often=3,
 )
-def test_every_photo_stays_as_it_is(tmp_path: Path, size: Any, seed: int) -> None:
+def test_photos_named_by_cameras_stay_beside_noisy_rows(tmp_path: Path, size: Any, seed: int) -> None:
     folder = write_scene(tmp_path / "room", num_views=VIEWS, width=size[0], height=size[1], seed=seed)
     shuffle_rows(folder / "scene.ply")
     for order in ("auto", "none"):

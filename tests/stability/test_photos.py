@@ -1,4 +1,4 @@
-"""Photos as people have them: covered, masked, in bars, in another tone or exposure (stability.md, case 29)."""
+"""Photos are covered, masked, in bars, in another tone or exposure, as people have them (stability.md, case 29)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def sound() -> CompactResult:
 
 
 def over_seeds(scene: Scene, *, aligned: bool = False, **settings: Any) -> float:
-    """Mean PSNR of the view between the photos over five seeds, between which results of so few pixels differ by .5."""
+    """Return the mean PSNR of the view between the photos over five seeds, among which so few pixels differ by .5."""
     results = (compact(scene, **FIT, **settings, seed=seed) for seed in range(5))
     return float(np.mean([novel_psnr(result.gaussians, aligned=aligned) for result in results]))
 
@@ -49,7 +49,7 @@ def usual() -> float:
 
 
 def novel_psnr(gaussians: Gaussians, *, aligned: bool = False) -> float:
-    """PSNR of a view between the photos; ``aligned``: after one factor for its brightness."""
+    """Return the PSNR of a view between the photos; ``aligned``: after one factor for its brightness."""
     camera = scenes.arc(1, WIDTH, HEIGHT, start=-0.2)
     truth = scenes.trace(scenes.room(), camera)[2].reshape(HEIGHT, WIDTH, 3)
     image = np.clip(scenes.images_of(gaussians, camera)[0][0], 0, 1)
@@ -80,7 +80,7 @@ def bars(photos: Photos) -> Photos:
 
 
 def letterbox(photos: Photos) -> Photos:
-    """Every second row, between bars."""
+    """Put every second row between bars."""
     out = np.zeros_like(photos)
     out[:, 9:27] = photos.reshape(VIEWS, 18, 2, WIDTH, 3).mean(2)
     return out
@@ -106,7 +106,9 @@ CASES: dict[str, tuple[Change, float, tuple[str, ...]]] = {
 
 
 @sweep(("change", "loss", "note"), CASES.values(), ids=list(CASES), often=2)
-def test_photos_are_mended(room: Scene, usual: float, change: Change, loss: float, note: tuple[str, ...]) -> None:
+def test_changed_photos_are_mended_or_left_out(
+    room: Scene, usual: float, change: Change, loss: float, note: tuple[str, ...]
+) -> None:
     changed = replace(room, images=change(room.images))
     result = compact(changed, **FIT)
     assert noted(result.report.notes, *note)
@@ -115,7 +117,7 @@ def test_photos_are_mended(room: Scene, usual: float, change: Change, loss: floa
 
 
 @sweep("change", [half, linear], ids=["photos half as bright", "photos in linear light"])
-def test_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Change) -> None:
+def test_changed_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Change) -> None:
     unaligned = Scene(room.gaussians, room.cameras, room.images, None, room.names)
     right, mended = (compact(replace(unaligned, images=images), **FIT) for images in (room.images, change(room.images)))
     assert novel_psnr(mended.gaussians) > novel_psnr(right.gaussians) - 1
@@ -123,7 +125,7 @@ def test_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Chan
     assert "photos_changed" not in right.report.choices
 
 
-def test_sound_photos_stay_as_they_are(room: Scene, sound: CompactResult) -> None:
+def test_sound_photos_stay_unchanged(room: Scene, sound: CompactResult) -> None:
     prepared = prepare(room)
     assert prepared.scene.images is room.images
     assert prepared.scene.masks is None
@@ -147,7 +149,7 @@ def test_a_model_s_own_colours_are_no_difference_where_they_show_the_photo(room:
 
 
 def exposed(room: Scene, gains: np.ndarray) -> Scene:
-    """The scene as a model exports it from photos of several exposures ``[v,3]``."""
+    """Return the scene as a model exports it from photos of several exposures ``[v,3]``."""
     g, each = room.gaussians, gains.astype(np.float32).repeat(room.pixels_per_view, 0)[:, None]
     gaussians = replace(g, sh0=rgb_to_sh0(sh0_to_rgb(g.sh0) * each).astype(np.float32))
     return replace(room, gaussians=gaussians, images=(room.images * gains[:, None, None]).clip(0, 1).astype(np.float32))
@@ -175,7 +177,7 @@ def test_exposures_are_brought_to_their_mean(room: Scene, channels: int) -> None
 
 
 def metered_views(eyes: list[float], targets: list[float]) -> Scene:
-    """A wall that is dark on its left, seen by a camera that makes all photos equally bright."""
+    """Return a wall that is dark on its left, seen by a camera that makes all photos equally bright."""
 
     def lit(surface: scenes.Surface) -> scenes.Surface:
         light = lambda x: (0.25 + 0.25 * x.clip(-1, 2))[..., None]  # noqa: E731

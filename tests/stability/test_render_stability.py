@@ -1,4 +1,4 @@
-"""Hostile but finite input: no crash, no NaN, nothing outside its range."""
+"""Hostile but finite input causes no crash, no NaN and nothing outside its range."""
 
 from __future__ import annotations
 
@@ -54,18 +54,18 @@ row = st.tuples(
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(row, min_size=1, max_size=6), st.sampled_from([(1, 1), (16, 16), (17, 33), (3, 40)]))
-def test_extreme_gaussians(rows: list[tuple[object, ...]], size: tuple[int, int]) -> None:
+def test_extreme_gaussians_are_drawn_finite(rows: list[tuple[object, ...]], size: tuple[int, int]) -> None:
     assert_sane(make(*(list(column) for column in zip(*rows, strict=True)), degree=1), camera(*size))
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1e30], ids="scale {:g}".format)
-def test_scales_of_any_size(scale: float) -> None:
+def test_gaussians_of_any_scale_are_drawn_finite(scale: float) -> None:
     gaussians = make([[0, 0, 1.0]] * 3, [[1, 0, 0, 0]] * 3, [[scale] * 3, [scale, 1, 1], [1, 1, scale]], [0.5] * 3)
     assert_sane(gaussians, camera(20, 20))
     assert render(gaussians, camera(21, 21)).alphas[0, 10, 10, 0] > 0.4
 
 
-def test_a_gaussian_wider_than_the_world_is_flat() -> None:
+def test_gaussian_wider_than_the_world_fills_the_image() -> None:
     alphas = render(make([[0, 0, 1.0]], [[1, 0, 0, 0]], [[1e30] * 3], [0.5]), camera(40, 40)).alphas
     np.testing.assert_allclose(alphas, 0.5, atol=1e-4, rtol=0)
 
@@ -85,7 +85,7 @@ def test_rows_that_are_not_finite_are_not_drawn() -> None:
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
-def test_many_on_one_spot_at_one_depth() -> None:
+def test_gaussians_of_one_depth_are_drawn_in_the_order_of_rows() -> None:
     n = 5000
     gaussians = make([[0, 0, 1.0]] * n, [[1, 0, 0, 0]] * n, [[0.05] * 3] * n, [0.3] * n)
     assert_sane(gaussians, camera(20, 20))
@@ -95,7 +95,7 @@ def test_many_on_one_spot_at_one_depth() -> None:
     assert (peak[100:] == 0).all()
 
 
-def test_more_tiles_than_sixteen_bits_count() -> None:
+def test_image_of_more_tiles_than_sixteen_bits_count_is_drawn() -> None:
     width = height = 16 * 260
     K = np.array([[100.0, 0, 0], [0, 100.0, 0], [0, 0, 1]])
     last = (width - 8) / 100, (height - 8) / 100
@@ -106,7 +106,7 @@ def test_more_tiles_than_sixteen_bits_count() -> None:
     assert tiled.flatten_ids[: tiled.isect_offsets[1]].tolist() == [1]
 
 
-def test_a_very_wide_image() -> None:
+def test_widest_image_is_drawn_to_its_edge_and_a_wider_one_is_refused() -> None:
     width = 32767 * 16
     K = np.array([[100.0, 0, 0], [0, 100.0, 0.5], [0, 0, 1]])
     gaussians = make([[(width - 0.5) / 100, 0, 1.0]], [[1, 0, 0, 0]], [[0.01] * 3], [0.5])

@@ -1,4 +1,4 @@
-"""What fitted results show from outside of the capture: no fog where the input is empty, no holes where it is solid."""
+"""Fitted results show no fog where the input is empty, and no holes where it is solid, from outside."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def room(num_views: int = 4) -> Scene:
 
 
 def two_layers() -> Scene:
-    """A second, fainter Gaussian behind that of each pixel, as a view of its own with the same camera and photo."""
+    """Put a fainter Gaussian behind that of each pixel, as a view of its own with the same camera and photo."""
     front = room(2)
     eyes = np.repeat(front.cameras.centres, front.pixels_per_view, 0)
     g = front.gaussians
@@ -35,7 +35,7 @@ def two_layers() -> Scene:
 
 
 def letterbox() -> Scene:
-    """Black bars above and below in the photos and the colours of their Gaussians."""
+    """Put black bars above and below in the photos and the colours of their Gaussians."""
     scene = room()
     images, sh0 = scene.images.copy(), scene.gaussians.sh0.copy()
     bars = np.zeros(images.shape[:3], bool)
@@ -45,7 +45,7 @@ def letterbox() -> Scene:
 
 
 def masked() -> Scene:
-    """The ball's side of each photo does not count."""
+    """Mask the ball's side of each photo."""
     scene = room()
     masks = np.ones(scene.images.shape[:3], bool)
     masks[:, :, SIZE[0] // 2 :] = False
@@ -53,7 +53,7 @@ def masked() -> Scene:
 
 
 def outliers() -> Scene:
-    """Every fiftieth pixel at a third to three times its depth."""
+    """Move every fiftieth pixel to a third to three times its depth."""
     scene, rng = room(), np.random.default_rng(0)
     eyes = np.repeat(scene.cameras.centres, scene.pixels_per_view, 0)
     factors = np.ones(scene.num_gaussians)
@@ -63,7 +63,7 @@ def outliers() -> Scene:
 
 
 def sky() -> Scene:
-    """Half of each photo is thirty times as far away, in one colour."""
+    """Put half of each photo thirty times as far away, in one colour."""
     surfaces = [scenes.plane(2.2, scenes.waves(1), right=0.0), scenes.plane(60.0, scenes.flat(0.7, 0.8, 0.95))]
     return scenes.make_scene(surfaces, scenes.arc(4, *SIZE))
 
@@ -82,7 +82,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
-def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
+def test_default_fit_leaves_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
     """After the default fit; the floor is of the share of emptiness that is left, far from the outline."""
     scene = SCENES[name]()
     result = scenes.compacted(scene)
@@ -96,7 +96,7 @@ def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
 
 
 @sweep("settings", [{"effort": "draft"}, {"effort": "fast"}, {"k": 4}, {"budget": "20%"}])
-def test_every_effort_and_size(settings: dict[str, object]) -> None:
+def test_no_effort_or_size_leaves_fog_or_holes(settings: dict[str, object]) -> None:
     scene = room()
     result = scenes.compacted(scene, **settings)
     fog = measure_fog(scene.gaussians, {"result": result.gaussians}, scene.cameras)["result"]["all"]

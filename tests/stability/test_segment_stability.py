@@ -1,4 +1,4 @@
-"""The number of threads, the picture's size and real photos."""
+"""Superpixels do not depend on threads, stay exact in wide pictures, and describe real photos."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmerge.stages.superpixels import superpixels
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)
-def test_threads_do_not_matter(segmentation: str) -> None:
+def test_superpixels_are_the_same_on_any_number_of_threads(segmentation: str) -> None:
     noise = np.random.default_rng(1).random((5, 24, 32, 3), np.float32)
     images = np.stack([cv2.blur(image, (3, 3)) for image in noise])
     options = SegmentOptions(superpixels=60, segmentation=segmentation)
@@ -27,7 +27,7 @@ def test_threads_do_not_matter(segmentation: str) -> None:
             np.testing.assert_array_equal(segment(images, options).labels, alone)
 
 
-def test_positions_stay_exact_in_wide_pictures() -> None:
+def test_superpixels_of_wide_pictures_keep_exact_positions() -> None:
     width, spread = 9000, np.float32(1e-5**0.5)
     labels = np.repeat(np.arange(3), 3000)[None].repeat(2, 0)
     rows = region_rows(pad_labels(labels), np.zeros((2, width, 3), np.float32), 3, 3, spread)
@@ -44,7 +44,7 @@ def test_positions_stay_exact_in_wide_pictures() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("density", DENSITIES, ids="{} superpixels".format)
-def test_photos_are_described_well(density: int, floor: Callable[..., None]) -> None:
+def test_superpixels_of_real_photos_reach_the_floor(density: int, floor: Callable[..., None]) -> None:
     scores = []
     for image in photos().values():
         labels = superpixels(image, count_at(image, density))

@@ -1,4 +1,4 @@
-"""Photos that do not show the scene: black, noise, of another scene, of another view (stability.md, case 56)."""
+"""Photos that do not show the scene are left out: black, noise, of another scene or view (stability.md, case 56)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FIT = {"superpixels": 50, "fit_steps": 30, "checkpoint": "none", "poses": "fixed
 
 
 def only(view: int, change: Callable[[Photos], Photos], photos: Photos) -> Photos:
-    """The change in one photo alone."""
+    """Change one photo alone."""
     return np.where(np.arange(VIEWS)[:, None, None, None] == view, change(photos), photos)
 
 
@@ -111,7 +111,7 @@ def test_odd_photos_are_recognised_in_drawings(room: Scene, change: Callable[[Ph
 
 
 @sweep("change", [change for change, odd in SPOILT.items() if len(odd) < VIEWS])
-def test_rows_take_the_place_of_other_pictures(room: Scene, change: Callable[[Photos], Photos]) -> None:
+def test_colours_of_rows_replace_photos_of_something_else(room: Scene, change: Callable[[Photos], Photos]) -> None:
     """Where the photo is that of another view, what both show alike stays."""
     compared, views = compare_photos(PicturedScene.with_pictures(canonicalise(room)[0], change(room.images), None))
     away = np.abs(compared.images - room.images).mean((1, 2, 3))
@@ -133,7 +133,7 @@ def tinted(photos: Photos) -> Photos:
 
 
 def shifted(photos: Photos) -> Photos:
-    """By a pixel, as where the cameras are not exact."""
+    """Shift photos by a pixel, as where the cameras are not exact."""
     return np.roll(photos, 1, 2)
 
 
@@ -142,21 +142,23 @@ def shifted(photos: Photos) -> Photos:
     [np.copy, darker, overexposed, tinted, shifted],
     ids=["unchanged", "darker one by one", "overexposed", "tinted", "shifted by a pixel"],
 )
-def test_right_ones_stay(room: Scene, change: Callable[[Photos], Photos]) -> None:
+def test_photos_of_the_scene_stay(room: Scene, change: Callable[[Photos], Photos]) -> None:
     assert odd_photos(room, change) == []
 
 
-def test_gaussians_that_show_nothing_cannot_tell(room: Scene) -> None:
+def test_gaussians_that_show_nothing_leave_out_no_photo(room: Scene) -> None:
     plain = replace(room, gaussians=replace(room.gaussians, sh0=np.zeros_like(room.gaussians.sh0)))
     assert odd_photos(plain, np.copy) == []
 
 
-def test_photos_of_a_few_pixels_stay() -> None:
+def test_photos_of_a_few_pixels_are_not_left_out() -> None:
     assert odd_photos(scenes.make_scene(scenes.room(), scenes.arc(3, 24, 16)), np.copy) == []
 
 
 @sweep("change", [one_black, one_of_noise, one_of_another_scene])
-def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change: Callable[[Photos], Photos]) -> None:
+def test_fit_without_odd_photos_is_nearly_as_good(
+    room: Scene, unspoilt: CompactResult, change: Callable[[Photos], Photos]
+) -> None:
     """Nearly as good as with all photos, and as the input; the note and the report name them."""
     odd = SPOILT[change]
     result = compact(with_photos(room, change), **FIT)
@@ -170,7 +172,7 @@ def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change:
 
 @sweep("change", [all_black, all_noise, all_of_another_scene])
 @sweep("settings", [{}, {"budget": 125}, {"budget": "auto"}])
-def test_none_is_used_where_most_are_wrong(
+def test_no_photo_is_used_where_most_are_wrong(
     room: Scene, change: Callable[[Photos], Photos], settings: dict[str, Any]
 ) -> None:
     wanted = {**FIT, **settings}
@@ -187,13 +189,13 @@ def test_unaligned_gaussians_are_fitted_to_renders(room: Scene) -> None:
     assert scenes.identical(result.gaussians, without.gaussians)
 
 
-def test_no_note_on_good_photos(unspoilt: CompactResult) -> None:
+def test_good_photos_get_no_note(unspoilt: CompactResult) -> None:
     assert [note for note in unspoilt.report.notes if note != unspoilt.report.worse] == []
     assert "photos_left_out" not in unspoilt.report.choices
 
 
 @pytest.mark.slow
-def test_the_quality_asked_for_is_that_of_the_others(room: Scene) -> None:
+def test_quality_target_is_measured_on_the_other_photos(room: Scene) -> None:
     """A black photo would keep any result from it."""
     result = compact(with_photos(room, one_black), quality="22dB", **FIT)
     assert result.report.unmet is None

@@ -1,4 +1,4 @@
-"""Gaussians in no order that lack something: finite values, views, photos, cameras, anything to see."""
+"""Gaussians in no order may lack finite values, views, photos, cameras, or anything to see."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def room() -> Scene:
 
 
 def compacted(scene: Scene, **settings: Any) -> CompactResult:
-    """A tenth of the pixels, with what must hold of every result checked."""
+    """Compact to a tenth of the pixels, and check what must hold of every result."""
     result = compact(scene, **{"superpixels": "10%", "fit_steps": 10, **settings})
     for name in scenes.FIELDS:
         assert np.isfinite(getattr(result.gaussians, name)).all(), name
@@ -39,7 +39,7 @@ SETTINGS = [
 
 
 @sweep("settings", SETTINGS, often=2)
-def test_every_setting(room: Scene, settings: dict, floor: Callable[..., None]) -> None:
+def test_every_setting_reaches_the_floor(room: Scene, settings: dict, floor: Callable[..., None]) -> None:
     result = compacted(unaligned_scenes.shuffled(room), **settings)
     if settings.get("budget") == 150:
         assert len(result.gaussians) == 150
@@ -47,7 +47,7 @@ def test_every_setting(room: Scene, settings: dict, floor: Callable[..., None]) 
         floor(scenes.psnr_of(result.gaussians, room))
 
 
-def test_values_that_are_not_finite(room: Scene) -> None:
+def test_rows_that_are_not_finite_cost_less_than_a_decibel(room: Scene) -> None:
     g = unaligned_scenes.shuffled(room).gaussians
     columns = {name: getattr(g, name).copy() for name in scenes.FIELDS}
     columns["means"][::50, 1] = np.nan
@@ -67,14 +67,14 @@ def test_values_that_are_not_finite(room: Scene) -> None:
     )
 
 
-def test_nothing_finite(room: Scene) -> None:
+def test_scene_without_a_finite_row_is_refused(room: Scene) -> None:
     g = room.gaussians
     spoilt = replace(unaligned_scenes.without_order(room), gaussians=replace(g, means=np.full_like(g.means, np.nan)))
     with refuses(ValueError, "", "finite", "none"):
         compact(spoilt)
 
 
-def test_few_gaussians_that_nobody_sees_change_nothing(room: Scene) -> None:
+def test_few_gaussians_that_no_view_sees_change_nothing(room: Scene) -> None:
     alone = unaligned_scenes.without_order(room)
     hidden = unaligned_scenes.far_behind(room.gaussians, 20)
     both = replace(alone, gaussians=Gaussians.concat([room.gaussians, hidden]))
@@ -84,18 +84,18 @@ def test_few_gaussians_that_nobody_sees_change_nothing(room: Scene) -> None:
 
 
 @pytest.mark.parametrize("fit", ["none", "full"], ids="fit={}".format)
-def test_one_view(room: Scene, fit: str, floor: Callable[..., None]) -> None:
+def test_one_view_reaches_the_floor(room: Scene, fit: str, floor: Callable[..., None]) -> None:
     single = scenes.take_views(room, [1])
     result = compacted(unaligned_scenes.shuffled(single), fit=fit, fit_steps=20)
     floor(scenes.psnr_of(result.gaussians, single))
 
 
-def test_one_gaussian(room: Scene) -> None:
+def test_one_gaussian_stays_one(room: Scene) -> None:
     middle = room.gaussians[15 * 40 + 20 : 15 * 40 + 21]
     assert len(compacted(replace(unaligned_scenes.without_order(room), gaussians=middle), fit="none").gaussians) == 1
 
 
-def test_without_images(room: Scene, floor: Callable[..., None]) -> None:
+def test_scene_without_photos_reaches_the_floor(room: Scene, floor: Callable[..., None]) -> None:
     blind = replace(unaligned_scenes.shuffled(room), images=None)
     result = compacted(blind, fit_steps=60)
     assert noted(result.report.notes, "no", "photos")
@@ -105,7 +105,7 @@ def test_without_images(room: Scene, floor: Callable[..., None]) -> None:
     floor(scenes.psnr_of(result.gaussians, replace(room, images=own)))
 
 
-def test_without_cameras(room: Scene, floor: Callable[..., None]) -> None:
+def test_scene_without_cameras_reaches_the_floor(room: Scene, floor: Callable[..., None]) -> None:
     blind = Scene(unaligned_scenes.shuffled(room).gaussians, unaligned_scenes.NO_CAMERAS, None, None, ())
     result = compacted(blind, fit_steps=60)
     assert noted(result.report.notes, "no", "cameras")
@@ -113,7 +113,7 @@ def test_without_cameras(room: Scene, floor: Callable[..., None]) -> None:
     floor(scenes.psnr_of(result.gaussians, replace(room, images=own)))
 
 
-def test_far_from_the_origin_without_cameras(room: Scene) -> None:
+def test_cameras_are_placed_as_well_far_from_the_origin(room: Scene) -> None:
     """In geographic coordinates cameras are placed as well as at home."""
     g, shift = room.gaussians, np.array([1e6, -3e6, 400.0])
     there = replace(g, means=g.means + shift)
@@ -124,7 +124,7 @@ def test_far_from_the_origin_without_cameras(room: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_many_more_views_than_gaussians_for_each() -> None:
+def test_count_keeps_to_its_share_with_few_gaussians_for_each_view() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(30, 16, 12))
     few = replace(unaligned_scenes.without_order(scene), gaussians=scene.gaussians[::30])
     result = compacted(few, superpixels="30%", fit="none", poses="fixed")
@@ -132,7 +132,7 @@ def test_many_more_views_than_gaussians_for_each() -> None:
 
 
 @pytest.mark.parametrize("degree", [1, 3], ids="degree {}".format)
-def test_harmonics_survive(degree: int) -> None:
+def test_harmonics_keep_their_degree(degree: int) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
     result = compacted(unaligned_scenes.shuffled(scene))
     assert result.gaussians.sh_degree == degree
@@ -140,7 +140,7 @@ def test_harmonics_survive(degree: int) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2], ids="threads={}".format)
-def test_stacked_layers(room: Scene, threads: int, floor: Callable[..., None]) -> None:
+def test_layers_in_one_place_reach_the_floor(room: Scene, threads: int, floor: Callable[..., None]) -> None:
     """Every Gaussian four times at one place, fainter: layers that hide nothing and are hidden by nothing."""
     g = room.gaussians
     layers = Gaussians.concat([replace(g, opacities=1 - (1 - g.opacities) ** 0.25)] * 4)
@@ -148,7 +148,7 @@ def test_stacked_layers(room: Scene, threads: int, floor: Callable[..., None]) -
     floor(scenes.psnr_of(result.gaussians, room))
 
 
-def test_empty_sky() -> None:
+def test_no_gaussians_are_put_into_empty_sky() -> None:
     """Superpixels without a Gaussian are left out, and their share is spent on the ball."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36))
     near = scene.gaussians.means[:, 2] < 3.3

@@ -1,4 +1,4 @@
-"""Recursive bisection, and the errors of its children, against slow, obvious numpy in float64."""
+"""Recursive bisection and the errors of its children match slow, obvious numpy in float64."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Case:
         return self.starts, self.ids, self.means, self.sh, self.opacities, self.centres, self.footprints
 
     def children(self, count: int | np.ndarray) -> list[list[frozenset[int]]]:
-        """The children of every group."""
+        """Return the children of every group."""
         starts, ids, parents = bisect(*self.arrays(), count)
         assert (np.diff(starts) > 0).all()
         actual: list[list[frozenset[int]]] = [[] for _ in self.groups]
@@ -81,7 +81,7 @@ class Case:
         return np.maximum(self.opacities[rows].astype(float), 1e-3)
 
     def error(self, group: int, parts: list[frozenset[int]]) -> float:
-        """Weighted squared error of all children of a group."""
+        """Return the weighted squared error of all children of a group."""
         rows = [np.array(sorted(p)) for p in parts]
         return sum(np.trace(scatter(self.features(group, r), self.weights(r))) for r in rows)
 
@@ -97,7 +97,7 @@ def test_every_member_is_in_exactly_one_child(seed: int, count: int) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("coarse", "fine"), [(1, 2), (2, 3), (2, 4), (4, 8)])
-def test_children_nest(coarse: int, fine: int, seed: int) -> None:
+def test_more_children_are_parts_of_fewer_children(coarse: int, fine: int, seed: int) -> None:
     case = Case(seed)
     for large, small in zip(case.children(coarse), case.children(fine), strict=True):
         assert all(any(part <= whole for whole in large) for part in small)
@@ -127,7 +127,7 @@ def test_transparent_members_are_still_dealt_out() -> None:
     assert [len(parts) for parts in case.children(4)] == [1, 2, 3, 4, 4]
 
 
-def test_first_group_may_start_late() -> None:
+def test_starts_of_groups_need_not_begin_at_zero() -> None:
     """A task works on a range of the groups: starts need not begin at zero."""
     case = Case(2)
     starts, ids, parents = bisect(
@@ -139,7 +139,7 @@ def test_first_group_may_start_late() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_errors_are_those_of_the_children(seed: int) -> None:
+def test_errors_of_splits_match_their_children(seed: int) -> None:
     """Colour about its mean and positions about their plane, weighted by opacity, times the number of members."""
     case = Case(seed, (1, 2, 7, 40))
 
@@ -161,7 +161,7 @@ def test_errors_are_those_of_the_children(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_own_counts_give_the_same_children_as_one_for_all(seed: int) -> None:
+def test_counts_of_single_groups_give_the_children_of_a_common_count(seed: int) -> None:
     case, counts = Case(seed), np.array([3, 1, 2, 5, 4])
     assert case.children(counts) == [case.children(int(count))[g] for g, count in enumerate(counts)]
 
@@ -191,7 +191,7 @@ def test_no_groups_have_no_children() -> None:
 
 
 @pytest.mark.parametrize("row", [-1, 3, 2**31 - 1])
-def test_members_that_are_none_are_refused(row: int) -> None:
+def test_ids_of_members_outside_are_refused(row: int) -> None:
     case = Case(0, (1, 2))
     case.ids[1] = row
     with refuses(ValueError, "split_groups", "indices"):
@@ -199,12 +199,12 @@ def test_members_that_are_none_are_refused(row: int) -> None:
 
 
 @pytest.mark.parametrize("starts", [[0, 1, 4], [-1, 1, 3], [2, 1, 3]])
-def test_groups_beyond_the_members_are_refused(starts: list[int]) -> None:
+def test_starts_of_groups_outside_are_refused(starts: list[int]) -> None:
     _, *arrays = Case(0, (1, 2)).arrays()
     with pytest.raises(ValueError, match="split_groups: "):
         bisect(np.array(starts), *arrays, 2)
 
 
-def test_no_children_are_refused() -> None:
+def test_count_of_zero_children_is_refused() -> None:
     with refuses(ValueError, "split_groups: counts", 0):
         bisect(*Case(0).arrays(), 0)

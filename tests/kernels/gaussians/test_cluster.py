@@ -1,4 +1,4 @@
-"""Overlaps and clusters against slow, obvious numpy in float64."""
+"""Overlaps and clusters match slow, obvious numpy in float64."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def overlap(a: Gaussian, b: Gaussian) -> float:
 
 
 def overlap_reference(a: Gaussian, b: Gaussian) -> float:
-    """exp(-D_B), Bhattacharyya 1943."""
+    """Return exp(-D_B), Bhattacharyya 1943."""
     middle, delta = (a[1] + b[1]) / 2, b[0] - a[0]
     distance = delta @ np.linalg.solve(middle, delta) / 8
     dets = [np.linalg.det(c) for c in (middle, a[1], b[1])]
@@ -49,7 +49,7 @@ def box_reference(a: Gaussian, b: Gaussian) -> float:
     return float(shared / (np.prod(2 * sides[0]) + np.prod(2 * sides[1]) - shared))
 
 
-def test_overlaps_match() -> None:
+def test_overlaps_match_the_formulas() -> None:
     gaussians = random_gaussians(40, 0)
     for a in gaussians[:20]:
         for b in gaussians[20:]:
@@ -59,7 +59,7 @@ def test_overlaps_match() -> None:
             assert box == pytest.approx(box_reference(a, b), rel=1e-9)
 
 
-def test_overlap_of_equal_and_of_far_ones() -> None:
+def test_overlap_is_one_for_equal_and_zero_for_far_gaussians() -> None:
     a = random_gaussians(1, 1)[0]
     far = (a[0] + 1e4, a[1])
     assert overlap(a, a) == pytest.approx(1)
@@ -68,7 +68,7 @@ def test_overlap_of_equal_and_of_far_ones() -> None:
     assert box_overlap(a[0], upper(a[1]), far[0], upper(a[1])) == 0
 
 
-def test_overlap_of_flat_ones() -> None:
+def test_flat_gaussians_overlap_with_nothing() -> None:
     """Singular covariances overlap with nothing rather than with everything."""
     zero = (np.zeros(3), np.zeros((3, 3)))
     assert overlap(zero, zero) == 0
@@ -79,7 +79,7 @@ def test_overlap_of_flat_ones() -> None:
 
 @pytest.mark.parametrize("width", [0, 3])
 @pytest.mark.parametrize("boxes", [True, False])
-def test_edge_scores_match(boxes: bool, width: int) -> None:
+def test_edge_scores_match_the_formulas(boxes: bool, width: int) -> None:
     gaussians = random_gaussians(30, 5, 0.2)
     rng = np.random.default_rng(0)
     neighbors = rng.integers(-1, 30, (30, 6))
@@ -126,7 +126,7 @@ def as_sets(clusters: np.ndarray, count: int) -> list[set[int]]:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("most", [1, 2, 4, 9])
-def test_leader_clusters_match(seed: int, most: int) -> None:
+def test_leader_clusters_match_a_slow_twin(seed: int, most: int) -> None:
     rng = np.random.default_rng(seed)
     n, k = 60, 8
     neighbors = np.stack([rng.permutation([j for j in range(n) if j != i])[:k] for i in range(n)])
@@ -141,7 +141,7 @@ def test_leader_clusters_match(seed: int, most: int) -> None:
         assert len({views[i] for i in cluster}) == len(cluster)
 
 
-def test_leaders_do_not_chain() -> None:
+def test_leader_clusters_do_not_chain() -> None:
     """a - b - c with no edge a - c: led by a, c stays alone; led by b, all three are one."""
     neighbors = np.array([[1, -1], [0, 2], [1, -1]])
     scores, views = np.where(neighbors >= 0, 0.9, -1.0), np.arange(3)
@@ -150,7 +150,7 @@ def test_leaders_do_not_chain() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_connected_components_match(seed: int) -> None:
+def test_connected_components_match_scipy_s(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n, k = 80, 3
     neighbors, scores = rng.integers(-1, n, (n, k)), rng.uniform(0, 1, (n, k))
@@ -197,7 +197,7 @@ def test_nothing_has_no_clusters() -> None:
 
 
 @pytest.mark.parametrize("neighbor", [2, 2**62])
-def test_neighbours_that_are_none_are_refused(neighbor: int) -> None:
+def test_ids_of_neighbours_outside_are_refused(neighbor: int) -> None:
     neighbors, ones, views = np.array([[1], [neighbor]]), np.ones((2, 3)), np.array([0, 1])
     scores, order = np.ones((2, 1)), np.array([0, 1])
     latents, covars = np.empty((2, 0), np.float32), np.ones((2, 6))

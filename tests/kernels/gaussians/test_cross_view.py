@@ -1,4 +1,4 @@
-"""What other views say of points, against one point and one view at a time."""
+"""What other views say of points matches a loop over one point and one view at a time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsmerge.types import SH_C0, Cameras, Scene
 def slowly(
     means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras, most: int | None = None
 ) -> np.ndarray:
-    """``[g,7]``: a loop over points and views."""
+    """Return the statistics ``[g,7]`` by a loop over points and views."""
     distances = camera_distances(cameras)
     places, depths = project(means, cameras)
     actual = np.zeros((len(means), 7))
@@ -52,7 +52,7 @@ def scene() -> Scene:
     return make_scene(room(), arc(4, 24, 18))
 
 
-def test_every_point_and_view(scene: Scene) -> None:
+def test_statistics_match_a_loop_over_points_and_views(scene: Scene) -> None:
     """Points on surfaces, before and behind them, behind cameras, and of no view."""
     rng = np.random.default_rng(0)
     rows = rng.permutation(len(scene.gaussians))[:160]
@@ -71,7 +71,7 @@ def test_every_point_and_view(scene: Scene) -> None:
         np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
-def test_pixels_show_the_gaussians_that_are_named(scene: Scene) -> None:
+def test_statistics_do_not_depend_on_the_order_of_rows(scene: Scene) -> None:
     """Rows in another order with the pixels that show them say what the grid says; pixels without any say nothing."""
     members, g, cameras = scene_members(scene), scene.gaussians, scene.cameras
     order = np.random.default_rng(1).permutation(len(g))
@@ -89,7 +89,7 @@ def test_pixels_show_the_gaussians_that_are_named(scene: Scene) -> None:
         cross_view_stats(g.means, g.sh0, views, replace(shuffled, fronts=fronts + len(g)), cameras)
 
 
-def test_transparent_pixels_and_single_views_say_nothing() -> None:
+def test_transparent_pixels_single_views_or_no_points_give_no_statistics() -> None:
     scene = make_scene(room(), arc(2))
     members, g = scene_members(scene), scene.gaussians
     views = np.zeros(len(g), np.int64)
@@ -128,7 +128,7 @@ def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type:
     assert not sums[:3].any()
 
 
-def test_pixels_and_points_outside_are_refused() -> None:
+def test_ranges_of_points_or_pixels_outside_are_refused() -> None:
     assert random_sums(0, 72).shape == (0, 6)
     for arguments in ((500, 72, 0, 500, 1), (5, 72, 0, 6), (5, 72, -1, 5)):
         with pytest.raises(ValueError, match="sum_cross_view: "):

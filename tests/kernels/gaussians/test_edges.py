@@ -1,4 +1,4 @@
-"""Gaussians cut at the edges of photos, against the formulas of the truncated normal distribution."""
+"""Gaussians cut at the edges of photos match the formulas of the truncated normal distribution."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ REACH = 2.0
 
 
 def make_planes(views: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Planes of cameras near the origin that look along z, each with a frustum of its own."""
+    """Make planes of cameras near the origin that look along z, each with a frustum of its own."""
     random = np.random.default_rng(seed)
     left, right, top, bottom = random.uniform([-0.9, 0.2, -0.7, 0.1], [-0.2, 0.9, -0.1, 0.7], (views, 4)).T
     zero, one = np.zeros(views), np.ones(views)
@@ -27,7 +27,7 @@ def make_planes(views: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cut_slowly(mean: np.ndarray, covar: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Mean and covariance of one Gaussian after two cuts at most, and whether it is cut."""
+    """Return mean and covariance of one Gaussian after two cuts at most, and whether it is cut."""
     is_cut = False
     for _ in range(2):
         sigmas = np.array([[sqrt(n @ covar @ n) for n in view] for view in normals])
@@ -45,7 +45,7 @@ def cut_slowly(mean: np.ndarray, covar: np.ndarray, normals: np.ndarray, offsets
 
 
 def cut(gaussians: Gaussians, normals: np.ndarray, offsets: np.ndarray, *spans: tuple[int, int]) -> tuple:
-    """The kernel's means, covariances and marks."""
+    """Return the kernel's means, covariances and marks."""
     means, num = gaussians.means.astype(np.float32), len(gaussians)
     covars, is_cut = np.full((num, 3, 3), np.nan), np.zeros(num, np.uint8)
     columns = gaussians.quats.astype(np.float32), gaussians.scales.astype(np.float32)
@@ -55,7 +55,7 @@ def cut(gaussians: Gaussians, normals: np.ndarray, offsets: np.ndarray, *spans: 
 
 
 @pytest.mark.parametrize(("count", "views", "seed"), [(300, 1, 0), (300, 5, 1), (200, 12, 2), (0, 3, 3), (1, 2, 4)])
-def test_same_as_formulas(count: int, views: int, seed: int) -> None:
+def test_cut_gaussians_match_the_truncated_normal_distribution(count: int, views: int, seed: int) -> None:
     gaussians, planes = random_gaussians(count, seed, size=-2.0), make_planes(views, seed)
     means, covars, is_cut = cut(gaussians, *planes)
     whole = covariances(gaussians.quats.astype(np.float64), gaussians.scales.astype(np.float64))
@@ -68,7 +68,7 @@ def test_same_as_formulas(count: int, views: int, seed: int) -> None:
     assert count < 200 or 0.1 < is_cut.mean() < 0.9
 
 
-def test_pieces_are_as_the_whole() -> None:
+def test_gaussians_cut_in_pieces_are_those_cut_at_once() -> None:
     gaussians, planes = random_gaussians(100, 5), make_planes(3, 5)
     for whole, pieces in zip(
         cut(gaussians, *planes), cut(gaussians, *planes, (0, 33), (33, 33), (33, 100)), strict=True
@@ -76,7 +76,7 @@ def test_pieces_are_as_the_whole() -> None:
         np.testing.assert_array_equal(whole, pieces)
 
 
-def test_moments_are_those_of_the_part_inside() -> None:
+def test_cut_gaussian_has_the_moments_of_the_part_inside() -> None:
     """Points drawn from a Gaussian that one edge cuts, those beyond left out."""
     normals = np.zeros((1, NUM_EDGES, 3))
     normals[0, :, 0] = 1
@@ -98,7 +98,7 @@ def test_moments_are_those_of_the_part_inside() -> None:
 
 
 def cut_once(mean: np.ndarray, covar: np.ndarray, normal: np.ndarray, offset: float) -> tuple[np.ndarray, np.ndarray]:
-    """Moments of what lies inside of one plane."""
+    """Return moments of what lies inside of one plane."""
     sigma = sqrt(normal @ covar @ normal)
     room = (offset - normal @ mean) / sigma
     hazard = exp(-room * room / 2) / sqrt(2 * pi) / (0.5 + 0.5 * erf(room / sqrt(2)))
@@ -106,7 +106,7 @@ def cut_once(mean: np.ndarray, covar: np.ndarray, normal: np.ndarray, offset: fl
     return mean - across / sigma * hazard, covar - np.outer(across, across) * hazard * (hazard + room) / sigma**2
 
 
-def test_inside_and_far_outside_stay() -> None:
+def test_gaussians_inside_or_far_outside_stay_uncut() -> None:
     normals, offsets = make_planes(1, 8)
     offsets = np.zeros_like(offsets)
     gaussians = random_gaussians(2, 8)

@@ -1,4 +1,4 @@
-"""Pixels of Gaussians and what pixels show, against a loop over Gaussians in order of depth."""
+"""Pixels of Gaussians, and what pixels show, match a loop over Gaussians in order of depth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CASES = [(400, 0, 0.5, -3.5), (150, 1, 3.0, -1.5), (60, 2, 0.1, -0.5), (0, 3, 0.
 
 
 def slowly(gaussians: Gaussians, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weights ``[n]``, pixels ``[n]`` and fronts ``[h,w]`` of a view."""
+    """Return weights ``[n]``, pixels ``[n]`` and fronts ``[h,w]`` of a view."""
     places, depths = project(gaussians.means.astype(np.float64), CAMERAS[[view]])
     weights, pixels = np.zeros(len(gaussians)), np.full(len(gaussians), -1)
     passing, most, fronts = np.ones((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH)), np.full((HEIGHT, WIDTH), -1)
@@ -50,7 +50,7 @@ def slowly(gaussians: Gaussians, view: int) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def weigh(gaussians: Gaussians, view: int) -> tuple[np.ndarray, ...]:
-    """The kernel's rows, pixels, weights and fronts."""
+    """Return the kernel's rows, pixels, weights and fronts."""
     fronts = np.empty((HEIGHT, WIDTH), np.int32)
     columns = (np.ascontiguousarray(column, np.float32) for column in (gaussians.means, gaussians.scales))
     opacities = gaussians.opacities.astype(np.float32)
@@ -60,7 +60,7 @@ def weigh(gaussians: Gaussians, view: int) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("view", [0, 1, 2])
-def test_weights_pixels_and_fronts(case: tuple[int, int, float, float], view: int) -> None:
+def test_weights_pixels_and_fronts_match_a_loop(case: tuple[int, int, float, float], view: int) -> None:
     n, seed, opacity, size = case
     gaussians = random_gaussians(n, seed, opacity=opacity, size=size)
     ids, pixels, weights, fronts = weigh(gaussians, view)
@@ -72,7 +72,7 @@ def test_weights_pixels_and_fronts(case: tuple[int, int, float, float], view: in
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_best_of_all_views(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pixel_is_in_the_view_of_largest_weight(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pixels_module, "choose_level", lambda *_: 0)  # cells of one pixel
     gaussians = random_gaussians(300, seed, size=-2.5)
     pixels = find_pixels(Scene(gaussians, CAMERAS, None, None, tuple("abc"))).homes
@@ -96,7 +96,7 @@ def test_of_equal_views_the_first_and_of_equal_depths_the_first_row() -> None:
     assert fronts.reshape(-1)[pixels].tolist() == [0, 0]
 
 
-def test_what_is_behind_the_camera_has_no_pixel() -> None:
+def test_gaussian_behind_the_camera_has_no_pixel() -> None:
     gaussians = random_gaussians(50, 0)
     behind = replace(gaussians, means=-np.abs(gaussians.means))
     ids, _, _, fronts = weigh(behind, 0)

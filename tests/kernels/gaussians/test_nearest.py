@@ -1,3 +1,5 @@
+"""Neighbours of other views match a search through all of them."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -11,7 +13,7 @@ from gsmerge.runtime.threads import use_threads
 
 @pytest.mark.parametrize("views", [1, 2, 5])
 @pytest.mark.parametrize("num", [1, 3, 16, 17, 40, 250])
-def test_neighbours_of_other_views(num: int, views: int) -> None:
+def test_neighbours_match_a_search_through_all(num: int, views: int) -> None:
     """As a search through all of them."""
     generator = np.random.default_rng(num)
     means, owners, count = generator.normal(size=(num, 3)), generator.integers(-1, views, num), 4
@@ -37,7 +39,7 @@ def test_neighbours_are_the_same_on_any_number_of_threads() -> None:
         np.testing.assert_allclose(np.linalg.norm(means[results[0][i]] - means[i], axis=1), near)
 
 
-def test_what_lies_behind_thousands_of_the_own_view_is_not_looked_for() -> None:
+def test_search_ends_among_thousands_of_the_own_view() -> None:
     crowd = np.random.default_rng(0).normal(size=(5000, 3))
     neighbors = nearest_of_other_views(np.concatenate([crowd, [[50, 0, 0]]]), np.array([0] * 5000 + [1]), 4)
     assert (neighbors[:5000] == -1).mean() > 0.9
@@ -53,12 +55,11 @@ def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type:
 
 
 @pytest.mark.parametrize(("num", "count"), [(0, 4), (1, 4), (1, 0), (40, 0)])
-def test_few_have_few_neighbours(num: int, count: int) -> None:
-    neighbors = nearest_of_other_views(np.ones((num, 3)), np.zeros(num, np.int64), count)
-    assert neighbors.tolist() == [[-1] * count] * num
+def test_gaussians_of_one_view_have_no_neighbours(num: int, count: int) -> None:
+    assert nearest_of_other_views(np.ones((num, 3)), np.zeros(num, np.int64), count).tolist() == [[-1] * count] * num
 
 
-def test_trees_that_are_none_are_refused() -> None:
+def test_damaged_trees_are_refused() -> None:
     points, views, order = np.random.default_rng(0).normal(size=(40, 3)), np.arange(40), np.arange(40)
     axes, splits, out = np.empty(16, np.int8), np.empty(16), np.empty((40, 4), np.int64)
     with refuses(ValueError, "build_tree", "indices"):
@@ -78,7 +79,7 @@ def test_trees_that_are_none_are_refused() -> None:
 
 @pytest.mark.parametrize("kinds", [2, 10, 10**6])
 @pytest.mark.parametrize("num", [1, 2, 3, 17, 400])
-def test_one_place_is_as_sorted(num: int, kinds: int) -> None:
+def test_partition_puts_at_one_place_what_sorting_would(num: int, kinds: int) -> None:
     """As numpy's partition, with many equal values and without."""
     rng = np.random.default_rng(num)
     values = rng.integers(0, kinds, num).astype(float)
@@ -93,7 +94,7 @@ def test_one_place_is_as_sorted(num: int, kinds: int) -> None:
         assert (reordered[place:] >= reordered[place]).all()
 
 
-def test_an_order_against_the_pivots_is_sorted_instead() -> None:
+def test_partition_sorts_an_order_against_its_pivots() -> None:
     """Every pivot is the smallest value that is left, so that halving would take a pass for each value."""
     num = 4096
     values, slots = np.empty(num), list(range(num))
@@ -106,7 +107,7 @@ def test_an_order_against_the_pivots_is_sorted_instead() -> None:
     np.testing.assert_array_equal(values[order], np.arange(num))
 
 
-def test_only_a_run_is_reordered() -> None:
+def test_partition_reorders_its_run_alone() -> None:
     """Through an order that holds some of the values; the values stay as they are."""
     rng = np.random.default_rng(0)
     values, order = rng.normal(size=200), rng.permutation(200)[:90]
@@ -119,7 +120,7 @@ def test_only_a_run_is_reordered() -> None:
     assert values[order[31]] == np.partition(values[before[20:70]], 11)[11]
 
 
-def test_nan_ends() -> None:
+def test_partition_of_nan_ends_with_all_ids() -> None:
     values, order = np.full(50, np.nan), np.arange(50)
     values[::3] = np.arange(17)
     partition(values, order, 0, 50, 25)
@@ -127,7 +128,7 @@ def test_nan_ends() -> None:
 
 
 @pytest.mark.parametrize("run", [(0, 4, 1), (-1, 3, 1), (1, 3, 0), (0, 2, 2), (0, 0, 0)])
-def test_places_outside_are_refused(run: tuple[int, int, int]) -> None:
+def test_partition_refuses_places_outside(run: tuple[int, int, int]) -> None:
     with pytest.raises(ValueError, match="partition: "):
         partition(np.zeros(3), np.arange(3), *run)
     with refuses(ValueError, "partition: order", "below 3", 3):

@@ -1,4 +1,4 @@
-"""The optimiser's step against a slow, obvious twin in float64."""
+"""The optimiser's step matches a slow, obvious twin in float64."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def make_run(count: int, seed: int = 0) -> Run:
 
 
 def gradients(count: int, seed: int, share: float = 0.6, size: float = 1.0) -> Wanted:
-    """Of a part of the rows."""
+    """Return random gradients of a part of the rows."""
     rng = np.random.default_rng(seed)
     ids = np.flatnonzero(rng.random(count) < share).astype(np.int32)
 
@@ -94,7 +94,7 @@ def step_kernel(run: Run, g: Wanted, step: int, pieces: list[int] | None = None,
 
 
 def step_slowly(run: Run, g: Wanted, step: int) -> None:
-    """The textbook (Kingma and Ba, 2015; Dozat, 2016), row by row in float64, with what the kernel's docstring says."""
+    """Step as the textbook (Kingma and Ba, 2015; Dozat, 2016) and the kernel's docstring say, row by row in float64."""
     for k, i in enumerate(g.ids):
         alpha = run.opacities[i]
         row = np.concatenate([
@@ -128,7 +128,7 @@ def step_slowly(run: Run, g: Wanted, step: int) -> None:
         run.scales[i], run.opacities[i] = elementary.exp(x[SIZE:QUAT]), 1 / (1 + elementary.exp(-x[LOGIT]))
 
 
-def test_steps_match_the_slow_twin() -> None:
+def test_steps_match_a_slow_twin() -> None:
     """Thirty steps, each with gradients of other rows; long enough for many to reach the box."""
     run = make_run(40)
     slow = Run(*(getattr(run, f.name).astype(np.float64) for f in fields(run)))
@@ -168,7 +168,7 @@ def test_colours_that_begin_outside_the_range_may_stay_there() -> None:
     assert (run.x[:, COLOR + 1] < 1.5).all()
 
 
-def test_least_size_holds_within_the_box_and_beyond() -> None:
+def test_sizes_stay_above_the_least_within_the_box_and_beyond() -> None:
     """Pulled smaller for thirty steps: half of them may not shrink at all, one begins below what is allowed."""
     run, g = make_run(20), gradients(20, seed=1, share=1.1)
     g.scales[:] = 1
@@ -184,7 +184,7 @@ def test_least_size_holds_within_the_box_and_beyond() -> None:
 
 
 @pytest.mark.parametrize("pieces", [[0, 1, 33], [0, 16, 33], [0, 5, 6, 6, 20, 33]])
-def test_rows_may_be_split_anywhere(pieces: list[int]) -> None:
+def test_steps_in_pieces_have_the_same_bits_as_at_once(pieces: list[int]) -> None:
     whole, split = make_run(33), make_run(33)
     for step in range(1, 8):
         g = gradients(33, seed=step, share=1.1)
@@ -194,7 +194,7 @@ def test_rows_may_be_split_anywhere(pieces: list[int]) -> None:
         np.testing.assert_array_equal(getattr(split, f.name), getattr(whole, f.name), err_msg=f.name)
 
 
-def test_zero_quaternion_stays_finite() -> None:
+def test_step_from_a_zero_quaternion_is_finite() -> None:
     run = make_run(3)
     run.x[0, TURN] = run.quats[0] = 0
     g = gradients(3, seed=0, share=1.1)
@@ -231,7 +231,7 @@ def test_rows_that_are_not_finite_leave_their_neighbours_alone() -> None:
 
 
 @pytest.mark.parametrize("wrong", [-1, 20, 2**31 - 1])
-def test_rows_outside_are_refused(wrong: int) -> None:
+def test_ids_of_rows_outside_are_refused(wrong: int) -> None:
     run, g = make_run(20), gradients(20, seed=0, share=1.1)
     before = run.copy()
     g.ids[10] = wrong

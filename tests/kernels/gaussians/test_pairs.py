@@ -1,4 +1,4 @@
-"""Merging pair by pair against slow, obvious numpy in float64."""
+"""Merging pair by pair matches slow, obvious numpy in float64."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def cloud_of(count: int, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def merge_two(first: tuple, second: tuple) -> tuple:
-    """Mean, covariance, mass, colour and weight of two."""
+    """Return the mean, covariance, mass, colour and weight of two."""
     share = second[2] / (first[2] + second[2])
     apart = second[0] - first[0]
     covar = (1 - share) * first[1] + share * second[1] + share * (1 - share) * np.outer(apart, apart)
@@ -40,7 +40,7 @@ def merge_two(first: tuple, second: tuple) -> tuple:
 
 
 def cost_of(first: tuple, second: tuple) -> float:
-    """Runnalls' bound per mass, and the distance of the colours, times both weights."""
+    """Return Runnalls' bound per mass, and the distance of the colours, times both weights."""
     both = merge_two(first, second)
     logs = [np.linalg.slogdet(one[1])[1] for one in (both, first, second)]
     lost = 0.5 * (logs[0] - (first[2] * logs[1] + second[2] * logs[2]) / both[2])
@@ -48,7 +48,7 @@ def cost_of(first: tuple, second: tuple) -> float:
 
 
 def agglomerate_slowly(cloud: dict[str, np.ndarray], rows: np.ndarray, least: int) -> tuple[list, list[float]]:
-    """Pairs and costs of one cell: every pair is measured anew before every merge."""
+    """Return pairs and costs of one cell; measure every pair anew before every merge."""
     means, masses = cloud["means"][rows], cloud["masses"][rows].astype(float)
     covars = np.zeros((len(rows), 3, 3))
     covars[:, UPPER[0], UPPER[1]] = covars[:, UPPER[1], UPPER[0]] = cloud["covars"][rows]
@@ -77,7 +77,7 @@ def run(cloud: dict[str, np.ndarray], order: np.ndarray, starts: np.ndarray, lea
     return pairs, costs
 
 
-def test_the_cheapest_pair_is_merged_again_and_again() -> None:
+def test_cheapest_pair_is_merged_until_the_wanted_share_is_left() -> None:
     cloud, order = cloud_of(33), np.random.default_rng(1).permutation(33)
     starts = np.array([0, 12, 13, 13, 33])
     pairs, costs = run(cloud, order, starts, 0.25)
@@ -92,7 +92,7 @@ def test_the_cheapest_pair_is_merged_again_and_again() -> None:
             members[first] |= members.pop(second)
 
 
-def test_moments_are_those_of_the_formula() -> None:
+def test_moments_of_gaussians_match_the_formulas() -> None:
     g = random_gaussians(50, 2)
     quats = (g.quats * 3).astype(np.float32)
     covars, masses = np.empty((50, 6), np.float32), np.empty(50, np.float32)
@@ -125,7 +125,7 @@ def test_merged_rows_have_the_moments_of_all() -> None:
     assert np.array_equal(sh[3], before[3])
 
 
-def test_what_points_outside_is_refused() -> None:
+def test_ranges_and_pairs_outside_are_refused() -> None:
     cloud, order = cloud_of(CELL + 1), np.arange(CELL + 1)
     with refuses(ValueError, "agglomerate", "indices"):
         run(cloud, order, np.array([0, CELL + 1]), 0.5)  # more than a cell holds
@@ -141,7 +141,7 @@ def test_what_points_outside_is_refused() -> None:
         merge_pairs(np.array([[0, -1]], np.int32), *moments, sh, sizes)
 
 
-def test_numbers_that_are_none_end_a_cell() -> None:
+def test_cell_with_infinite_costs_ends() -> None:
     cloud = cloud_of(8)
     cloud["means"][3] = 1e300
     pairs, costs = run(cloud, np.arange(8), np.array([0, 8]), 0.1)

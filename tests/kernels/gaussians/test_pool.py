@@ -1,4 +1,4 @@
-"""Pooling and decomposition against slow, obvious numpy in float64."""
+"""Pooling and decomposition match slow, obvious numpy in float64."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def rotation(quat: np.ndarray) -> np.ndarray:
 
 
 def pool_reference(members: dict[str, np.ndarray], rows: list[int], own: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The 13 numbers and the harmonics of one group, from the formulas in docs of the kernel."""
+    """Return the 13 numbers and the harmonics of one group, from the formulas in docs of the kernel."""
     means, scales = members["means"][rows].astype(float), members["scales"][rows].astype(float)
     opacities = np.minimum(members["opacities"][rows].astype(float), 0.995)
     footprints = members["footprints"][rows].astype(float)
@@ -70,12 +70,7 @@ def pooled(members: dict[str, np.ndarray], groups: list[list[int]], own: bool = 
     return geometry, sh
 
 
-@pytest.mark.parametrize("own", [True, False])
-@pytest.mark.parametrize("seed", range(3))
-def test_pool_matches(own: bool, seed: int) -> None:
-    members = random_members(200, seed)
-    rng = np.random.default_rng(seed)
-    groups = [sorted(rng.choice(200, size, replace=False).tolist()) for size in (1, 2, 3, 30, 160)]
+def assert_pooled_by_the_formulas(members: dict[str, np.ndarray], groups: list[list[int]], own: bool) -> None:
     geometry, sh = pooled(members, groups, own)
     for g, rows in enumerate(groups):
         expected, wanted_sh = pool_reference(members, rows, own)
@@ -84,19 +79,24 @@ def test_pool_matches(own: bool, seed: int) -> None:
 
 
 @pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_pooled_groups_match_the_formulas(own: bool, seed: int) -> None:
+    members = random_members(200, seed)
+    rng = np.random.default_rng(seed)
+    groups = [sorted(rng.choice(200, size, replace=False).tolist()) for size in (1, 2, 3, 30, 160)]
+    assert_pooled_by_the_formulas(members, groups, own)
+
+
+@pytest.mark.parametrize("own", [True, False])
 @pytest.mark.parametrize(("field", "value"), [("opacities", 0.0), ("opacities", 1.0), ("scales", 0.02), ("quats", 0.0)])
-def test_pool_matches_at_the_ends(field: str, value: float, own: bool) -> None:
+def test_pooled_groups_match_the_formulas_at_the_ends_of_values(field: str, value: float, own: bool) -> None:
     """Transparent groups take the plain mean, opaque ones have a finite depth."""
     members = random_members(50, 2)
     members[field][:] = value
-    geometry, sh = pooled(members, [list(range(50)), [7]], own)
-    for g, rows in enumerate((list(range(50)), [7])):
-        expected, wanted_sh = pool_reference(members, rows, own)
-        np.testing.assert_allclose(geometry[g], expected, rtol=2e-6, atol=1e-10)
-        np.testing.assert_allclose(sh[g], wanted_sh, atol=2e-6)
+    assert_pooled_by_the_formulas(members, [list(range(50)), [7]], own)
 
 
-def test_far_from_the_origin_nothing_cancels() -> None:
+def test_pooled_covariance_is_exact_far_from_the_origin() -> None:
     members = random_members(50, 4)
     members["means"] = (members["means"] * 0.05 + 1e4).astype(np.float32)
     geometry, _ = pooled(members, [list(range(50))], False)
@@ -111,7 +111,7 @@ def test_empty_groups_stay_zero() -> None:
     assert geometry[2].any()
 
 
-def test_group_members_matches() -> None:
+def test_group_members_lists_the_members_of_each_label() -> None:
     rng = np.random.default_rng(0)
     labels = rng.integers(-1, 12, 500).astype(np.int32)
     labels[labels == 7] = 3  # a label without a member
@@ -163,7 +163,7 @@ def test_decompose_matches_eigh() -> None:
     ],
     ids=["equal", "zero", "unsorted", "pair", "rank one", "tiny", "wide range", "below zero by rounding"],
 )
-def test_decompose_special_cases(covar: np.ndarray) -> None:
+def test_decomposed_special_covariances_are_rebuilt(covar: np.ndarray) -> None:
     scales, quats, again = rebuilt(np.ascontiguousarray(covar[None], dtype=float))
     assert (scales >= 0).all()
     assert np.isfinite(quats).all()
@@ -200,7 +200,7 @@ def test_the_bits_are_the_same_on_every_processor(each_target, own: bool) -> Non
     each_target(axes)
 
 
-def test_nothing_is_pooled_into_nothing() -> None:
+def test_kernels_take_no_groups_and_no_members() -> None:
     assert [len(part) for part in group_members(np.empty(0, np.int32), 0)] == [1, 0]
     none = np.zeros(1, np.int64), np.empty(0, np.int64)
     pool(*none, *random_members(0, 0).values(), True, np.empty((0, 13)), np.empty((0, 4, 3), np.float32))
@@ -208,13 +208,13 @@ def test_nothing_is_pooled_into_nothing() -> None:
 
 
 @pytest.mark.parametrize("row", [-1, 4, 2**31 - 1])
-def test_members_that_are_none_are_refused(row: int) -> None:
+def test_ids_of_members_outside_are_refused(row: int) -> None:
     with refuses(ValueError, "pool_groups", "indices"):
         pooled(random_members(4, 0), [[0, row]])
 
 
 @pytest.mark.parametrize("starts", [[0, 5], [0, -1], [-1, 2], [3, 2]])
-def test_groups_beyond_the_members_are_refused(starts: list[int]) -> None:
+def test_starts_of_groups_outside_are_refused(starts: list[int]) -> None:
     members = random_members(4, 0)
     with pytest.raises(ValueError, match="pool_groups: "):
         pool(

@@ -1,4 +1,4 @@
-"""What the networks read, one Gaussian after the other by the formulas."""
+"""What the networks read matches the formulas, one Gaussian after the other."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def logit(opacity: float) -> float:
 
 
 def slow_group(features: GroupFeatures, row: int, viewmat: np.ndarray) -> list[float]:
-    """The first 19 numbers of a group, see the kernel."""
+    """Return the first 19 numbers of a group, see the kernel."""
     f, base = features.features, features.base
     mean, pixel, size = (np.float64(x[row]) for x in (base.means, f.footprints, features.sizes))
     frame, count = slow_frame(mean, viewmat), int(np.diff(f.starts)[row])
@@ -69,7 +69,7 @@ def slow_group(features: GroupFeatures, row: int, viewmat: np.ndarray) -> list[f
 
 
 def slow_part(features: GroupFeatures, parts: Gaussians, part: int, owner: int) -> list[float]:
-    """The numbers of a part relative to a group, as a member."""
+    """Return the numbers of a part relative to a group, as a member."""
     base, frame = features.base, features.frames[owner].astype(np.float64)
     size, pixel = float(features.sizes[owner]), float(features.footprints[owner])
     offset = frame.T @ (parts.means[part].astype(np.float64) - base.means[owner])
@@ -82,7 +82,7 @@ def slow_part(features: GroupFeatures, parts: Gaussians, part: int, owner: int) 
     return [*numbers, *arcsinh(offset / pixel), *(SH_C0 * parts.sh0[part, 0])]
 
 
-def test_groups(some: Made, each_target: Each) -> None:
+def test_descriptions_of_groups_match_the_formulas(some: Made, each_target: Each) -> None:
     frames, sizes, group = each_target(lambda: arrays_of(described(some)))
     features = described(some)
     viewmats = some.scene.cameras.viewmats[features.views]
@@ -97,7 +97,7 @@ def test_groups(some: Made, each_target: Each) -> None:
     assert nothing.group.shape == (0, group.shape[1])
 
 
-def test_points_at_a_camera_and_on_its_axis(some: Made) -> None:
+def test_points_at_a_camera_or_on_its_axis_have_frames(some: Made) -> None:
     """Have frames, too: what is seen along the image's own right is level with the ray ahead."""
     features, viewmat = take_features(some.features, np.arange(3)), some.scene.cameras.viewmats[0]
     rotation, centre = viewmat[:3, :3], some.scene.cameras.centres[0]
@@ -107,7 +107,7 @@ def test_points_at_a_camera_and_on_its_axis(some: Made) -> None:
     np.testing.assert_allclose(frames[1], rotation.T, atol=1e-5)
 
 
-def test_parts(some: Made, each_target: Each) -> None:
+def test_tokens_of_parts_match_the_formulas(some: Made, each_target: Each) -> None:
     features, parts = described(some), contiguous(feature_to_gaussians(some.features))
     rng = np.random.default_rng(0)
     parts = replace(parts, quats=rng.normal(size=parts.quats.shape).astype(np.float32))
@@ -127,7 +127,7 @@ def test_parts(some: Made, each_target: Each) -> None:
 
 
 @pytest.mark.parametrize("odd", [np.nan, np.inf, -np.inf, 0.0, 3e38])
-def test_odd_numbers_give_finite_ones(some: Made, odd: float, each_target: Each) -> None:
+def test_descriptions_of_odd_numbers_are_finite(some: Made, odd: float, each_target: Each) -> None:
     names = ("means", "covars", "masses", "extinctions", "weights", "footprints", "sh0")
     columns = {name: getattr(some.features, name).copy() for name in names}
     for column in columns.values():

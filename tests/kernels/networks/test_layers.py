@@ -1,4 +1,4 @@
-"""Layers of the networks against NumPy in float64, and against the modules of torch that training uses."""
+"""Layers of the networks match NumPy in float64, and the modules of torch that training uses."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def some(*shape: int, seed: int = 0) -> np.ndarray:
 
 
 def activate(values: np.ndarray, activation: int) -> np.ndarray:
-    """A dense layer that changes nothing, and its activation."""
+    """Return a dense layer that changes nothing, and its activation."""
     out = np.empty((len(values), 1), np.float32)
     dense(
         values.reshape(-1, 1),
@@ -59,7 +59,9 @@ def activate(values: np.ndarray, activation: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("rows", "inputs", "outputs"), SHAPES)
-def test_dense(rows: int, inputs: int, outputs: int, each_target: Callable[..., list[np.ndarray]]) -> None:
+def test_dense_layer_matches_numpy(
+    rows: int, inputs: int, outputs: int, each_target: Callable[..., list[np.ndarray]]
+) -> None:
     x, weight, bias = some(rows, inputs), some(outputs, inputs, seed=1), some(outputs, seed=2)
     residual = some(rows, outputs, seed=3)
 
@@ -77,7 +79,7 @@ def test_dense(rows: int, inputs: int, outputs: int, each_target: Callable[..., 
     np.testing.assert_allclose(bounded, np.tanh(expected + residual), atol=1e-5)
 
 
-def test_activations(each_target: Callable[..., list[np.ndarray]]) -> None:
+def test_activations_match_their_formulas(each_target: Callable[..., list[np.ndarray]]) -> None:
     values = np.concatenate([np.linspace(-9, 9, 20001), np.geomspace(1e-30, 1, 2001)]).astype(np.float32)
     gelu, tanh = each_target(lambda: [activate(values, GELU), activate(values, TANH)])
     exact = values.astype(np.float64)
@@ -87,7 +89,7 @@ def test_activations(each_target: Callable[..., list[np.ndarray]]) -> None:
     np.testing.assert_allclose(tanh, np.tanh(exact), rtol=2 * 2.0**-23)
 
 
-def test_activations_of_odd_numbers(each_target: Callable[..., list[np.ndarray]]) -> None:
+def test_activations_of_odd_numbers_match_their_formulas(each_target: Callable[..., list[np.ndarray]]) -> None:
     gelu, tanh = each_target(lambda: [activate(ODD, GELU), activate(ODD, TANH)])
     finite, expected = np.isfinite(ODD), np.array([x / 2 * math.erfc(-x / 2**0.5) for x in ODD.tolist()])
     np.testing.assert_allclose(gelu[finite], expected[finite], rtol=1e-6, atol=1e-6)
@@ -96,7 +98,7 @@ def test_activations_of_odd_numbers(each_target: Callable[..., list[np.ndarray]]
 
 
 @pytest.mark.parametrize(("rows", "width"), [(0, 4), (1, 1), (3, 16), (5, 20), (2, 48), (4, 33)])
-def test_normalise(rows: int, width: int, each_target: Callable[..., list[np.ndarray]]) -> None:
+def test_normalised_rows_match_numpy(rows: int, width: int, each_target: Callable[..., list[np.ndarray]]) -> None:
     x, gains, shifts = 5 + some(rows, width), some(width, seed=1), some(width, seed=2)
 
     def run() -> list[np.ndarray]:
@@ -122,7 +124,9 @@ def slow_attention(query: np.ndarray, keys: np.ndarray, values: np.ndarray, mask
 
 @pytest.mark.parametrize("tokens", [1, 2, 9, 16, 17, 40])
 @pytest.mark.parametrize(("width", "heads"), [(48, 4), (20, 5), (40, 2), (3, 1)])
-def test_attention(tokens: int, width: int, heads: int, each_target: Callable[..., list[np.ndarray]]) -> None:
+def test_attention_matches_a_slow_twin(
+    tokens: int, width: int, heads: int, each_target: Callable[..., list[np.ndarray]]
+) -> None:
     sets, queries, size = 3, 2, width // heads
     query, keys, values = (some(sets, n, width, seed=seed) for seed, n in enumerate((queries, tokens, tokens)))
     mask = np.random.default_rng(0).random((sets, tokens)) < 0.6
@@ -162,7 +166,7 @@ def test_sizes_that_do_not_go_together_are_refused() -> None:
 
 
 def inputs_of(name: str, options: NetworkOptions, count: int) -> tuple[np.ndarray, ...]:
-    """Random inputs of a network: some tokens do not count."""
+    """Return random inputs of a network: some tokens do not count."""
     kind, _, slots = name.partition(".")
     width, tokens = {
         "encoder": (MEMBER_COLUMNS, options.members), "merger": (PART_COLUMNS + options.latent, 5),
@@ -182,7 +186,7 @@ def names_of(options: NetworkOptions) -> list[str]:
 
 
 @sweep("which", [*IN_PACKAGE, *range(len(OTHERS))])
-def test_networks_are_those_of_training(which: str | int, each_target: Callable[..., list[np.ndarray]]) -> None:
+def test_networks_match_the_modules_of_training(which: str | int, each_target: Callable[..., list[np.ndarray]]) -> None:
     """Of what ships and of random ones, to rounding."""
     modules_of = training_helpers().modules_of
     named = isinstance(which, str)
@@ -210,6 +214,6 @@ def test_every_group_is_computed_alone() -> None:
 
 
 @pytest.mark.parametrize("options", [NetworkOptions(), *OTHERS, NetworkOptions(encoder=False, merger=False)])
-def test_shapes_of_weights_are_those_of_the_modules(options: NetworkOptions) -> None:
+def test_shapes_of_weights_match_the_modules_of_training(options: NetworkOptions) -> None:
     state = training_helpers().Networks(options).state_dict()
     assert weight_shapes(options) == {name: tuple(tensor.shape) for name, tensor in state.items()}

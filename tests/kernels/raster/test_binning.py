@@ -1,4 +1,4 @@
-"""Depth order and tile lists against sorting and loops."""
+"""Depth order and tile lists match sorting and loops."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ RNG = np.random.default_rng(0)
     ],
     ids=["none", "one", "equal", "usual", "wide", "ties", "extremes"],
 )
-def test_depth_order_is_a_stable_sort(values: np.ndarray) -> None:
+def test_depth_order_matches_a_stable_sort(values: np.ndarray) -> None:
     depths = values.astype(np.float32)
     np.testing.assert_array_equal(binning.depth_order(depths.view(np.uint32)), np.argsort(depths, kind="stable"))
 
 
 def random_boxes(count: int, tile_height: int, tile_width: int) -> np.ndarray:
-    """First and exclusive last column and row; every fifth one empty."""
+    """Draw first and exclusive last column and row; every fifth one is empty."""
     x, y = (
         np.sort(RNG.integers(0, tile_width + 1, (count, 2)), 1),
         np.sort(RNG.integers(0, tile_height + 1, (count, 2)), 1),
@@ -42,7 +42,7 @@ def random_boxes(count: int, tile_height: int, tile_width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("tile_height", "tile_width"), [(1, 1), (1, 9), (9, 1), (5, 7)])
-def test_tile_lists(tile_height: int, tile_width: int) -> None:
+def test_tile_lists_match_a_loop_over_boxes(tile_height: int, tile_width: int) -> None:
     boxes, order = random_boxes(200, tile_height, tile_width), RNG.permutation(200).astype(np.int32)
     expected: list[list[int]] = [[] for _ in range(tile_height * tile_width)]
     for k, (x0, x1, y0, y1) in zip(order.tolist(), boxes[order].tolist(), strict=True):

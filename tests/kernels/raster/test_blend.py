@@ -1,4 +1,4 @@
-"""The renderer against the slow float64 one of this folder."""
+"""The renderer matches the slow float64 one."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def reference(gaussians: Gaussians, cameras: Cameras, **options: object) -> Refe
 
 
 def assert_alike(image: object, expected: object, most: float = 0.02) -> None:
-    """Equal up to rounding but for single pixels where a threshold or a depth tie falls the other way."""
+    """Check for equality up to rounding but for single pixels where a threshold or a depth tie falls the other way."""
     error = np.abs(np.asarray(image, np.float64) - np.asarray(expected))
     assert error.max() < most
     assert np.quantile(error, 0.99) < 2e-5
 
 
 @sweep("degree", range(5), often=2)
-def test_images_match(degree: int) -> None:
+def test_images_match_the_slow_renderer(degree: int) -> None:
     gaussians, cameras = random_gaussians(300, degree, degree=degree), turned_camera()
     rendering = render(gaussians, cameras, (0.2, 0.5, 0.9), with_depths=True)
     expected = reference(gaussians, cameras, background=(0.2, 0.5, 0.9))
@@ -47,28 +47,28 @@ def test_images_match(degree: int) -> None:
     assert_alike(rendering.depths[0, ..., 0], expected.depth, 0.1)
 
 
-def test_antialiased_images_match() -> None:
+def test_antialiased_images_match_the_slow_renderer() -> None:
     gaussians, cameras = random_gaussians(300, 7, degree=1), turned_camera()
     rendering = render(gaussians, cameras, antialiased=True)
     assert_alike(rendering.images[0], reference(gaussians, cameras, antialiased=True).image)
     assert psnr(rendering.images[0], render(gaussians, cameras).images[0]) < 60
 
 
-def test_depth_range_matches() -> None:
+def test_range_of_depths_matches_the_slow_renderer() -> None:
     gaussians, cameras = random_gaussians(300, 8), turned_camera()
     rendering = render(gaussians, cameras, near=2.5, far=3.5)
     assert_alike(rendering.images[0], reference(gaussians, cameras, near=2.5, far=3.5).image)
 
 
 @sweep("scale", [1e-6, 0.3, 3.0], often=2)
-def test_tiny_and_large_gaussians_match(scale: float) -> None:
+def test_tiny_and_large_gaussians_match_the_slow_renderer(scale: float) -> None:
     gaussians, cameras = random_gaussians(200, 9), turned_camera()
     scales = elementary.exp(0.5 * elementary.log(gaussians.scales / 0.05)) * scale
     resized = replace(gaussians, scales=scales, opacities=gaussians.opacities * 0.3)
     assert_alike(render(resized, cameras).images[0], reference(resized, cameras).image)
 
 
-def test_needles_match() -> None:
+def test_needles_match_the_slow_renderer() -> None:
     """Long and thin: where the determinant of the footprint cancels."""
     gaussians, cameras = random_gaussians(100, 10), turned_camera()
     scales = np.array([[2.0, 1e-4, 1e-5]], np.float32).repeat(100, 0)

@@ -1,4 +1,4 @@
-"""The array interface: against autograd through the slow renderer, threads, hostile input."""
+"""The array interface matches autograd through the slow renderer, on any threads and hostile input."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def gradients_of_view(tiled: TiledView, colors: np.ndarray, grad_left: np.ndarra
 
 @sweep("eps2d", [0.075, 0.3, 1.0])
 @sweep("with_left", [False, True])
-def test_any_colours_dilations_and_transmittances(eps2d: float, with_left: bool) -> None:
+def test_gradients_match_autograd_for_any_colour_dilation_and_transmittance(eps2d: float, with_left: bool) -> None:
     gaussians, cameras, colors = random_gaussians(40, 0, 1), turned_cameras(1), normal(40, 3, seed=2)
     grad_left = normal(HEIGHT, WIDTH, seed=3) if with_left else None
     actual = gradients_of_view(turned_view(gaussians, eps2d=eps2d), colors, grad_left)
@@ -49,7 +49,7 @@ def test_any_colours_dilations_and_transmittances(eps2d: float, with_left: bool)
     assert_near(actual.viewmat, inputs[-1].grad.numpy())
 
 
-def test_opacities_in_place_of_the_gaussians_own() -> None:
+def test_gradients_take_opacities_in_place_of_the_gaussians_own() -> None:
     """Dropped Gaussians have no rows' worth of gradient, the others that of their given opacity."""
     gaussians, colors = random_gaussians(40, 0, 4).numpy(), normal(40, 3)
     keep = np.arange(40) % 4 > 0
@@ -63,7 +63,7 @@ def test_opacities_in_place_of_the_gaussians_own() -> None:
 
 
 @pytest.mark.parametrize("threads", [2, 8])
-def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradients_have_the_same_bits_on_any_number_of_threads(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules["gsmerge.raster.tiled_view"], "THREAD_PIECE", 200)
     monkeypatch.setattr(sys.modules["gsmerge.raster.gradient"], "MIN_PER_THREAD", 200)
     gaussians, cameras = random_gaussians(2000, 3, 10).numpy(), turned_cameras(1).numpy()
@@ -110,7 +110,7 @@ def test_finite_input_gives_finite_gradients(change: str, eps2d: float, antialia
         assert np.isfinite(array).all()
 
 
-def test_a_view_of_nothing() -> None:
+def test_view_of_nothing_has_empty_gradients() -> None:
     gaussians = random_gaussians(5).numpy()
     tiled = turned_view(replace(gaussians, means=gaussians.means - 100))
     actual = gradients_of_view(tiled, normal(5, 3), None)

@@ -1,4 +1,4 @@
-"""The dominant superpixel of every Gaussian against sums over a dense matrix of weights."""
+"""The dominant superpixel of every Gaussian matches sums over a dense matrix of weights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def some_labels(count: int, seed: int = 0) -> np.ndarray:
 
 
 def superpixel_sums(gaussians: Gaussians, labels: np.ndarray, viewmat: np.ndarray | None = None) -> np.ndarray:
-    """``[n,labels]`` every Gaussian's weights, one pixel after the other, float64."""
+    """Return every Gaussian's weights ``[n,labels]``, one pixel after the other, float64."""
     weights = render_arrays(gaussians, np.eye(4) if viewmat is None else viewmat, K, WIDTH, HEIGHT).weights
     sums = np.zeros((labels.max() + 1, len(gaussians)))
     np.add.at(sums, labels.reshape(-1), weights.reshape(len(gaussians), -1).T)
@@ -39,7 +39,7 @@ CASES = [(300, 0, 0.5, -3.5, 90), (80, 1, 0.5, -1.0, 200), (400, 2, 3.0, -2.5, 4
 
 
 @sweep("case", CASES, often=2)
-def test_dominant_labels(case: tuple[int, int, float, float, int]) -> None:
+def test_owner_is_the_superpixel_of_the_largest_sum_of_weights(case: tuple[int, int, float, float, int]) -> None:
     n, seed, opacity, size, count = case
     gaussians, labels = random_gaussians(n, seed, opacity=opacity, size=size), some_labels(count)
     tiled = tile_view(make_splats(gaussians), np.eye(4), K, WIDTH, HEIGHT)
@@ -54,7 +54,7 @@ def test_dominant_labels(case: tuple[int, int, float, float, int]) -> None:
     assert (actual[seen] == sums[seen].argmax(1)).mean() > 0.98
 
 
-def test_pairs_beyond_the_first_room() -> None:
+def test_owners_are_right_where_pairs_outgrow_their_arrays() -> None:
     """Every pixel its own superpixel, and Gaussians over the whole picture: pairs outgrow their arrays."""
     gaussians = random_gaussians(400, 7, opacity=3.0, size=0.3)
     gaussians = replace(gaussians, opacities=0.01 + 0.03 * gaussians.opacities)
@@ -81,7 +81,7 @@ def test_equal_sums_go_to_the_smaller_label() -> None:
 
 
 @sweep("seed", [0, 1])
-def test_the_best_of_all_views(seed: int) -> None:
+def test_owner_is_in_the_view_of_the_largest_sum(seed: int) -> None:
     gaussians = random_gaussians(150, seed, size=-2.5)
     viewmats = np.stack([np.eye(4)] * 3)
     viewmats[1, 0, 3], viewmats[2, 2, 3] = 0.7, 1.0
@@ -96,7 +96,7 @@ def test_the_best_of_all_views(seed: int) -> None:
     assert len(seen) > 100
 
 
-def test_of_equal_views_the_first() -> None:
+def test_owner_is_in_the_first_of_equal_views() -> None:
     gaussians = random_gaussians(100, 3, size=-3.5)
     cameras = Cameras(np.stack([np.eye(4)] * 4), np.stack([K] * 4), WIDTH, HEIGHT)
     labels = np.stack([some_labels(30)] * 4)
@@ -115,7 +115,7 @@ def test_of_equal_views_the_first() -> None:
         pytest.param([(np.nan, 1, -1)], 1, id="a label that is no number"),
     ],
 )
-def test_chains_that_do_not_end_are_refused(pairs: list[tuple[float, float, float]], num_pairs: int) -> None:
+def test_damaged_chains_of_pairs_are_refused(pairs: list[tuple[float, float, float]], num_pairs: int) -> None:
     rows, num_labels = np.array(pairs, float), 2
     heads, active, counts = np.zeros(1, np.int32), np.zeros(2, np.int32), np.array([num_pairs, 1, 0])
     totals, seen = np.zeros(num_labels), np.empty(num_labels, np.int32)

@@ -1,4 +1,4 @@
-"""The image loss: against autograd of a plain float64 loss."""
+"""The image loss matches autograd of a plain float64 loss."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SIZES = [(20, 17), (7, 7), (3, 5), (1, 9)]
 
 
 def pictures(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render, photo, weights of the pixels (a part of them zero)."""
+    """Return a render, a photo and weights of the pixels (a part of them zero)."""
     rng = np.random.default_rng(seed)
     photo = rng.uniform(0, 1, (*size, 3))
     image = photo + rng.normal(size=photo.shape) * 0.2
@@ -26,12 +26,12 @@ def pictures(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarr
 
 
 def box(images: torch.Tensor) -> torch.Tensor:
-    """Means over 7 x 7 windows of ``[h,w,3]``, zero beyond the border."""
+    """Return means over 7 x 7 windows of ``[h,w,3]``, zero beyond the border."""
     return avg_pool2d(images.permute(2, 0, 1)[None], 7, 1, 3, count_include_pad=True)[0].permute(1, 2, 0)
 
 
 def similarity(image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
-    """SSIM ``[h,w,3]`` (Wang et al., 2004)."""
+    """Return the SSIM ``[h,w,3]`` (Wang et al., 2004)."""
     mx, my = box(image), box(photo)
     xx, yy, xy = box(image * image) - mx * mx, box(photo * photo) - my * my, box(image * photo) - mx * my
     c1, c2 = float(C1), float(C2)
@@ -92,7 +92,7 @@ def test_error_is_the_weighted_square(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
-def test_no_gradient_at_the_photo(ssim_lambda: float) -> None:
+def test_gradient_is_zero_where_the_image_is_the_photo(ssim_lambda: float) -> None:
     _, photo, weight = pictures((16, 16))
     assert np.abs(image_gradient(photo, photo, weight, ssim_lambda, 1.2)[0]).max() < 1e-5
 
@@ -117,7 +117,7 @@ def test_pixels_without_weight_teach_nothing() -> None:
     np.testing.assert_allclose(image_gradient(image, elsewhere, weight, 0.2, 1.2)[0], gradient, atol=1e-7)
 
 
-def test_flat_pictures_stay_finite() -> None:
+def test_gradients_of_flat_pictures_are_finite() -> None:
     flat, weight = np.zeros((9, 9, 3), np.float32), np.ones((9, 9), np.float32)
     for image in (flat, flat + 1):
         assert np.isfinite(image_gradient(image, flat, weight, 0.2, 1.2)[0]).all()

@@ -1,4 +1,4 @@
-"""The written-out blending weights against the renderer and against a dense matrix."""
+"""The written-out blending weights match the renderer and a dense matrix."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def tile_and_weigh(gaussians: Gaussians) -> tuple[TiledView, ViewWeights]:
 
 
 def entry_pixels(weights: ViewWeights) -> np.ndarray:
-    """Row-major pixel of the image of every entry."""
+    """Return the row-major pixel of the image of every entry."""
     tiles = np.repeat(np.arange(len(weights.isect_offsets) - 1), np.diff(weights.isect_offsets))
     tiles = np.repeat(tiles, np.diff(weights.starts))
     y = tiles // weights.tile_width * 16 + weights.lanes // 16
@@ -41,7 +41,7 @@ def entry_pixels(weights: ViewWeights) -> np.ndarray:
 
 
 def dense(weights: ViewWeights, count: int) -> np.ndarray:
-    """``[pixels,n]``."""
+    """Return the weights as a matrix ``[pixels,n]``."""
     matrix, pixels = np.zeros((HEIGHT * WIDTH, count)), entry_pixels(weights)
     for i, member in enumerate(weights.flatten_ids):
         entries = slice(weights.starts[i], weights.starts[i + 1])
@@ -54,7 +54,7 @@ CASES = [(200, 0, 0.5), (3000, 1, 0.05), (3000, 2, 3.0), (1, 3, 0.5)]
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_entries_are_sound(case: tuple[int, int, float]) -> None:
+def test_entries_are_positive_with_one_for_each_gaussian_and_pixel(case: tuple[int, int, float]) -> None:
     tiled, weights = tile_and_weigh(of_case(case))
     assert len(weights.starts) == len(tiled.flatten_ids) + 1
     assert weights.starts[0] == 0
@@ -75,7 +75,7 @@ def test_weights_give_the_composite(case: tuple[int, int, float]) -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_transposed_matches_the_adjoint_and_the_dense_matrix(channels: int) -> None:
+def test_transposed_product_matches_adjoint_and_dense_matrix(channels: int) -> None:
     gaussians = random_gaussians(400, 5)
     tiled, weights = tile_and_weigh(gaussians)
     image = np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, channels))
@@ -110,7 +110,7 @@ def test_needles_lose_no_pixel() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 5])
-def test_nothing_in_view(count: int) -> None:
+def test_weights_of_nothing_in_view_are_empty(count: int) -> None:
     gaussians = random_gaussians(5, 9)[:count]
     _, weights = tile_and_weigh(replace(gaussians, means=gaussians.means - 10))
     assert len(weights.lanes) == 0

@@ -1,4 +1,4 @@
-"""What the walks refuse: lists that point outside their arrays."""
+"""The walks refuse lists that point outside their arrays."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ M, N, SIDE = 3, 5, 20
 
 
 def lists(**changes: Any) -> dict[str, Any]:
-    """Three Gaussians in the first and the last of four tiles."""
+    """Return lists of three Gaussians in the first and the last of four tiles."""
     conics = np.tile(np.array([8, 8, 0.2, 0, 0.04, -1, 0, SIDE], np.float32), (M, 1))
     flatten_ids, isect_offsets = np.array([0, 1, 2, 0, 1], np.int32), np.array([0, 3, 3, 3, 5])
     lists = {"conics": conics, "flatten_ids": flatten_ids, "isect_offsets": isect_offsets, "tile_width": 2}
@@ -32,7 +32,7 @@ def lists(**changes: Any) -> dict[str, Any]:
 
 
 def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
-    """Calls of all walks with the same lists."""
+    """Return calls of all walks with the same lists."""
     colors, image, left = (
         np.ones((M, 3), np.float32),
         np.empty((SIDE, SIDE, 3), np.float32),
@@ -50,7 +50,7 @@ def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
     ]
 
 
-def test_sound_lists_are_taken() -> None:
+def test_walks_take_sound_lists() -> None:
     for walk in walks(lists()):
         walk()
 
@@ -68,7 +68,7 @@ def test_sound_lists_are_taken() -> None:
     ],
 )
 @pytest.mark.parametrize("walk", range(6))
-def test_lists_outside_their_arrays_are_refused(walk: int, change: dict[str, Any]) -> None:
+def test_walks_refuse_lists_outside_their_arrays(walk: int, change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="indices"):
         walks(lists(**change))[walk]()
 
@@ -81,7 +81,7 @@ def test_tiles_that_are_not_there_are_refused(walk: int, span: tuple[int, int]) 
 
 
 @pytest.mark.parametrize("bad", [M, -1, np.iinfo(np.int32).min])
-def test_members_outside_are_refused_by_what_adds_up(bad: int) -> None:
+def test_kernels_that_add_up_refuse_members_outside(bad: int) -> None:
     flatten_ids, rows = np.array([0, bad], np.int32), np.zeros((1, 8), np.float32)
     sums, ids = np.zeros((M, SUMS), np.float32), np.arange(M, dtype=np.int32)
     with pytest.raises(ValueError, match="add_slots"):

@@ -1,4 +1,4 @@
-"""Footprints and culling against the slow renderer."""
+"""Footprints and culling match the slow renderer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 
 
 def random_gaussians(n: int, seed: int, *, spread: float, depth: float, sizes: float) -> Gaussians:
-    """About a point on the axis, with quaternions of any length."""
+    """Draw Gaussians about a point on the axis, with quaternions of any length."""
     rng = np.random.default_rng(seed)
     columns = (
         rng.normal(size=(n, 3)) * spread + [0, 0, depth], rng.normal(size=(n, 4)),
@@ -24,12 +24,12 @@ def random_gaussians(n: int, seed: int, *, spread: float, depth: float, sizes: f
 
 
 def slow_footprints(gaussians: Gaussians, viewmat: np.ndarray, K: np.ndarray, *size: int) -> tuple[np.ndarray, ...]:
-    """Image positions ``[n,2]``, undilated covariances ``[n,2,2]`` and depths ``[n]``."""
+    """Return image positions ``[n,2]``, undilated covariances ``[n,2,2]`` and depths ``[n]``."""
     columns = (torch.from_numpy(c).double() for c in (gaussians.means, gaussians.quats, gaussians.scales))
     return tuple(t.numpy() for t in footprints(*columns, torch.from_numpy(viewmat), torch.from_numpy(K), *size))
 
 
-def test_footprints() -> None:
+def test_footprints_match_the_slow_renderer() -> None:
     """Position, precision and rows of what a tiled view holds; a row is listed if a pixel column could reach 1/255."""
     n, width, height = 300, 60, 40
     gaussians = random_gaussians(n, 0, spread=0.6, depth=3, sizes=1.0)

@@ -26,7 +26,7 @@ def normal(*shape: int) -> np.ndarray:
 
 
 def columns_of(n: int, num: int = 3, *, hostile: bool = False) -> Columns:
-    """Gaussians in front of the camera; every third number is a hostile one if that is asked for."""
+    """Return Gaussians in front of the camera; every third number is a hostile one if that is asked for."""
     columns = {
         "means": normal(n, 3) + np.float32([0, 0, 3]), "quats": normal(n, 4), "scales": exp(normal(n, 3) - 3),
         "opacities": RNG.random(n, dtype=np.float32), "sh0": normal(n, 1, 3), "shN": normal(n, num, 3),
@@ -38,7 +38,7 @@ def columns_of(n: int, num: int = 3, *, hostile: bool = False) -> Columns:
 
 
 def camera_of(antialiased: bool = False) -> np.ndarray:
-    """A camera of 60 x 40 pixels at the origin."""
+    """Return a camera of 60 x 40 pixels at the origin."""
     camera = np.zeros(project.CAMERA, np.float32)
     camera[: project.SHIFT] = np.eye(3).ravel()
     camera[project.FX : project.NEAR] = 50, 50, 30, 20, 60, 40
@@ -114,7 +114,7 @@ def colors_of(c: Columns) -> list[np.ndarray]:
 
 
 def plain(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The arrays with one NaN for all: its sign goes with the order of operands, which compilers choose."""
+    """Return the arrays with one NaN for all: its sign goes with the order of operands, which compilers choose."""
     return [np.where(np.isnan(array), np.float32(np.nan), array) for array in arrays]
 
 
@@ -130,7 +130,7 @@ def test_bits_are_the_same_on_every_processor(each_target: Any, kernel: Any, hos
 
 
 @pytest.mark.parametrize("num", [0, 1, 2, 4, 5, 7, 8, 11, 15, 20, 24])
-def test_any_number_of_harmonics(each_target: Any, num: int) -> None:
+def test_missing_harmonics_of_a_degree_count_as_zero(each_target: Any, num: int) -> None:
     """Those of a degree may be given in part; the rest count as zero. The last Gaussian is one of those listed."""
     columns = columns_of(31, num)
     actual = each_target(lambda: colors_of(columns))
@@ -186,7 +186,7 @@ def test_ranges_outside_are_refused() -> None:
         project.project_backward(*head, 1, 5, *results)
 
 
-def test_rows_are_added_where_they_belong() -> None:
+def test_added_rows_go_to_the_rows_of_their_ids() -> None:
     totals, rows = normal(6, 5), normal(3, 5)
     expected, ids = totals.copy(), np.array([4, 0, 5], np.int32)
     expected[ids] += rows

@@ -1,4 +1,4 @@
-"""``render`` as autograd sees it, against autograd through the slow float64 renderer."""
+"""``render`` as autograd sees it matches autograd through the slow float64 renderer."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def gradients(
 
 @pytest.mark.parametrize("degree", range(5))
 @sweep("seed", range(2))
-def test_every_parameter_and_degree(degree: int, seed: int) -> None:
+def test_gradients_of_every_parameter_and_degree_match_autograd(degree: int, seed: int) -> None:
     gaussians, cameras = random_gaussians(40, degree, 10 * degree + seed), turned_cameras()
     actual, expected = gradients(gaussians, cameras, seed=seed), reference_gradients(gaussians, cameras, seed=seed)
     assert_close(actual, expected)
@@ -47,13 +47,13 @@ def test_every_parameter_and_degree(degree: int, seed: int) -> None:
 
 
 @sweep("background", [(-2.0, 0.3, 5.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
-def test_backgrounds(background: tuple[float, float, float]) -> None:
+def test_gradients_over_any_background_match_autograd(background: tuple[float, float, float]) -> None:
     gaussians, cameras = random_gaussians(40), turned_cameras(1)
     assert_close(gradients(gaussians, cameras, background), reference_gradients(gaussians, cameras, background))
 
 
 @sweep("seed", range(3))
-def test_antialiased(seed: int) -> None:
+def test_antialiased_gradients_match_autograd(seed: int) -> None:
     gaussians, cameras = random_gaussians(40, 1, seed), turned_cameras()
     gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
     assert_close(
@@ -62,7 +62,7 @@ def test_antialiased(seed: int) -> None:
 
 
 def border(g: Gaussians) -> Gaussians:
-    """Their centres beyond the clamp of the viewing direction, reaching into the image."""
+    """Move Gaussians' centres beyond the clamp of the viewing direction, so that they reach into the image."""
     side = torch.tensor([1.0, -1.0]).repeat(len(g) // 2)
     means = g.means.clone()
     means[::4, 0], means[1::4, 0] = 0.75 * means[::4, 2].abs() * side[::4], -0.9 * means[1::4, 2].abs()
@@ -87,12 +87,12 @@ DEGENERATE: dict[str, Callable[[Gaussians], Gaussians]] = {
 
 
 @pytest.mark.parametrize("change", DEGENERATE)
-def test_degenerate_gaussians(change: str) -> None:
+def test_gradients_of_degenerate_gaussians_match_autograd(change: str) -> None:
     gaussians, cameras = DEGENERATE[change](random_gaussians(40, 1, 5)), turned_cameras()
     assert_close(gradients(gaussians, cameras), reference_gradients(gaussians, cameras))
 
 
-def test_what_is_not_drawn_has_no_gradient() -> None:
+def test_gaussians_that_are_not_drawn_have_no_gradient() -> None:
     gaussians, cameras = random_gaussians(40, 2, 6), turned_cameras(1)
     means, opacities = gaussians.means.clone(), gaussians.opacities.clone()
     means[:10, 2], opacities[10:20] = -3.0, 0.0
@@ -109,7 +109,7 @@ def test_empty_scenes_have_empty_gradients() -> None:
     assert (actual[-1] == 0).all()
 
 
-def test_gradients_keep_types_and_only_those_asked_for_are_made() -> None:
+def test_inputs_that_ask_for_a_gradient_get_one_of_their_type() -> None:
     gaussians, cameras = random_gaussians(30), turned_cameras(1)
     means = gaussians.means.double().requires_grad_()
     scales = gaussians.scales.clone().requires_grad_()
@@ -122,7 +122,7 @@ def test_gradients_keep_types_and_only_those_asked_for_are_made() -> None:
     assert gaussians.opacities.grad is None
 
 
-def test_images_are_those_without_gradients() -> None:
+def test_images_with_gradients_are_those_without() -> None:
     gaussians, cameras = random_gaussians(40, 1), turned_cameras()
     plain = render(gaussians, cameras, BACKGROUND, with_depths=True)
     *tensors, viewmats = leaves(gaussians, cameras)
@@ -135,7 +135,7 @@ def test_images_are_those_without_gradients() -> None:
         assert not render(Gaussians(*tensors), cameras).images.requires_grad
 
 
-def test_overwritten_inputs_are_noticed() -> None:
+def test_overwritten_input_is_refused_in_the_backward_pass() -> None:
     gaussians, cameras = random_gaussians(30), turned_cameras(1)
     scales = gaussians.scales.clone().requires_grad_()
     drawn = render(replace(gaussians, scales=scales), cameras)

@@ -1,4 +1,4 @@
-"""Colours seen from a camera, and their gradient, against the slow renderer."""
+"""Colours seen from a camera, and their gradient, match the slow renderer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RNG = np.random.default_rng(0)
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_view_colors(degree: int) -> None:
+def test_colours_seen_from_a_camera_match_the_slow_renderer(degree: int) -> None:
     means = RNG.normal(size=(50, 3)).astype(np.float32)
     sh0 = RNG.normal(size=(50, 1, 3)).astype(np.float32)
     shN = RNG.normal(size=(50, (degree + 1) ** 2 - 1, 3)).astype(np.float32)

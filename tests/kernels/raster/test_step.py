@@ -1,4 +1,4 @@
-"""Phases of a step on any numbers: nothing outside the buffers is read or written, as sanitizers would see.
+"""Phases of a step read and write nothing outside the buffers on any numbers, as sanitizers would see.
 
 That the bits are those of a slow twin is in ``tests/unit/fit/test_steps.py``.
 """
@@ -22,7 +22,7 @@ HOSTILE = np.array([0, -0.0, 1, -1, 1e-40, 1e30, -1e30, 3e38, np.nan, np.inf, -n
 
 
 def some_state(count: int, rng: np.random.Generator, num: int = 0) -> FitState:
-    """A state of Gaussians with so many higher harmonics; some are fixed."""
+    """Return a state of Gaussians with so many higher harmonics; some are fixed."""
     means = rng.normal(0, 1, (count, 3))
     means[:, 2] += 4
     colors, shN = rng.normal(0, 1, (count, 1, 3)), rng.normal(0, 1, (count, num, 3)).astype(np.float32)

@@ -42,7 +42,7 @@ def digests(target: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_all_targets_write_the_same_bits() -> None:
+def test_every_target_writes_the_same_bits() -> None:
     first, *others = (target.name for target in library._runnable_targets())
     if not others:
         pytest.skip("this processor runs one target")

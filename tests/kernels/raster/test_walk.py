@@ -1,4 +1,4 @@
-"""The rows of a tile in which a Gaussian of a batch shows, against all its pixels."""
+"""The rows of a tile in which a Gaussian of a batch shows match a look at all its pixels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def parts_of(conics: np.ndarray) -> np.ndarray:
 
 
 def conics_of(kind: str, rng: np.random.Generator) -> np.ndarray:
-    """``[BATCH,8]`` of Gaussians around the tile, their rows those of the whole image."""
+    """Return conics ``[BATCH,8]`` of Gaussians around the tile, their rows those of the whole image."""
     rows = np.zeros((BATCH, 8), np.float32)
     reach = {"near": 8, "far": 40, "huge": 3000}[kind]
     rows[:, 0] = LEFT + 8 + rng.uniform(-reach, reach, BATCH)
@@ -37,7 +37,7 @@ def conics_of(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["near", "far", "huge"])
 @sweep("seed", range(20), often=4)
-def test_rows_and_columns_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
+def test_rows_and_columns_of_a_gaussian_are_those_where_it_shows(kind: str, seed: int) -> None:
     """None that shows is left out, and at most one beside them is kept."""
     conics = conics_of(kind, np.random.default_rng(seed))
     parts = parts_of(conics)

@@ -1,4 +1,4 @@
-"""A small picture cut into regions, and the error that superpixels minimise."""
+"""Fixtures are a small picture and its cut into regions."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ def pixels() -> np.ndarray:
 
 @pytest.fixture
 def labels() -> np.ndarray:
-    """30 connected regions of the picture, not padded."""
+    """Return 30 connected regions of the picture, not padded."""
     return seeds.voronoi(seeds.hexagonal_seeds(*SIZE, 30), *SIZE)

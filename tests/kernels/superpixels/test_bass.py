@@ -1,4 +1,4 @@
-"""The paper's BASS against slow, obvious twins."""
+"""The paper's BASS matches slow, obvious twins."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_simple_points_do_not_change_the_parts_of_either_side() -> None:
 
 
 def slow_parameters(colours: np.ndarray, labels: np.ndarray, count: int) -> list[tuple]:
-    """(mean colour, mean position, covariance) of every region, as the model's posterior has them."""
+    """Return (mean colour, mean position, covariance) of every region, as the model's posterior has them."""
     area, actual = labels.size / count, []
     for k in range(count):
         y, x = np.nonzero(labels == k)
@@ -39,7 +39,7 @@ def slow_parameters(colours: np.ndarray, labels: np.ndarray, count: int) -> list
     return actual
 
 
-def test_bass_parameters(pixels: np.ndarray, labels: np.ndarray) -> None:
+def test_parameters_of_regions_match_a_slow_twin(pixels: np.ndarray, labels: np.ndarray) -> None:
     rows = bass.fit_regions(pad_labels(labels), pixels, np.full(30, labels.size / 30))
     for row, (colour, place, covariance) in zip(rows, slow_parameters(pixels, labels, 30), strict=True):
         inverse = np.linalg.inv(covariance)
@@ -48,7 +48,7 @@ def test_bass_parameters(pixels: np.ndarray, labels: np.ndarray) -> None:
 
 
 def slow_label_pass(colours: np.ndarray, labels: np.ndarray, count: int, deviation: float) -> np.ndarray:
-    """The constrained label update, pixel by pixel, with the parameters held."""
+    """Update labels under the constraint, pixel by pixel, with the parameters held."""
     (height, width), parameters, table = (
         labels.shape,
         slow_parameters(colours, labels, count),
@@ -75,7 +75,7 @@ def slow_label_pass(colours: np.ndarray, labels: np.ndarray, count: int, deviati
     return padded[1:-1, 1:-1]
 
 
-def test_bass_label_pass(pixels: np.ndarray, labels: np.ndarray) -> None:
+def test_label_pass_matches_a_slow_twin(pixels: np.ndarray, labels: np.ndarray) -> None:
     padded, deviation = pad_labels(labels), 0.2
     foreign = np.array([8 - mask.bit_count() for mask in range(256)], np.float32)
     rows = bass.fit_regions(padded, pixels, np.full(30, labels.size / 30))

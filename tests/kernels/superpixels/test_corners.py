@@ -1,4 +1,4 @@
-"""Corners against OpenCV."""
+"""Corners match OpenCV's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def noise(height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_corners_are_those_of_opencv(size: tuple[int, int]) -> None:
+def test_corners_match_opencv_s(size: tuple[int, int]) -> None:
     pixels = noise(*size)
     expected = cv2.cornerMinEigenVal(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), 3, ksize=3)
     response = seeds.corner_response(pixels)
@@ -29,11 +29,11 @@ def test_flat_pictures_have_no_corners() -> None:
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0)])
-def test_no_pixels(shape: tuple[int, int]) -> None:
+def test_picture_without_pixels_has_no_corners(shape: tuple[int, int]) -> None:
     assert seeds.corner_response(np.empty((*shape, 3), np.float32)).shape == shape
 
 
-def test_nan_stays_where_it_is() -> None:
+def test_nan_changes_no_corner_far_from_it() -> None:
     pixels = noise(12, 12)
     pixels[6, 6] = np.nan
     clean, response = seeds.corner_response(noise(12, 12)), seeds.corner_response(pixels)

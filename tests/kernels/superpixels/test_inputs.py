@@ -1,4 +1,4 @@
-"""What all kernels of superpixels share: the same bits from every library, empty and odd inputs, bad labels."""
+"""All kernels of superpixels give the same bits with every library, and take empty, odd or wrong inputs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ONE = pad_labels(np.zeros((1, 1), int))
 
 
 def make_picture(height: int, width: int) -> np.ndarray:
-    """Noise on a slope."""
+    """Make a picture of noise on a slope."""
     noise = np.random.default_rng(0).random((height, width, 3), dtype=np.float32)
     return 0.3 * noise + np.linspace(0, 0.7, width, dtype=np.float32)[:, None]
 
@@ -44,13 +44,13 @@ def all_of_them(height: int, width: int) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (47, 61)])
-def test_same_bits_from_every_library(
+def test_every_library_gives_the_same_bits(
     size: tuple[int, int], each_target: Callable[[Callable[[], Sequence[np.ndarray]]], Sequence[np.ndarray]]
 ) -> None:
     assert len(each_target(lambda: all_of_them(*size))) > 10
 
 
-def test_no_pixels() -> None:
+def test_every_kernel_takes_a_picture_without_pixels() -> None:
     labels, pixels, sums = np.full((2, 2), -1, np.int32), np.empty((0, 0, 3), np.float32), np.empty((0, 20))
     assert regions.region_rows(labels, pixels, 0, 2, SPREAD).tolist() == [[0] * 8] * 2
     assert regions.sweep(labels, pixels, np.empty((0, 8), np.float32), regions.CONNECTIVITY, SPREAD, False) == 0
@@ -121,7 +121,7 @@ def test_bad_indices_are_refused() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38])
-def test_odd_colours_end_and_stay_inside(value: float) -> None:
+def test_odd_colours_leave_labels_in_their_range(value: float) -> None:
     """Colours that no caller lets in: every kernel comes to an end, and labels stay in their range."""
     height, width, count = 9, 11, 6
     pixels = make_picture(height, width)
@@ -140,5 +140,5 @@ def test_odd_colours_end_and_stay_inside(value: float) -> None:
             ward.merge_regions(labels, pixels, count, 1, SPREAD)
 
 
-def test_duplicate_seeds_share_a_pixel() -> None:
+def test_last_of_equal_seeds_gets_the_pixels() -> None:
     assert seeds.voronoi(np.zeros((9, 2), np.int64), 2, 2).tolist() == [[8, 8], [8, 8]]

@@ -1,4 +1,4 @@
-"""Splitting rectangles against slow, obvious twins."""
+"""Splitting rectangles matches slow, obvious twins."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from regions_of_noise import COMPACTNESS, features, squared_error, total_error
 from gsmerge.kernels.superpixels import kd
 
 
-def test_integral_image(pixels: np.ndarray) -> None:
+def test_integral_image_sums_the_pixels_above_and_left(pixels: np.ndarray) -> None:
     expected = np.zeros((18, 24, 3))
     expected[1:, 1:] = pixels.astype(np.float64).cumsum(0).cumsum(1)
     assert kd.integral_image(pixels) == pytest.approx(expected.reshape(-1, 3))
 
 
 def brute_cuts(pixels: np.ndarray, y0: int, x0: int, y1: int, x1: int) -> list[tuple[float, int, int]]:
-    """(gain, axis, cut) of every straight cut of a rectangle."""
+    """Return (gain, axis, cut) of every straight cut of a rectangle."""
     points = features(pixels).reshape(*pixels.shape[:2], 5)[y0:y1, x0:x1]
     whole, gains = squared_error(points.reshape(-1, 5)), []
     for axis in (0, 1):
@@ -46,7 +46,7 @@ def test_best_cut_is_the_largest_fall_of_the_error(pixels: np.ndarray, box: tupl
 
 
 def greedy_rectangles(pixels: np.ndarray, count: int) -> np.ndarray:
-    """The best cut of all, again and again."""
+    """Make the best cut of all, again and again."""
     labels = np.zeros(pixels.shape[:2], int)
     heap: list[tuple] = []
 
@@ -68,7 +68,7 @@ def greedy_rectangles(pixels: np.ndarray, count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 20, 200, 391])
-def test_rectangles_are_nearly_the_greedy_ones(pixels: np.ndarray, count: int) -> None:
+def test_rectangles_have_nearly_the_error_of_greedy_cuts(pixels: np.ndarray, count: int) -> None:
     padded, num_regions = kd.split_rectangles(pixels, count, 32, COMPACTNESS)
     actual = padded[1:-1, 1:-1]
     assert num_regions == count == len(np.unique(actual))

@@ -1,4 +1,4 @@
-"""Merging regions against slow, obvious numpy."""
+"""Merging regions matches slow, obvious numpy."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class View:
         return float(((self.pixels[mask] - self.pixels[mask].mean(0, dtype=float)) ** 2).sum()) if mask.any() else 0.0
 
     def plane_error(self, mask: np.ndarray) -> float:
-        """Least squares of z (a x + b y + c) against 1, the slopes damped; in coordinates about the region's middle."""
+        """Fit z (a x + b y + c) to 1 by least squares, the slopes damped; in coordinates about the region's middle."""
         mask = mask & (self.depths > 0)
         if not mask.any():
             return 0.0
@@ -71,7 +71,7 @@ class View:
 
 
 def merge_reference(view: View, max_extent: float) -> tuple[list[int], list[float], list[float]]:
-    """The cheapest pair of neighbours of all, again and again."""
+    """Merge the cheapest pair of neighbours of all, again and again."""
     masks = {i: view.labels == i for i in range(COUNT)}
     touching = {tuple(sorted(p)) for p in adjacent_pairs(pad_labels(view.labels)).tolist()}
     parents, heights, growths = [-1] * (2 * COUNT - 1), [0.0] * (2 * COUNT - 1), []
@@ -92,7 +92,7 @@ def merge_reference(view: View, max_extent: float) -> tuple[list[int], list[floa
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_sums_of_the_leaves(seed: int) -> None:
+def test_sums_of_leaves_match_their_pixels(seed: int) -> None:
     view = View(seed)
     rows, colour_error = view.rows()
     masks = [view.labels == i for i in range(COUNT)]
@@ -103,7 +103,7 @@ def test_sums_of_the_leaves(seed: int) -> None:
 
 @pytest.mark.parametrize("max_extent", [1e9, 9.0])
 @sweep("seed", range(3))
-def test_order_of_merges(seed: int, max_extent: float) -> None:
+def test_merges_match_a_slow_twin(seed: int, max_extent: float) -> None:
     view = View(seed)
     parents, heights, growths = view.merges(max_extent)
     expected = merge_reference(view, max_extent)
@@ -131,6 +131,6 @@ def test_regions_without_pixels_cost_nothing() -> None:
         ([True] * 4, [0] * 5),
     ],
 )
-def test_cut_labels(keep: list[bool], expected: list[int]) -> None:
+def test_cut_of_a_tree_numbers_its_leaves_by_branch(keep: list[bool], expected: list[int]) -> None:
     parents = np.array([5, 5, 7, 6, 6, 7, 8, 8, -1], np.int32)  # ((0 1) 2) (3 4)
     assert kernels.cut_labels(parents, np.array(keep), 5).tolist() == expected

@@ -1,4 +1,4 @@
-"""Seeds of superpixels against slow, obvious twins."""
+"""Seeds of superpixels match slow, obvious twins."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_voronoi_regions_hold_the_nearest_pixels() -> None:
 
 
 def slow_dither(density: np.ndarray) -> np.ndarray:
-    """Floyd-Steinberg error diffusion, serpentine, with the kernel's noise."""
+    """Diffuse errors as Floyd and Steinberg do, serpentine, with the kernel's noise."""
     height, width = density.shape
     left, seeds_at, noise = density.copy(), np.zeros(density.shape, bool), 1
     for y in range(height):
@@ -33,7 +33,7 @@ def slow_dither(density: np.ndarray) -> np.ndarray:
     return seeds_at
 
 
-def test_dither(pixels: np.ndarray) -> None:
+def test_dithered_seeds_match_a_slow_twin(pixels: np.ndarray) -> None:
     density = pixels[..., 0].astype(np.float64) ** 2
     actual = seeds.dither(density)
     assert np.array_equal(actual, slow_dither(density))
@@ -66,7 +66,7 @@ def test_hexagonal_seeds_are_distinct_pixels(height: int, width: int) -> None:
         assert (seeds < [height, width]).all()
 
 
-def test_hexagonal_rows_are_shifted() -> None:
+def test_every_second_row_of_hexagonal_seeds_is_shifted() -> None:
     seeds = hexagonal_seeds(26, 30, 30)  # rows of hexagons of 26 pixels are 4.75 apart
     rows = [seeds[seeds[:, 0] == y][:, 1] for y in np.unique(seeds[:, 0])]
     assert len(rows) == 5

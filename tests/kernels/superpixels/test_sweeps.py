@@ -1,4 +1,4 @@
-"""Sweeps over border pixels against a slow, obvious twin."""
+"""Sweeps over border pixels match a slow, obvious twin."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def test_ring_mask_reads_the_ring_in_order() -> None:
         assert regions.ring_mask(np.where(ring_of(mask), 5, 2).astype(np.int32), 1, 1, 5) == mask
 
 
-def test_connectivity_table_is_what_components_say() -> None:
+def test_connectivity_table_matches_connected_components() -> None:
     table = regions.connectivity_table()
     for mask in range(256):
         parts = connected_parts(ring_of(mask), connectivity=1)

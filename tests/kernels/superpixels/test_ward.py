@@ -1,4 +1,4 @@
-"""Merging neighbours by the growth of the error, and rows of regions, against slow, obvious twins."""
+"""Merging neighbours by the growth of the error, and rows of regions, match slow, obvious twins."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_adjacent_pairs_are_all_neighbours(labels: np.ndarray) -> None:
 
 
 def greedy_merge(pixels: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """The cheapest pair of neighbours, again and again."""
+    """Merge the cheapest pair of neighbours, again and again."""
     labels, points = labels.copy(), features(pixels)
 
     def cost(pair: tuple[int, int]) -> float:
@@ -51,7 +51,9 @@ def greedy_merge(pixels: np.ndarray, labels: np.ndarray, count: int) -> np.ndarr
 
 
 @pytest.mark.parametrize("count", [1, 2, 8, 15, 29, 30])
-def test_merging_is_nearly_greedy(pixels: np.ndarray, labels: np.ndarray, count: int) -> None:
+def test_merged_regions_have_nearly_the_error_of_greedy_merges(
+    pixels: np.ndarray, labels: np.ndarray, count: int
+) -> None:
     merged = ward.merge_regions(pad_labels(labels), pixels, 30, count, SPREAD)[1:-1, 1:-1]
     assert len(np.unique(merged)) == merged.max() + 1 == count
     for k in range(30):

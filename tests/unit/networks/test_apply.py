@@ -1,3 +1,5 @@
+"""Networks change every stage, and silent ones change nothing."""
+
 from __future__ import annotations
 
 from dataclasses import fields, replace
@@ -38,7 +40,7 @@ def assert_close(a: FeatureGaussians | Gaussians, b: FeatureGaussians | Gaussian
 
 
 def pairs(features: FeatureGaussians) -> Matches:
-    """Every Feature Gaussian of the first view with the same one of the second, but for the first."""
+    """Match every Feature Gaussian of the first view with the same one of the second, but for the first."""
     half = len(features) // 2
     clusters = np.tile(np.arange(half), 2)
     clusters[half] = half
@@ -76,7 +78,7 @@ def test_trained_networks_change_every_stage(scene: Made) -> None:
     assert not np.array_equal(refined.latents, merged.latents)
 
 
-def test_no_networks_and_nothing_to_do(scene: Made) -> None:
+def test_nothing_is_corrected_without_networks_or_features(scene: Made) -> None:
     assert ANALYTIC.refine(scene.features) is scene.features
     context = scene.networks(noisy())
     none = take_features(encode_features(scene.features, context), np.zeros(0, np.int64))
@@ -85,7 +87,7 @@ def test_no_networks_and_nothing_to_do(scene: Made) -> None:
     assert len(decode(none, scene.members, DecodeOptions(), networks=context)) == 0
 
 
-def test_order_of_the_members_does_not_matter(scene: Made) -> None:
+def test_encoding_does_not_depend_on_the_order_of_members(scene: Made) -> None:
     starts, members = scene.features.starts, scene.features.members.copy()
     rng = np.random.default_rng(0)
     for first, last in pairwise(starts):
@@ -97,7 +99,7 @@ def test_order_of_the_members_does_not_matter(scene: Made) -> None:
     assert np.array_equal(a.means, b.means)
 
 
-def test_order_of_the_groups_and_the_table_they_share_do_not_matter(scene: Made) -> None:
+def test_each_group_is_encoded_as_if_alone(scene: Made) -> None:
     """Padding and bins: every group alone gives what all together give."""
     context = scene.networks(noisy())
     together = encode_features(scene.features, context)
@@ -106,7 +108,7 @@ def test_order_of_the_groups_and_the_table_they_share_do_not_matter(scene: Made)
         assert_close(alone, take_features(together, np.array([row])), 2e-6)
 
 
-def test_order_within_a_cluster_does_not_matter(scene: Made) -> None:
+def test_merged_cluster_does_not_depend_on_the_order_of_members(scene: Made) -> None:
     context = scene.networks(noisy())
     encoded = encode_features(scene.features, context)
     matches = pairs(encoded)
@@ -147,7 +149,7 @@ def test_many_children_are_corrected_in_halves(scene: Made) -> None:
     assert not np.array_equal(together.means, children.means)
 
 
-def test_refiner_reads_the_neighbours(scene: Made) -> None:
+def test_refiner_reads_near_neighbours_alone(scene: Made) -> None:
     context = scene.networks(noisy())
     encoded = encode_features(scene.features, context)
     near = find_neighbors(encoded.means, 4)
@@ -159,7 +161,7 @@ def test_refiner_reads_the_neighbours(scene: Made) -> None:
         assert np.array_equal(refined.means[0], context.refine(encoded).means[0]) is same
 
 
-def test_nearest_by_hand(scene: Made) -> None:
+def test_nearest_neighbours_on_a_line_are_those_found_by_hand(scene: Made) -> None:
     features = take_features(scene.features, np.arange(6))
     line = np.array([0, 1, 3, 7, 7.5, 9], np.float32)
     features = replace(features, means=np.stack([line, line * 0, line * 0], 1))
@@ -180,14 +182,14 @@ def test_the_seed_chooses_the_sample_of_large_groups(scene: Made) -> None:
     assert np.array_equal(a[~large], b[~large])
 
 
-def test_every_member_counts_in_the_mass_even_when_sampled(scene: Made) -> None:
+def test_mass_of_a_sampled_group_counts_every_member(scene: Made) -> None:
     """Group mass is that of all members (paper supplement), so it does not change with the limit."""
     few, many = scene.networks(noisy()), scene.networks(noisy(replace(SMALL, members=64)))
     assert np.array_equal(few.describe(scene.features).group, many.describe(scene.features).group)
 
 
 @pytest.mark.parametrize("factor", [2.0**-10, 2.0**10])
-def test_scale_of_the_world_drops_out(scene: Made, factor: float) -> None:
+def test_encoding_does_not_depend_on_the_scale_of_the_world(scene: Made, factor: float) -> None:
     context, f = (
         scene.networks(noisy(replace(SMALL, members=64))),
         scene.features,
@@ -233,14 +235,14 @@ def test_gradients_reach_every_parameter(scene: Made) -> None:
         assert unused or bool(parameter.grad.any()), name
 
 
-def test_sizes_are_checked() -> None:
+def test_sizes_of_networks_out_of_range_are_refused() -> None:
     for wrong in ({"width": 50}, {"heads": 0}, {"members": 10**9}, {"latent": 1.5}, {"blocks": True}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             NetworkOptions(**wrong)
     assert 150_000 <= untrained().num_parameters <= 300_000
 
 
-def test_absolute_heads_know_no_children(scene: Made) -> None:
+def test_absolute_heads_make_k_children_of_every_group(scene: Made) -> None:
     """Exactly K of every group, whatever its members; untrained, round Gaussians in the group's place."""
     plain, start = DecodeOptions(k=2, min_opacity=0.0), scene.networks(untrained(PAPER))
     encoded = encode_features(scene.features, start)
@@ -256,7 +258,7 @@ def test_absolute_heads_know_no_children(scene: Made) -> None:
     assert float(moved.scales.max() / actual.scales.max()) < np.exp(6.1)
 
 
-def test_the_geometry_of_the_first_head_is_carried_on(scene: Made) -> None:
+def test_geometry_of_the_first_head_is_carried_on(scene: Made) -> None:
     """Scales and rotations are those of the K = 1 head from the encoder on; the means stay the encoder's."""
     context, moments = (scene.networks(noisy(replace(PAPER, geometry=name))) for name in ("carried", "analytic"))
     encoded, carried = moments.encode(scene.features), context.encode(scene.features)
@@ -290,7 +292,7 @@ def test_heads_of_the_paper_read_latent_mass_and_base_colour_alone(scene: Made) 
 
 
 @pytest.mark.parametrize("name", ["encoder", "merger", "refiner"])
-def test_a_network_that_is_left_out_has_no_weights_and_corrects_nothing(scene: Made, name: str) -> None:
+def test_network_that_is_left_out_has_no_weights_and_no_effect(scene: Made, name: str) -> None:
     """As the whole with this network silent: its stage is the analytic one."""
     whole, options = noisy(), replace(SMALL, **{name: False})
     left = {key: array for key, array in whole.arrays.items() if not key.startswith(name)}

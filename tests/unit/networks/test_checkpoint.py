@@ -1,3 +1,5 @@
+"""Networks are written to a checkpoint and read back."""
+
 from __future__ import annotations
 
 import json
@@ -11,7 +13,7 @@ import gsmerge
 from gsmerge.networks.checkpoint import SHIPPED, find_checkpoint, load_checkpoint
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_written_checkpoint_is_read_back(tmp_path: Path) -> None:
     networks = noisy()
     checkpoint = load_checkpoint(written(tmp_path / "a.safetensors", noisy()))
     assert checkpoint.networks.options == SMALL
@@ -24,16 +26,16 @@ def test_round_trip(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a.safetensors"]
 
 
-def test_the_same_networks_give_the_same_bytes(tmp_path: Path) -> None:
+def test_same_networks_are_written_as_the_same_bytes(tmp_path: Path) -> None:
     a, b = (written(tmp_path / name, noisy()).read_bytes() for name in ("a", "b"))
     assert a == b
 
 
-def test_none_is_nothing() -> None:
+def test_checkpoint_none_means_no_networks() -> None:
     assert find_checkpoint("none", required=False) == (None, [])
 
 
-def test_what_ships_says_what_it_is() -> None:
+def test_shipped_checkpoint_says_what_it_is() -> None:
     checkpoint, notes = find_checkpoint("shipped", required=True)
     assert notes == []
     assert SHIPPED.stat().st_size < 8e6

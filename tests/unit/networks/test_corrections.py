@@ -1,3 +1,5 @@
+"""Corrections move Gaussians by their formulas, within bounds."""
+
 from __future__ import annotations
 
 from dataclasses import fields, replace
@@ -43,7 +45,7 @@ def move(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarray, axes: 
 
 
 def base_of(features: FeatureGaussians) -> Gaussians:
-    """The Gaussian of each, in C order."""
+    """Return the Gaussian of each, in C order."""
     return Gaussians(*(np.ascontiguousarray(column) for column in vars(feature_to_gaussians(features)).values()))
 
 
@@ -59,7 +61,7 @@ def zeros() -> np.ndarray:
     return np.zeros((20, FEATURE), np.float32)
 
 
-def test_zero_changes_no_bit() -> None:
+def test_corrections_of_zero_change_no_bit() -> None:
     features = some()
     base = base_of(features)
     for before, after in (
@@ -88,7 +90,7 @@ def test_any_number_of_rows_at_once_gives_the_same_bits(rows: int, monkeypatch: 
     assert len(move(base[:0], noise()[:0], EACH[:0], frames())) == 0
 
 
-def test_gaussians_move_as_told() -> None:
+def test_corrections_move_gaussians_by_their_formulas() -> None:
     base, residuals = base_of(some()), zeros()
     residuals[:, MEAN_COLUMNS], residuals[:, SIZE_COLUMNS] = [1.0, 0, 0], [0.1, 0.2, -0.3]
     residuals[:, LOGIT_COLUMN], residuals[:, COLOR_COLUMNS] = 0.7, [0.1, -0.1, 0.2]
@@ -101,7 +103,7 @@ def test_gaussians_move_as_told() -> None:
     np.testing.assert_allclose(SH_C0 * (moved.sh0 - base.sh0)[:, 0], residuals[:, COLOR_COLUMNS], atol=1e-6)
 
 
-def test_tensors_move_in_the_same_way(torch: Any) -> None:
+def test_corrections_of_tensors_are_those_of_arrays(torch: Any) -> None:
     """Training's Gaussians, through which gradients flow, are those of use."""
     from gsmerge.networks import tensors
 
@@ -115,7 +117,7 @@ def test_tensors_move_in_the_same_way(torch: Any) -> None:
 
 @pytest.mark.parametrize("opacity", [0.0, 1e-6, 1.0])
 @pytest.mark.parametrize("logit", [-3.0, 3.0])
-def test_opacities_at_the_ends_stay_within_them(logit: float, opacity: float) -> None:
+def test_opacities_of_0_and_1_stay_within_0_and_1(logit: float, opacity: float) -> None:
     base = replace(base_of(some()), opacities=np.full(20, opacity, np.float32))
     residuals = zeros()
     residuals[:, LOGIT_COLUMN] = logit
@@ -123,7 +125,7 @@ def test_opacities_at_the_ends_stay_within_them(logit: float, opacity: float) ->
     assert ((moved >= 0) & (moved <= 1)).all()
 
 
-def test_rotations_agree_with_each_other(torch: Any) -> None:
+def test_rotations_of_means_and_covariances_agree(torch: Any) -> None:
     """A quaternion and a covariance turn alike, also by more than a whole turn."""
     from gsmerge.networks import tensors
 
@@ -164,6 +166,6 @@ def test_feature_gaussians_move_like_gaussians() -> None:
     np.testing.assert_allclose(heavier.masses, 6 * features.masses, rtol=1e-5)
 
 
-def test_limits_are_those_of_the_bounds() -> None:
+def test_limits_of_corrections_are_their_bounds() -> None:
     limits = residual_limits(Bounds(mean=0.5, turn=0.2))
     assert limits.tolist() == np.float32([0.5] * 3 + [1.1] * 3 + [0.2] * 3 + [3.0] + [0.25] * 3 + [3.0]).tolist()

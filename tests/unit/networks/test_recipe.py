@@ -1,4 +1,4 @@
-"""``recipe="paper"``: the paper's own chain under one name."""
+"""``recipe="paper"`` is the paper's own chain under one name."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Networks that moved away from their start at random."""
+    """Return networks that moved away from their start at random."""
     return written(tmp_path_factory.mktemp("networks") / "absolute.safetensors", noisy(SMALL, 0.05))
 
 
-def test_recipe_is_its_settings(scene: Scene, absolute: Path) -> None:
+def test_recipe_means_the_settings_of_its_table(scene: Scene, absolute: Path) -> None:
     actual = compact(scene, recipe="paper", checkpoint=str(absolute))
     settings = {"segmentation": "bass-st", "superpixels": "5.3%", "match": "aabb", "fit": "none", "min_contribution": 0}
     expected = compact(scene, **settings, checkpoint=str(absolute))
@@ -48,7 +48,7 @@ def test_recipe_is_its_settings(scene: Scene, absolute: Path) -> None:
     assert actual.report.options["fit"] == "none"
 
 
-def test_what_is_set_besides_goes_before() -> None:
+def test_other_settings_go_before_those_of_a_recipe() -> None:
     options = CompactOptions().with_settings({"recipe": "paper", "checkpoint": "a.safetensors", "match": "none"})
     assert options.match.match == "none"
     assert options.segment.segmentation == "bass-st"
@@ -74,12 +74,12 @@ def test_gaussians_without_pixels_go_to_superpixels_by_blending_weight(absolute:
 
 
 @pytest.mark.parametrize("checkpoint", ["auto", "none"])
-def test_it_needs_networks(checkpoint: str) -> None:
+def test_recipe_without_networks_is_refused(checkpoint: str) -> None:
     with refuses(ValueError, "recipe paper", "absolute", checkpoint):
         CompactOptions().with_settings({"recipe": "paper", "checkpoint": checkpoint})
 
 
-def test_other_networks_are_refused(scene: Scene, tmp_path: Path) -> None:
+def test_recipe_refuses_residual_networks(scene: Scene, tmp_path: Path) -> None:
     path = tmp_path / "residual.safetensors"
     written(path, untrained(replace(SMALL, outputs="residual")))
     for checkpoint in (str(path), "shipped"):

@@ -1,3 +1,5 @@
+"""Members of groups are sampled and put into tables."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -6,7 +8,7 @@ import pytest
 from gsmerge.networks.tokens import hash_uniform, sample_members, split_tables
 
 
-def test_tables_hold_every_group_once() -> None:
+def test_token_tables_hold_every_group_once() -> None:
     sizes = np.random.default_rng(0).integers(1, 100, 5000)
     actual = list(split_tables(sizes, 16))
     assert sorted(np.concatenate([rows for rows, _ in actual]).tolist()) == list(range(5000))
@@ -28,7 +30,7 @@ def test_large_groups_are_sampled_once_from_every_run(size: int) -> None:
     assert (ranks < edges[1:]).all()
 
 
-def test_numbers_are_uniform_and_their_own() -> None:
+def test_hashed_numbers_are_uniform_without_correlation() -> None:
     numbers = hash_uniform(np.arange(20000, dtype=np.uint64), np.zeros(1, np.uint64))
     assert 0 <= numbers.min() < numbers.max() < 1
     assert abs(numbers.mean() - 0.5) < 0.01

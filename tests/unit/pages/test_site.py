@@ -1,4 +1,4 @@
-"""A page with a scene, that needs no other host, and a camera that it may not leave."""
+"""A page with a scene needs no other host, and its camera stays within bounds."""
 
 from __future__ import annotations
 
@@ -58,19 +58,19 @@ def test_a_page_needs_no_other_host(page: str) -> None:
     assert len(page) < 1_000_000
 
 
-def test_its_scene_is_a_sog_of_all_gaussians(page: str, tmp_path: Path) -> None:
+def test_scene_in_the_page_is_a_sog_of_all_gaussians(page: str, tmp_path: Path) -> None:
     (tmp_path / "a.sog").write_bytes(part_of(page, "scene"))
     assert len(read_gaussians(tmp_path / "a.sog").gaussians) == len(
         scenes.make_scene(scenes.room(), scenes.arc(3)).gaussians
     )
 
 
-def test_the_licences_of_the_viewer_are_in_it(page: str) -> None:
+def test_page_has_the_licences_of_its_viewer(page: str) -> None:
     texts = [base64.b64decode(one) for one in re.findall("data:text/plain;base64,([A-Za-z0-9+/=]+)", page)]
     assert [text.count(b"Permission is hereby granted") for text in texts] == [3]
 
 
-def test_of_many_views_the_page_knows_some_and_the_middle_one() -> None:
+def test_page_of_many_views_keeps_some_and_starts_at_the_middle() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3))
     many = scene.cameras[np.repeat(np.arange(3), 50)]
     data = data_of(make_page(scene.gaussians, many, "a", ()))
@@ -79,7 +79,7 @@ def test_of_many_views_the_page_knows_some_and_the_middle_one() -> None:
     np.testing.assert_allclose(data["views"][data["start"]]["viewmat"], scene.cameras.viewmats[1].reshape(-1))
 
 
-def test_without_cameras_one_may_look_from_any_side() -> None:
+def test_page_without_cameras_lets_one_look_from_any_side() -> None:
     gaussians = scenes.make_scene(scenes.room(), scenes.arc(3)).gaussians
     page = make_page(gaussians, NONE, "a", ())
     data = data_of(page)
@@ -111,7 +111,7 @@ def test_a_folder_gets_the_result(output: str, expected: str, tmp_path: Path) ->
     assert output_file(tmp_path / output, "a.ply") == tmp_path / expected
 
 
-def test_a_page_with_a_scene_is_a_result_that_no_report_replaces(tmp_path: Path) -> None:
+def test_page_with_a_scene_may_not_be_replaced_by_a_report(tmp_path: Path) -> None:
     (tmp_path / "scene.html").write_text(page_of_room())
     (tmp_path / "mine.html").write_text("<!DOCTYPE html><title>mine</title>")
     (tmp_path / "report.html").write_text('<meta name="generator" content="gsmerge 0.3.0">')

@@ -1,4 +1,4 @@
-"""What a page shows: pictures, cameras, numbers, Gaussians."""
+"""A page shows pictures, cameras, numbers and Gaussians of its scenes."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def decoded(still: bytes | None) -> np.ndarray:
 
 
 def unpacked(packed: bytes | None) -> tuple[dict[str, Any], np.ndarray]:
-    """The numbers of what the page holds: its head, and ``[n,columns]``."""
+    """Return the numbers of what the page holds: its head, and ``[n,columns]``."""
     assert packed is not None
     assert packed[9:10] == UNIX
     line, _, rest = gzip.decompress(packed).partition(b"\n")
@@ -97,7 +97,7 @@ def unpacked(packed: bytes | None) -> tuple[dict[str, Any], np.ndarray]:
     return head, np.stack(columns, 1)
 
 
-def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
+def test_scores_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
     nets = (data.LPIPS,) if lpips_available(data.LPIPS) else ()
     expected = evaluate(scene, {"half": half}, held_out, EvaluateOptions(lpips=nets, fog=False))
     by_place = sorted(actual.views, key=lambda view: view.place)
@@ -126,7 +126,7 @@ def test_a_page_opens_on_the_middle_view(actual: ViewData) -> None:
     assert replace(inputs, views=tuple(some)).start == 0  # the one with every figure
 
 
-def test_one_scene_alone(small: Scene) -> None:
+def test_scene_alone_is_scored_against_its_photos(small: Scene) -> None:
     alone = collect_page_data("room", small, {}, (300,))
     assert [side.name for side in alone.sides] == ["input"]
     assert alone.notes == ()
@@ -142,7 +142,7 @@ def test_the_worst_view_comes_first(actual: ViewData) -> None:
     assert values == sorted(values, key=lambda value: value or 0)
 
 
-def test_stills_are_our_renders(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
+def test_stills_are_what_render_draws(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
     for view in actual.views:
         split, i = (held_out, view.place - 3) if view.held_out else (scene, view.place)
         renders = [
@@ -153,7 +153,7 @@ def test_stills_are_our_renders(actual: ViewData, scene: Scene, half: Gaussians,
             assert psnr(decoded(still), picture) > 31  # 41 where pictures are not as small and colourful
 
 
-def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) -> None:
+def test_view_from_outside_is_drawn_without_photo_or_scores(actual: ViewData, scene: Scene, half: Gaussians) -> None:
     camera, distance = outside_camera(scene.cameras, scene.gaussians.means)
     for some, still in zip((scene.gaussians, half), actual.outside.stills, strict=False):
         assert psnr(decoded(still), render(some, camera, near=near_plane(scene)).images[0].clip(0, 1)) > 30
@@ -164,7 +164,7 @@ def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) 
     assert actual.outside not in actual.views
 
 
-def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: Scene) -> None:
+def test_cameras_and_gaussians_share_one_frame(actual: ViewData, half: Gaussians, scene: Scene) -> None:
     """What a view sees in the world it sees in the page's frame."""
     head, columns = unpacked(actual.sides[1].splats)
     drawn = half.means[half.opacities >= splats.LEAST_OPACITY]
@@ -230,7 +230,7 @@ def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: py
     assert unpacked(content)[1].shape == (len(half), 13 + 24)
 
 
-def test_harmonics_of_zeros_are_left_out(small: Scene) -> None:
+def test_higher_degrees_of_zeros_are_left_out(small: Scene) -> None:
     half = small.gaussians[::2]
     flat = np.zeros((len(half), 15, 3), np.float32)
     flat[:, :3] = 0.1
@@ -247,7 +247,7 @@ def test_pixels_in_order_take_less_than_their_spz(scene: Scene) -> None:
     assert len(packed or b"") < 0.8 * len(pack_splats(gaussians)[0] or b"") < 0.8 * len(spz_bytes(gaussians))
 
 
-def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
+def test_gaussians_not_finite_or_too_faint_are_left_out(half: Gaussians) -> None:
     means, opacities = half.means.copy(), half.opacities.copy()
     means[0, 1], opacities[1] = np.nan, 0.003
     content, _ = pack_splats(replace(half, means=means, opacities=opacities))
@@ -256,7 +256,7 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
     assert counts[0] == counts[1] - 2
 
 
-def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_views_are_thinned_to_some_with_the_worst(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(data, "MAX_SHOWN_VIEWS", 1)
     actual = collect_page_data("room", small, {"half": small.gaussians[::2]}, (2, 1))
     everything = evaluate(small, {"half": small.gaussians[::2]}, None, EvaluateOptions(lpips=())).results[1].scores
@@ -284,7 +284,7 @@ def test_without_photos_results_are_compared_with_the_input(small: Scene) -> Non
         ((), []),
     ],
 )
-def test_short_names(names: tuple[str, ...], short: list[str]) -> None:
+def test_short_names_leave_out_folder_and_suffix_unless_they_collide(names: tuple[str, ...], short: list[str]) -> None:
     assert short_names(names) == short
 
 

@@ -1,4 +1,4 @@
-"""The page: complete in one file, and nothing in it that a name could have put there."""
+"""The page is complete in one file, and nothing in it is there because of a name."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def block(page: str, name: str) -> str:
     return found[1]
 
 
-def test_it_loads_nothing(page: str) -> None:
+def test_page_loads_nothing_from_outside(page: str) -> None:
     addresses = re.findall(r"""(?:src|href)=["']([^"']+)["']|url\(([^)]+)\)""", _written(page))
     assert len(addresses) >= 3
     assert all(one.startswith(("data:", '"${')) for pair in addresses for one in pair if one)
@@ -56,17 +56,17 @@ def test_it_loads_nothing(page: str) -> None:
     assert "default-src &#x27;none&#x27;" in page
 
 
-def test_its_own_scripts_and_styles_alone_may_run(page: str) -> None:
+def test_policy_lets_the_page_s_own_scripts_and_styles_run_alone(page: str) -> None:
     """The policy names them by their hashes, and nothing needs more: no attribute holds a style or a script."""
     check_policy(page)
 
 
 def _written(page: str) -> str:
-    """The page without what is in base64: pictures and programs."""
+    """Return the page without what is in base64: pictures and programs."""
     return re.sub(r'(<script type="text/plain" id="[\w-]+">)[^<]*', r"\1", re.sub(r"base64,[\w+/=]+", "base64,", page))
 
 
-def test_names_are_escaped(page: str) -> None:
+def test_names_in_the_page_are_escaped(page: str) -> None:
     text = _written(page)
     assert "<b onload" not in text
     assert "<i>" not in text
@@ -74,7 +74,7 @@ def test_names_are_escaped(page: str) -> None:
     assert text.count("<script") == text.count("</script>")
 
 
-def test_what_the_script_reads(page: str, data: ViewData) -> None:
+def test_page_holds_the_data_that_its_script_reads(page: str, data: ViewData) -> None:
     read = json.loads(block(page, "data"))
     assert [source["name"] for source in read["sources"]] == ["photo", "input", EVIL]
     assert [view["name"] for view in read["views"]] == [view.name for view in data.shown]
@@ -96,14 +96,14 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
 
 
 def with_three_results(data: ViewData) -> ViewData:
-    """The scene with results of a half, a tenth and a hundredth; the second is worse than it."""
+    """Return the scene with results of a half, a tenth and a hundredth; the second is worse than it."""
     scene, half = (replace(side, num_gaussians=1000, mean=Quality(20.0, 0.5)) for side in data.sides)
     half = replace(half, name="half", num_gaussians=500, file_bytes=2_000, mean=Quality(25.0, 0.75))
     tenth = replace(half, name="tenth", num_gaussians=100, file_bytes=400, mean=Quality(19.0, 0.5, lpips_alex=0.25))
     return replace(data, sides=(scene, half, tenth, replace(tenth, name="least", num_gaussians=10)))
 
 
-def test_a_table_over_all_results(data: ViewData) -> None:
+def test_page_has_a_table_of_all_results(data: ViewData) -> None:
     three = with_three_results(data)
     head, rows = results_table(three)
     assert head == ["", "File", "PSNR (dB)", "SSIM", "LPIPS", "Gaussians", "Share"]
@@ -118,7 +118,7 @@ def test_a_table_over_all_results(data: ViewData) -> None:
     assert page.count('<button class="link"') == 3
 
 
-def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
+def test_each_result_has_its_headline_and_figures(data: ViewData) -> None:
     page = page_of(replace(with_three_results(data), reference="renders of the input"))
     half, tenth, least = json.loads(block(page, "data"))["results"]
     assert half["figures"] == [["500", ""], ["2.0 kB", ""], ["25.00 dB", "up"], ["0.750", "up"]]
@@ -129,7 +129,7 @@ def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
     assert '<select id="result"' not in page
 
 
-def test_new_views_come_before_own_photos_which_never_count_as_better(data: ViewData) -> None:
+def test_gain_of_new_views_comes_before_scores_of_own_photos(data: ViewData) -> None:
     three = with_three_results(data)
     gains = (None, (2.0, 4.5), (-1.0, 1.5), None)
     sides = tuple(replace(side, new_gain=gain) for side, gain in zip(three.sides, gains, strict=True))
@@ -142,7 +142,7 @@ def test_new_views_come_before_own_photos_which_never_count_as_better(data: View
     assert "No photo was held out: scores are those of photos that fits have seen." in page
 
 
-def test_the_slider_is_over_sizes(data: ViewData) -> None:
+def test_slider_chooses_among_sizes(data: ViewData) -> None:
     """From the smallest to the largest; it begins at the first result, and one result has none."""
     page = page_of(with_three_results(data))
     read = json.loads(block(page, "data"))
@@ -163,7 +163,7 @@ def test_the_slider_is_over_sizes(data: ViewData) -> None:
         (0.03, 0.03, ""),
     ],
 )
-def test_how_much_faster_it_draws(before: float, after: float, words: str, data: ViewData) -> None:
+def test_headline_says_how_much_faster_a_result_draws(before: float, after: float, words: str, data: ViewData) -> None:
     timed = replace(
         data, sides=tuple(replace(side, seconds=one) for side, one in zip(data.sides, (before, after), strict=True))
     )
@@ -185,7 +185,7 @@ def test_colours_are_readable_in_both_schemes(page: str) -> None:
 
 
 def contrast(*colors: str) -> float:
-    """The ratio of two colours' luminances, as WCAG 2 has it."""
+    """Return the ratio of two colours' luminances, as WCAG 2 has it."""
 
     def luminance(color: str) -> float:
         digits = color[1:] if len(color) == 7 else "".join(2 * digit for digit in color[1:])
@@ -197,7 +197,7 @@ def contrast(*colors: str) -> float:
     return (high + 0.05) / (low + 0.05)
 
 
-def test_what_the_input_covers_stands_beside_all_pixels(data: ViewData) -> None:
+def test_scores_of_covered_pixels_stand_beside_those_of_all_pixels(data: ViewData) -> None:
     """Where the scene itself lacks pixels."""
     before, after = (replace(side, covered_share=0.79, covered=Quality(26.1)) for side in data.sides[:2])
     lacking = replace(data, sides=(before, after, *data.sides[2:]))
@@ -224,7 +224,7 @@ def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:
     assert len(page) < 200_000
 
 
-def test_without_photos(data: ViewData) -> None:
+def test_page_without_photos_offers_no_photo_to_compare(data: ViewData) -> None:
     page = page_of(replace(data, views=tuple(replace(view, photo=None) for view in data.views)))
     assert [source["name"] for source in json.loads(block(page, "data"))["sources"]] == ["input", EVIL]
     assert "overlay-share" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
@@ -257,11 +257,11 @@ def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> N
     assert page_of(alone).count('data-set="mode"') == 4
 
 
-def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
+def test_unpaired_surrogates_in_names_become_question_marks(data: ViewData) -> None:
     assert "odd?" in page_of(replace(data, title="odd\udcff"))
 
 
-def test_the_renderer_is_the_one_that_was_vendored() -> None:
+def test_page_has_the_vendored_renderer() -> None:
     """Who changes it runs tools/vendor_viewer.py, which writes down where it came from."""
     vendor = files("gsmerge.pages").joinpath("vendor")
     sources = json.loads(vendor.joinpath("SOURCES.json").read_text())

@@ -35,7 +35,7 @@ def assign(
 
 @pytest.fixture(scope="module")
 def others() -> list[np.ndarray]:
-    """Photos of another place."""
+    """Return photos of another place."""
     return list(take_photos(cut_views(VIEWS, 9)))
 
 
@@ -43,12 +43,12 @@ ORDER = [3, 5, 0, 2, 4, 1]  # place of the photo in the pool of each view
 
 
 def in_order(photos: list[np.ndarray]) -> tuple[list[np.ndarray], list[Assignment]]:
-    """A pool in which photos have these places, and what has to be found."""
+    """Return a pool in which photos have these places, and what has to be found."""
     return [photos[ORDER.index(place)] for place in range(VIEWS)], [Assignment(place, 0) for place in ORDER]
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_order_is_no_evidence(views: np.ndarray, photos: list[np.ndarray], exact: bool) -> None:
+def test_photos_find_their_views_in_any_order(views: np.ndarray, photos: list[np.ndarray], exact: bool) -> None:
     pool, expected = in_order(photos)
     assert assign(views, pool, range(VIEWS), exact=exact) == expected
 
@@ -81,13 +81,13 @@ def test_photos_of_another_place_show_nothing(named: Named, views: np.ndarray, o
     assert assign(views, others, named, exact=True) == [None] * VIEWS
 
 
-def test_one_of_noise_is_left_out(views: np.ndarray, photos: list[np.ndarray]) -> None:
+def test_photo_of_noise_is_left_out(views: np.ndarray, photos: list[np.ndarray]) -> None:
     noise = np.random.default_rng(3).random(photos[0].shape, np.float32)
     pool = [*photos[:3], noise, *photos[4:]]
     assert [view for view, each in enumerate(assign(views, pool, range(VIEWS), exact=True)) if each is None] == [3]
 
 
-def test_some_frames_of_a_film(views: np.ndarray, photos: list[np.ndarray]) -> None:
+def test_frames_of_a_film_that_show_the_views_are_found(views: np.ndarray, photos: list[np.ndarray]) -> None:
     """Of many frames a sample is compared; the film dwells on each view."""
     film = [shrunk(photos[frame * VIEWS // (2 * FIRST_PHOTOS)][None], 64)[0] for frame in range(2 * FIRST_PHOTOS)]
     chosen = assign(views[[1, 4]], film, [None, None], exact=False)
@@ -107,7 +107,7 @@ def test_parts_tell_a_neighbour_s_photo(views: np.ndarray, photos: list[np.ndarr
     assert find_offsets(show(views, 32), 2, photos[2]) is None  # too small for parts
 
 
-def test_scores_are_kept(views: np.ndarray, photos: list[np.ndarray]) -> None:
+def test_each_photo_is_read_once_for_its_scores(views: np.ndarray, photos: list[np.ndarray]) -> None:
     reads: list[int] = []
 
     def read(photo: int) -> np.ndarray:
@@ -122,7 +122,7 @@ def test_scores_are_kept(views: np.ndarray, photos: list[np.ndarray]) -> None:
 
 
 def displaced(photos: list[np.ndarray], pixels: Sequence[int]) -> Assigner:
-    """An assigner of photos whose parts lie some pixels beside what is shown."""
+    """Return an assigner of photos whose parts lie some pixels beside what is shown."""
     pool = [np.roll(photo, away, 1) for photo, away in zip(photos, pixels, strict=True)]
     views = cut_views(VIEWS)
     return Assigner(lambda side: show(views, side), Candidates(lambda photo: pool[photo], VIEWS, lambda _: 0))
@@ -137,7 +137,7 @@ def displaced(photos: list[np.ndarray], pixels: Sequence[int]) -> Assigner:
         ([9, 9, -9, 9, -9, 9], [0, 1, 2, 3, 4, 5]),  # photos that were all taken from elsewhere
     ],
 )
-def test_parts_lie_elsewhere_where_others_do_not(
+def test_photo_is_displaced_where_its_parts_lie_farther_off_than_others(
     photos: list[np.ndarray], pixels: Sequence[int], elsewhere: list[int]
 ) -> None:
     assigner, given = displaced(photos, pixels), {view: Assignment(view, 0) for view in range(VIEWS)}
@@ -159,7 +159,7 @@ def test_a_photo_on_its_side_turns(views: np.ndarray, photos: list[np.ndarray]) 
     assert assign(views, pool, range(VIEWS), exact=True)[4] == Assignment(4, 2)
 
 
-def test_one_right_photo_speaks_for_no_other(
+def test_right_photo_speaks_for_no_other_photo(
     views: np.ndarray, photos: list[np.ndarray], others: list[np.ndarray]
 ) -> None:
     """What a photo of another place reaches by chance is no name's worth, however clear a single photo is."""

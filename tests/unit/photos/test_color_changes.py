@@ -29,7 +29,7 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 
 def pair(change: Change, noise: float = 0.0) -> Pairs:
-    """Photos of four views, which ``change`` brings to what the Gaussians show, but for noise of their pixels."""
+    """Return photos of four views, which ``change`` brings to what the Gaussians show, but for noise of pixels."""
     photos = shrunk(cut_views(4), 96)
     grain = noise * np.random.default_rng(0).standard_normal(photos.shape)
     pictures = (change(photos) + grain).clip(0, 1).astype(np.float32)
@@ -81,7 +81,7 @@ def test_a_map_is_least_squares() -> None:
 
 
 @pytest.mark.parametrize("change", [gamma, mix])
-def test_a_change_explains_what_it_made(change: Change) -> None:
+def test_fitted_change_explains_the_change_that_was_made(change: Change) -> None:
     pairs = pair(change, noise=0.02)
     stored = cut_blocks(pairs)
     after = tone_blocks(pairs, GROUPS) if change is gamma else map_blocks(stored)
@@ -127,7 +127,7 @@ def half_grey(photos: np.ndarray) -> np.ndarray:
     ],
     ids=["grey", "sepia", "half grey", "mixed"],
 )
-def test_grey_photos_are_those_without_hues(change: Change, is_grey: bool) -> None:
+def test_photos_without_hues_are_told_from_others(change: Change, is_grey: bool) -> None:
     """Of the Gaussians, since grey Gaussians need no other photos."""
     pairs = pair(lambda photos: photos)
     photos = change(pairs.photos)
@@ -137,7 +137,7 @@ def test_grey_photos_are_those_without_hues(change: Change, is_grey: bool) -> No
     assert (vary_in_hue(photos[0].reshape(-1, 3), weights) < 0.01) == is_grey
 
 
-def test_hues_are_taken_and_brightness_stays() -> None:
+def test_change_that_keeps_brightness_takes_hues_alone() -> None:
     photos = shrunk(cut_views(1), 96) * np.float32(0.5) + np.float32(0.25)
     dark = grey(photos[0]) * np.float32(0.9)
     cover = np.full(dark.shape[:2], True)
@@ -148,7 +148,7 @@ def test_hues_are_taken_and_brightness_stays() -> None:
     np.testing.assert_array_equal(changed[:5], dark[:5])
 
 
-def test_red_and_blue_that_are_exchanged_are_told_from_other_maps() -> None:
+def test_exchanged_red_and_blue_are_told_from_other_maps() -> None:
     assert are_exchanged(pair(lambda photos: photos[..., ::-1], noise=0.02))
     for change in (mix, gamma, half_grey):
         assert not are_exchanged(pair(change, noise=0.02))

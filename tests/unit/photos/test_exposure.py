@@ -1,4 +1,4 @@
-"""What tells exposures that are to be compensated from those that are better left alone."""
+"""Some exposures are to be compensated, and others are better left alone."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ VIEWS = range(5)
 
 
 def grey(*gains: float) -> np.ndarray:
-    """The same logarithmic gain for red, green and blue."""
+    """Return the same logarithmic gain for red, green and blue."""
     return np.repeat(np.array(gains)[:, None], 3, 1)
 
 
 def row(count: int) -> np.ndarray:
-    """Distances of cameras side by side."""
+    """Return distances of cameras side by side."""
     return np.abs(np.subtract.outer(np.arange(count), np.arange(count))).astype(float)
 
 
@@ -45,11 +45,11 @@ def scene() -> Scene:
     return canonicalise(scenes.make_scene(scenes.room(), scenes.arc(len(VIEWS), 64, 48)))[0]
 
 
-def test_size_of_gains() -> None:
+def test_size_of_gains_is_their_root_mean_square() -> None:
     assert root_mean_square(grey(0.9, 1.1)) == pytest.approx(0.1)
 
 
-def test_few_views_are_compared_with_all_others_and_many_with_some() -> None:
+def test_each_of_few_views_is_compared_with_all_others_and_of_many_with_some() -> None:
     few, many = choose_partners(row(NEAREST_VIEWS + FARTHER_VIEWS + 1)), choose_partners(row(200))
     assert all(sorted({*others, view}) == list(range(len(few))) for view, others in enumerate(few.tolist()))
     assert many.shape == (200, NEAREST_VIEWS + FARTHER_VIEWS)
@@ -58,7 +58,7 @@ def test_few_views_are_compared_with_all_others_and_many_with_some() -> None:
     assert (np.diff(many) > 0).all()
 
 
-def test_gains_of_many_views_follow_from_some_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gains_of_many_views_are_solved_from_some_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("NEAREST_VIEWS", "FARTHER_VIEWS"):
         monkeypatch.setattr(f"gsmerge.photos.exposure.{name}", 4)
     count = 16
@@ -70,7 +70,7 @@ def test_gains_of_many_views_follow_from_some_pairs(monkeypatch: pytest.MonkeyPa
     np.testing.assert_allclose(solved - solved.mean(0), gains - gains.mean(0), atol=0.03)
 
 
-def test_metered_photos_are_equally_bright() -> None:
+def test_gains_that_follow_the_light_of_places_are_metered() -> None:
     places, gains = grey(-0.4, 0.1, 0.3, 0.0), grey(0.1, -0.2, 0.3, -0.2)
     assert is_metered(np.zeros((4, 3)), -places)
     assert is_metered(places - 0.9 * places, -0.9 * places)
@@ -78,14 +78,14 @@ def test_metered_photos_are_equally_bright() -> None:
     assert not is_metered(gains, gains)
 
 
-def test_half_of_the_light_made_up_for_is_metered() -> None:
+def test_gains_that_make_up_for_half_of_the_light_are_metered() -> None:
     places = grey(-0.4, 0.1, 0.3, 0.0)
     slopes = [(-share * (1 - share)) / share**2 for share in (0.5, 0.7)]  # photos brighter where gains are lower
     assert max(slopes) < FOLLOWS
     assert all(is_metered((1 - share) * places, -share * places) for share in (0.5, 0.7))
 
 
-def test_drift_is_expected_and_a_change_at_every_photo_is_not() -> None:
+def test_drift_of_exposure_is_expected_unlike_a_change_at_every_photo() -> None:
     for count in (4, 5, 12):
         assert share_unexpected(grey(*np.linspace(-1, 1, count)), row(count)) < UNEXPECTED
         assert share_unexpected(grey(*[0.2, -0.2] * (count // 2)), row(count // 2 * 2)) > 1
@@ -97,7 +97,7 @@ def test_two_views_say_nothing_of_drift() -> None:
     assert share_unexpected(grey(0.2, -0.2), row(2)) >= 1
 
 
-def test_cameras_are_apart_by_place_and_direction() -> None:
+def test_distance_of_cameras_counts_place_and_direction() -> None:
     poses = [scenes.look_at(np.array([x, 0.0, 0.0]), np.array([x, 0.0, z])) for x, z in ((0, 1), (2, 1), (0, -1))]
     cameras = scenes.Cameras(np.stack(poses), scenes.intrinsics(3, 8, 8), 8, 8)
     np.testing.assert_allclose(camera_distances(cameras), [[0, 2, 2], [2, 0, 4], [2, 4, 0]], atol=1e-9)

@@ -1,4 +1,4 @@
-"""Masks beside the photos and inside them, and bars around them."""
+"""Masks lie beside the photos or inside them, and bars around photos are cut off."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gsmerge.scene.read import load_scene, read_scene
 
 
 def half(tiny: Tiny) -> np.ndarray:
-    """A mask of the left half."""
+    """Return a mask of the left half."""
     mask = np.zeros((tiny.height, tiny.width), bool)
     mask[:, : tiny.width // 2] = True
     return mask
@@ -97,7 +97,7 @@ def test_opaque_photos_have_no_masks(tiny_folder: Path, tiny: Tiny) -> None:
     assert read_scene(tiny_folder).masks is None
 
 
-def test_a_mask_that_is_no_image(tmp_path: Path) -> None:
+def test_mask_that_is_no_image_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"\0no image")
     with pytest.raises(SceneError, match="decoded"):
         decode_levels(tmp_path / "a.png")
@@ -151,13 +151,13 @@ def test_bright_pixels_count_by_their_opacity(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("most", "dtype", "white"), [
     (1, np.uint8, 255), (64, np.uint8, 64), (255, np.uint8, 255), (1, np.uint16, 255), (32768, np.uint16, 128),
 ])  # fmt: skip
-def test_grey_is_a_weight(tmp_path: Path, most: int, dtype: type, white: int) -> None:
+def test_levels_of_a_mask_are_its_greys_unless_only_0_and_1(tmp_path: Path, most: int, dtype: type, white: int) -> None:
     """Only a picture of 0 and 1 alone is stretched."""
     write(tmp_path / "a.png", np.array([[0, most, 0]], dtype))
     assert decode_levels(tmp_path / "a.png").tolist() == [[0, white, 0]]
 
 
-def test_a_mask_may_take_what_its_photo_allows(tmp_path: Path) -> None:
+def test_mask_may_take_as_much_memory_as_its_photo_allows(tmp_path: Path) -> None:
     mask, photo = tmp_path / "mask.png", tmp_path / "photo.jpg"
     write(mask, np.full((6000, 6000), 255, np.uint8))
     photo.write_bytes(bytes(1_000_000))
@@ -166,7 +166,7 @@ def test_a_mask_may_take_what_its_photo_allows(tmp_path: Path) -> None:
     assert (decode_levels(mask, photo) == 255).all()
 
 
-def test_the_grey_of_a_mask_is_a_weight(tiny_folder: Path, tiny: Tiny) -> None:
+def test_grey_of_a_mask_is_the_weight_of_its_pixel(tiny_folder: Path, tiny: Tiny) -> None:
     """Where it counts at all; black and white pixels have the weights that they have without greys."""
     mask = half(tiny).astype(np.uint8) * 255
     mask[:, 0] = 204
@@ -179,7 +179,7 @@ def test_the_grey_of_a_mask_is_a_weight(tiny_folder: Path, tiny: Tiny) -> None:
     assert scene.protected is None
 
 
-def test_what_has_to_stay_sharp_counts_four_times(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+def test_protected_pixels_count_four_times(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
     levels = half(tiny).astype(np.uint8) * 255
     levels[:, 0] = 51
     write(tmp_path / "signs" / tiny.names[1], levels)
@@ -196,7 +196,7 @@ def test_what_has_to_stay_sharp_counts_four_times(tiny_folder: Path, tiny: Tiny,
     assert subset(scene, [1, 2]).importance.shape[0] == 2
 
 
-def test_pictures_to_protect_that_do_not_fit(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+def test_pictures_to_protect_that_do_not_fit_are_refused(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
     with refuses(SceneError, "missing", "no such"):
         read_scene(tiny_folder, protect=tmp_path / "missing")
     with refuses(SceneError, "scene.ply", "--protect", "file"):
@@ -234,7 +234,7 @@ PICTURES: dict[
 
 
 @pytest.mark.parametrize(("kind", "is_photo"), [("another photo", True), ("another photo in grey", False)])
-def test_one_picture_among_masks(tiny_folder: Path, tiny: Tiny, kind: str, is_photo: bool) -> None:
+def test_photo_among_masks_keeps_the_masks_from_use(tiny_folder: Path, tiny: Tiny, kind: str, is_photo: bool) -> None:
     """Colours say for certain that it is a photo; most greys have to."""
     for number, name in enumerate(tiny.names):
         mask = half(tiny).astype(np.uint8) * 255

@@ -1,4 +1,4 @@
-"""Scores of pairs, against slow and obvious twins."""
+"""Scores of pairs match slow, obvious twins."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gsmerge.raster.photos import shrink_pictures
 
 
 def correlate_slowly(shown: ViewPictures, view: int, upright: np.ndarray) -> float:
-    """Weighted correlation of local contrasts, the mean of all sizes, pixel by pixel."""
+    """Return the weighted correlation of local contrasts, the mean of all sizes, pixel by pixel."""
     out, most = [], fit_size(upright.shape[1::-1], SCORE_PIXELS[-1])
     for side in SCORE_PIXELS:
         small = shown.shrink(side)
@@ -83,7 +83,7 @@ def test_views_that_show_nothing_have_no_score() -> None:
     assert noise > 0
 
 
-def test_noise_is_that_of_most_pairs() -> None:
+def test_noise_of_scores_is_measured_on_most_pairs() -> None:
     rng = np.random.default_rng(0)
     z = rng.normal(0.3, 0.1, (8, 40, 8))
     z[range(8), range(8), 0] += 2  # the right ones
@@ -94,7 +94,7 @@ def test_noise_is_that_of_most_pairs() -> None:
 
 
 @pytest.mark.parametrize("shift", [-0.3, 0.0, 0.1, 0.5])
-def test_signed_ranks_are_wilcoxon_s(shift: float) -> None:
+def test_signed_ranks_match_scipy_s_wilcoxon(shift: float) -> None:
     from scipy.stats import wilcoxon  # which takes a second to load in each process of a run
 
     gains = np.random.default_rng(1).standard_normal(200) + shift
@@ -105,7 +105,7 @@ def test_signed_ranks_are_wilcoxon_s(shift: float) -> None:
     assert signed_ranks(np.array([np.nan, 0.0])) == 0
 
 
-def test_averages_weigh_what_is_shown() -> None:
+def test_averaged_pixels_are_weighted_by_what_is_shown() -> None:
     pictures = np.array([[[[1.0, 0, 0], [0, 1, 0]], [[0, 0, 1], [0.5, 0.5, 0.5]]]], np.float32)
     weights = np.array([[[1.0, 0], [0.5, 0.5]]], np.float32)
     small = average(pictures, weights, np.array([[[0.5]]], np.float32))

@@ -1,4 +1,4 @@
-"""Photos that show more than their views: a part is cut out, or all are left out."""
+"""Photos that show more than their views are cut to a part, or all are left out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 
 def other(photo: np.ndarray) -> np.ndarray:
-    """A picture of the same size that shows something else."""
+    """Return a picture of the same size that shows something else."""
     return np.ascontiguousarray(cv2.GaussianBlur(photo[::-1, ::-1], (0, 0), 2))
 
 
@@ -81,7 +81,7 @@ def test_photos_decide_whether_colors_are_rgb(tmp_path: Path, as_rgb: bool, leas
     assert np.abs(255 * shown - photos).max() < 2
 
 
-def test_masks_and_larger_photos_are_cut_alike(tmp_path: Path) -> None:
+def test_masks_are_cut_as_the_larger_photos_are(tmp_path: Path) -> None:
     write_photos(tmp_path, lambda i: cv2.resize(np.hstack([other(i), i]), (192, 72)))
     (tmp_path / "masks" / SMOOTH.names[0]).parent.mkdir(parents=True)
     mask = np.zeros((72, 192), np.uint8)
@@ -105,7 +105,7 @@ def test_parts_have_the_shape_of_views_or_are_stretched_to_it() -> None:
     assert fits[-1].shape == (48, 36)
 
 
-def test_a_part_is_cut_and_stretched() -> None:
+def test_part_of_a_photo_is_cut_by_shares_of_its_sides() -> None:
     photo = np.arange(4 * 8 * 3, dtype=np.uint8).reshape(4, 8, 3)
     assert np.array_equal(cut_part(photo, (0.5, 0.25, 1, 1)), photo[1:, 4:])
     assert PartFit((0, 0, 0.5, 1), (8, 4)).cut(photo).shape == (4, 8, 3)

@@ -1,4 +1,4 @@
-"""Pictures that stand in for photos: the rows' own colours, or drawings of the Gaussians where those say little."""
+"""The rows' own colours stand in for photos, or drawings of the Gaussians where those say little."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def scene() -> Scene:
 
 
 def square(scene: Scene) -> np.ndarray:
-    """Mask ``[v,h,w]`` of a square in the middle of each view."""
+    """Return a mask ``[v,h,w]`` of a square in the middle of each view."""
     mask = np.zeros_like(scene.pixels.shown)
     mask[:, (HEIGHT - SIDE) // 2 : (HEIGHT + SIDE) // 2, (WIDTH - SIDE) // 2 : (WIDTH + SIDE) // 2] = True
     return mask
@@ -44,7 +44,7 @@ def changed(scene: Scene, rows: np.ndarray, **columns: Any) -> Scene:
 
 
 def pictures_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Pictures, masks and notes."""
+    """Return pictures, masks and notes."""
     with record_run() as record:
         colored = add_row_colors(scene)
     assert colored.gaussians is scene.gaussians
@@ -53,7 +53,7 @@ def pictures_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, list[str]]:
 
 
 def two_layers(front: Scene, back: Scene) -> Scene:
-    """Two scenes of the same cameras, view by view, as models with several Gaussians per pixel write them."""
+    """Return two scenes of the same cameras, view by view, as models with several Gaussians per pixel write them."""
     gaussians = Gaussians.concat([front.gaussians, back.gaussians])
     cameras = replace(
         front.cameras, viewmats=np.concatenate([front.cameras.viewmats] * 2), Ks=np.concatenate([front.cameras.Ks] * 2)

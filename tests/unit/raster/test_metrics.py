@@ -1,3 +1,5 @@
+"""PSNR and SSIM match known values and scikit-image's."""
+
 from __future__ import annotations
 
 import math
@@ -32,14 +34,14 @@ def test_psnr_counts_only_the_mask() -> None:
     assert psnr(image, np.zeros((2, 2, 3)), mask[..., None]) == pytest.approx(20)
 
 
-def test_tensors_and_arrays_give_the_same(torch: Any) -> None:
+def test_metrics_of_tensors_are_those_of_arrays(torch: Any) -> None:
     tensors = torch.from_numpy(PHOTO), torch.from_numpy(NOISY)
     assert psnr(*tensors) == psnr(PHOTO, NOISY)
     assert ssim(*tensors) == ssim(PHOTO, NOISY)
 
 
 def reference_ssim(image: np.ndarray, photo: np.ndarray) -> float:
-    """scikit-image's, with the windows of the literature; it crops the border itself."""
+    """Return scikit-image's SSIM, with the windows of the literature; it crops the border itself."""
     settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     return structural_similarity(
         image.astype(np.float64), photo.astype(np.float64), channel_axis=-1, data_range=1, **settings
@@ -47,13 +49,13 @@ def reference_ssim(image: np.ndarray, photo: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_ssim_is_scikit_images(channels: int) -> None:
+def test_ssim_matches_scikit_image_s(channels: int) -> None:
     first, second = np.concatenate([PHOTO, PHOTO], 2)[..., :channels], np.concatenate([NOISY, PHOTO], 2)[..., :channels]
     assert ssim(first, second) == pytest.approx(reference_ssim(first, second), abs=1e-5)
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.01, 0.1])
-def test_ssim_is_scikit_images_where_images_are_smooth(noise: float) -> None:
+def test_ssim_matches_scikit_image_s_where_images_are_smooth(noise: float) -> None:
     """Small variances, which float32 loses first."""
     y, x = np.mgrid[:60, :70] / 60
     smooth = np.stack([0.9 + 0.05 * x, 0.5 + 0.4 * elementary.sin(2 * x + y), x * 0 + 0.02], -1).astype(np.float32)
@@ -75,7 +77,7 @@ def test_ssim_of_a_mask_is_the_mean_of_its_windows() -> None:
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
-def test_messages(metric: object) -> None:
+def test_metrics_refuse_images_and_masks_that_do_not_fit(metric: object) -> None:
     assert callable(metric)
     refuse_all(ValueError, [
         (lambda: metric(PHOTO, PHOTO[:-1]), "", [40, 50, 3], [39, 50, 3]),

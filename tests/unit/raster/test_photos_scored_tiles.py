@@ -1,4 +1,4 @@
-"""The sample of the input views that scenes are judged by."""
+"""Scenes are judged by a sample of the input views."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(4, 160, 128), noise=0.05)
 
 
-def test_wanted_tiles_are_drawn_as_in_the_whole(scene: Scene) -> None:
+def test_wanted_tiles_have_the_same_bits_as_in_the_whole_picture(scene: Scene) -> None:
     """Bit for bit, with Gaussians of all sizes, from fewer of them."""
     rng, splats = np.random.default_rng(0), make_splats(scene.gaussians)
     scales = splats.scales * rng.choice([0.2, 1, 30], (len(splats), 1)).astype(np.float32)
@@ -38,7 +38,7 @@ def test_wanted_tiles_are_drawn_as_in_the_whole(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("every", [2, 3, 4, 6, 7, 9, 10])
-def test_so_many_views_score_every_place_once(every: int) -> None:
+def test_as_many_views_as_the_sampling_rate_score_every_tile_once(every: int) -> None:
     """And no two neighbouring tiles of a view."""
     tiles = np.stack([scored_tiles(view, 16 * 3 * 4 * 7, 16 * 5 * 9 * 2, every) for view in range(every)])
     assert (tiles.sum(0) == 1).all()
@@ -67,7 +67,7 @@ def test_odd_sizes_have_about_their_share(width: int, height: int) -> None:
         assert tiles.mean() == pytest.approx(0.25, abs=0.1)
 
 
-def test_a_sample_is_near_the_whole() -> None:
+def test_score_of_a_sample_is_near_that_of_the_whole() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(2, 320, 320), noise=0.05)
     photos, views = scene_photos(scene), range(len(scene))
     whole, sample = (

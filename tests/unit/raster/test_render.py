@@ -1,3 +1,5 @@
+"""The renderer draws what follows by hand, and refuses what does not fit."""
+
 from __future__ import annotations
 
 import math
@@ -15,13 +17,13 @@ FOCAL = 100.0
 
 
 def camera(width: int = 21, height: int = 11, count: int = 1) -> Cameras:
-    """At the origin, looking along z; the principal point is the centre of the middle pixel."""
+    """Return cameras at the origin that look along z; the principal point is the centre of the middle pixel."""
     K = np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1]])
     return Cameras(np.stack([np.eye(4)] * count), np.stack([K] * count), width, height)
 
 
 def balls(*rows: tuple[float, float, float, float, float, float]) -> Gaussians:
-    """Round grey Gaussians: x, y, z, standard deviation, opacity, grey."""
+    """Return round grey Gaussians: x, y, z, standard deviation, opacity, grey."""
     means, sizes, opacities, greys = np.split(np.array(rows, np.float32).reshape(-1, 6), [3, 4, 5], axis=1)
     n = len(means)
     quats, scales = np.eye(1, 4, dtype=np.float32).repeat(n, 0), sizes.repeat(3, 1)
@@ -33,7 +35,7 @@ def value(image: np.ndarray, x: int, y: int) -> float:
     return float(image[0, y, x, 0])
 
 
-def test_one_gaussian_by_hand() -> None:
+def test_one_gaussian_has_the_values_computed_by_hand() -> None:
     # 0.02 wide, 1 away: 2 px; its centre is that of pixel (10, 5); dilation adds 0.3 px^2
     images = render(balls((0, 0, 1, 0.02, 0.8, 1.0)), camera()).images
     assert value(images, 10, 5) == pytest.approx(0.8, abs=1e-6)
@@ -41,7 +43,7 @@ def test_one_gaussian_by_hand() -> None:
     assert value(images, 10, 3) == pytest.approx(0.8 * math.exp(-0.5 * 4 / 4.3), abs=1e-6)
 
 
-def test_there_is_no_farthest_depth() -> None:
+def test_gaussians_at_any_depth_are_drawn() -> None:
     near, huge = (render(balls((0, 0, s, 0.02 * s, 0.8, 1.0)), camera(), near=0.01 * s) for s in (1, 4e13))
     np.testing.assert_allclose(huge.images, near.images, atol=1e-6)
     assert value(huge.images, 10, 5) > 0.7
@@ -55,7 +57,7 @@ def test_no_gaussians_leave_the_background() -> None:
     assert (rendering.depths == 0).all()
 
 
-def test_what_is_behind_or_too_faint_is_not_seen() -> None:
+def test_gaussians_behind_the_camera_or_too_faint_are_not_drawn() -> None:
     gaussians = balls((0, 0, -1, 0.1, 1, 1), (0, 0, 0.01, 0.1, 1, 1), (0, 0, 1, 0.1, 1 / 256, 1), (9, 0, 1, 0.1, 1, 1))
     tiled = tile_view(make_splats(gaussians), np.eye(4), camera().Ks[0], 21, 11)
     assert len(tiled.ids) == 0
@@ -70,7 +72,7 @@ def test_negative_colours_are_clamped_but_given_ones_are_not() -> None:
     assert transmittance[5, 10] == pytest.approx(0.2, abs=1e-6)
 
 
-def test_left_out_ones_and_other_opacities() -> None:
+def test_tiled_views_leave_out_gaussians_and_take_other_opacities() -> None:
     splats = make_splats(balls((0, 0, 1, 0.5, 0.5, 1), (0, 0, 2, 1.0, 0.5, 1)))
     alone = tile_view(splats, np.eye(4), camera().Ks[0], 21, 11, keep=np.array([False, True]))
     assert alone.ids.tolist() == [1]
@@ -79,7 +81,7 @@ def test_left_out_ones_and_other_opacities() -> None:
     assert contributions(fainter)[1].tolist() == pytest.approx([0.25, 0.375], abs=1e-5)
 
 
-def test_nothing_is_copied_that_need_not_be(torch: Any) -> None:
+def test_arrays_are_not_copied_before_drawing(torch: Any) -> None:
     gaussians = balls((0, 0, 1, 0.02, 0.8, 1.0), (1, 1, 0, 0.02, 0.8, 1.0))
     for given in (gaussians, gaussians.to("cpu")):
         splats = make_splats(given)
@@ -89,7 +91,7 @@ def test_nothing_is_copied_that_need_not_be(torch: Any) -> None:
 
 @pytest.mark.parametrize("with_depths", [False, True])
 @pytest.mark.parametrize("count", [0, 2])
-def test_arrays_give_arrays_and_tensors_tensors(with_depths: bool, count: int, torch: Any) -> None:
+def test_render_gives_tensors_where_an_input_is_one(with_depths: bool, count: int, torch: Any) -> None:
     """Of equal values, also where only the Gaussians or only the cameras are tensors."""
     gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0), (0.01, 0, 1.2, 0.03, 0.5, 0.2)), camera(count=2)[:count]
     options = {"antialiased": True, "near": 0.1, "far": 5.0, "with_depths": with_depths}
@@ -137,7 +139,7 @@ def test_every_view_has_its_own_image() -> None:
     assert np.abs(images[1] - images[0]).max() > 0.5
 
 
-def test_messages() -> None:
+def test_render_refuses_arguments_that_do_not_fit() -> None:
     gaussians, splats, K = (
         balls((0, 0, 1, 0.02, 0.8, 1.0)),
         make_splats(balls((0, 0, 1, 0.02, 0.8, 1.0))),
@@ -192,7 +194,7 @@ def test_bands_of_a_large_picture_are_those_of_the_whole(band: int, monkeypatch:
     assert shapes == [*[tall] * (61 // tall), 61 % tall] * 2
 
 
-def test_lists_end_behind_what_hides_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tile_lists_end_behind_gaussians_that_hide_the_tile(monkeypatch: pytest.MonkeyPatch) -> None:
     """So Gaussians that cover every pixel, and cannot be seen, take no memory; what is drawn stays."""
     huge = balls(*((0.01 * i, 0, 4 + 0.01 * i, 30 + i, 0.02 + 0.004 * i, 0.5) for i in range(200)))
     gaussians, cameras = Gaussians.concat([many_balls()[:40], huge]), camera(41, 61)

@@ -1,4 +1,4 @@
-"""Samples of a photo's pixels: a camera draws them as they are among the others."""
+"""A camera draws samples of a photo's pixels as they are among the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stress cases: changes do what they say, and a property that does not hold is noticed."""
+"""Stress cases change what they say, and find a property that does not hold."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def noisy() -> Scene:
-    """With the errors of an export, which runs of every case begin with."""
+    """Return a scene with the errors of an export, which runs of every case begin with."""
     return load_scene(make_once("small", write_small)).scene
 
 
 def offsets(scene: Scene) -> float:
-    """Largest distance (pixels) of a Gaussian from its pixel."""
+    """Return the largest distance (pixels) of a Gaussian from its pixel."""
     pixels, _ = project(scene.gaussians.means, scene.cameras)
     v, h, w = scene.pixels.shown.shape
     own = pixels.reshape(v, v, h * w, 2)[np.arange(v), np.arange(v)].reshape(v, h, w, 2)
@@ -74,7 +74,7 @@ def test_exposure_changes_photos_and_colours_alike(scene: Scene) -> None:
     np.testing.assert_allclose(colors[1].clip(0, 1), changed.images[1], rtol=1e-5, atol=1e-5)
 
 
-def test_rows_that_are_spoilt(scene: Scene) -> None:
+def test_break_rows_spoils_one_row_in_a_hundred(scene: Scene) -> None:
     scene_in, n = StressScene(scene, None), len(scene.gaussians)
     broken = pixel_scene(module.break_rows(scene_in))
     assert int((~broken.pixels.shown).sum()) == round(0.01 * n)
@@ -83,7 +83,7 @@ def test_rows_that_are_spoilt(scene: Scene) -> None:
     assert len(module.break_rows(StressScene(unaligned, None)).scene.gaussians) == n - round(0.01 * n)
 
 
-def test_views_are_taken_away_shuffled_and_repeated(scene: Scene) -> None:
+def test_cases_of_views_take_away_shuffle_or_repeat_them(scene: Scene) -> None:
     scene_in = StressScene(scene, None)
     names = {}
     for case in ("views-half", "views-3", "views-1", "order", "twice"):
@@ -113,14 +113,14 @@ def test_every_case_on_a_scene_with_held_out_views(made_scene: Path) -> None:
     assert steps[-1] == ("done", len(CASES), len(CASES))
 
 
-def test_a_scene_in_no_order_skips_what_needs_pixels(noisy: Scene) -> None:
+def test_cases_that_need_pixels_are_skipped_for_scenes_in_no_order(noisy: Scene) -> None:
     unaligned = Scene(noisy.gaussians, noisy.cameras, noisy.images, None, noisy.names)
     actual = stress(unaligned, FAST, cases=["order", "views-3", "large"])
     assert [outcome.held for outcome in actual] == [None, None, True]
 
 
 @pytest.mark.slow
-def test_without_photos(noisy: Scene) -> None:
+def test_scenes_without_photos_are_judged_by_colours_of_pixels(noisy: Scene) -> None:
     bare = replace(noisy, images=None)
     actual = stress(bare, FAST, cases=["unchanged", "exposure", "utm"])
     assert [outcome.held for outcome in actual] == [True, None, True]
@@ -128,7 +128,7 @@ def test_without_photos(noisy: Scene) -> None:
 
 
 def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
-    """Every run after the first one goes wrong in some way."""
+    """Let every run after the first one go wrong in some way."""
     genuine, runs = module.compact, []
 
     def compact(scene: Any, options: CompactOptions) -> Any:
@@ -148,14 +148,16 @@ def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
         (lambda g: replace(g, means=g.means * np.nan), "not finite"),
     ],
 )
-def test_what_does_not_hold_is_noticed(change: Any, words: str, noisy: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_property_that_does_not_hold_is_found(
+    change: Any, words: str, noisy: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spoilt(monkeypatch, change)
     outcome = stress(noisy, FAST, cases=["large"])[0]
     assert outcome.held is False
     assert words in outcome.found
 
 
-def test_an_error_is_an_outcome(noisy: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_a_run_is_an_outcome_of_the_case(noisy: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: Any) -> None:
         raise SceneError("scene.ply", "expected mercy")
 
@@ -164,7 +166,7 @@ def test_an_error_is_an_outcome(noisy: Scene, monkeypatch: pytest.MonkeyPatch) -
     assert (outcome.held, outcome.found) == (False, "ended with: scene.ply: expected mercy")
 
 
-def test_bad_arguments(noisy: Scene) -> None:
+def test_unknown_case_or_scene_without_views_is_refused(noisy: Scene) -> None:
     with refuses(ValueError, "cases", "unchanged"):
         stress(noisy, FAST, cases=["nonsense"])
     bare = Scene(noisy.gaussians, noisy.cameras[[]], None, None, ())

@@ -1,4 +1,4 @@
-"""Arrays in files, whose pages leave memory and whose values stay; and what a run needs, and a machine has."""
+"""Arrays in files keep their values when pages leave memory, and a run knows what it needs and has."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from gsmerge.runtime import memory
 
 
-def test_values_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_stay_when_pages_are_freed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "MAPPED_BYTES", 1)
     array = memory.make_array((300, 5), np.float32)
     array[:] = np.arange(1500).reshape(300, 5)
@@ -18,7 +18,7 @@ def test_values_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(array, np.arange(1500).reshape(300, 5))
 
 
-def test_private_pages_of_others_stay(tmp_path: Path) -> None:
+def test_freed_pages_of_private_copies_keep_their_values(tmp_path: Path) -> None:
     np.zeros(4096, np.float32).tofile(tmp_path / "rows")
     array = np.memmap(tmp_path / "rows", np.float32, mode="c")
     array[:] = 1
@@ -26,7 +26,7 @@ def test_private_pages_of_others_stay(tmp_path: Path) -> None:
     assert (array == 1).all()
 
 
-def test_rows_are_gathered_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_gathered_in_parts_are_those_of_indexing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "MAPPED_BYTES", 64)
     array = memory.make_array((5, 4, 3), np.float32)
     array[:] = np.arange(60).reshape(5, 4, 3)
@@ -37,13 +37,16 @@ def test_rows_are_gathered_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     assert memory.gather(array, rows[:0]).shape == (0, 4, 3)
 
 
-def test_a_block_takes_less_memory_than_the_whole_and_harmonics_count_once() -> None:
+def test_block_takes_less_memory_than_the_whole() -> None:
     assert memory.memory_bytes(10**6) < memory.memory_bytes(10**6, num_elsewhere=10**7) < memory.memory_bytes(10**7)
+
+
+def test_harmonics_count_once_in_the_memory_that_is_needed() -> None:
     plain, degree4 = (memory.memory_bytes(10**7, num_rest=num) for num in (0, 72))
     assert 4 * 72 * 10**7 <= degree4 - plain <= 5 * 72 * 10**7
 
 
-def test_what_does_not_fit_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_is_named_with_what_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     for available, fits in ((None, True), (30 * 10**9, True), (24 * 10**9, False)):
         monkeypatch.setattr(memory, "machine_memory", lambda available=available: available)
         assert (memory.memory_problem(30 * 10**9) is None) == fits

@@ -1,4 +1,4 @@
-"""Work in parts: calls in order, their records, and engines that cannot be had."""
+"""Work in parts has calls in order and records, and engines that cannot be had are refused."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_calls_have_records_of_their_own() -> None:
     assert heard[:2] == ["block 1 of 2: halve: join", "block 2 of 2: halve: join"]
 
 
-def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_engine_ray_without_the_package_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with refuses(UsageError, "engine ray", "ray>=2.9,<3"), start_work("ray", threads=1, memory=0):
         pass
@@ -117,7 +117,7 @@ def test_a_cluster_has_as_many_calls_at_once_as_processors() -> None:
     assert ray.options[0]["num_cpus"] == 1
 
 
-def test_what_a_call_raises_comes_at_once() -> None:
+def test_error_of_a_call_ends_the_work_at_once() -> None:
     taken = []
 
     def calls() -> Iterator[tuple[int]]:

@@ -1,4 +1,4 @@
-"""The ambient record: what is written where, and that nothing is lost or counted twice."""
+"""The ambient record has what each run wrote, with nothing lost or counted twice."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_new_stage_needs_no_list() -> None:
     assert events[1] == ("a new one", 1, len(STAGES))
 
 
-def test_a_stage_that_fails_ends() -> None:
+def test_failed_stage_ends_before_the_next_begins() -> None:
     with record_run() as record:
         with pytest.raises(KeyError), stage("prepare"):
             raise KeyError
@@ -107,7 +107,7 @@ def test_threads_of_the_caller_have_runs_of_their_own() -> None:
     assert notes == [["other"]]
 
 
-def test_parts_and_steps_of_their_fits_say_what_share_is_done() -> None:
+def test_forecast_tells_the_share_done_from_parts_and_steps_of_fits() -> None:
     """Also with two fits in a part, and after fewer or more parts than were expected."""
     forecast, shares = Forecast(), []
     assert forecast.share is None

@@ -1,3 +1,5 @@
+"""Work on several threads keeps its order, its errors and the number of threads."""
+
 from __future__ import annotations
 
 import sys
@@ -23,7 +25,7 @@ def library_threads() -> Iterator[None]:
 
 
 def library_thread_counts() -> list[int]:
-    """Of OpenCV, and of torch where it is installed."""
+    """Return the threads of OpenCV, and of torch where it is installed."""
     torch = sys.modules.get("torch")
     return [cv2.getNumThreads(), *([torch.get_num_threads()] if torch else [])]
 
@@ -35,7 +37,7 @@ def test_results_keep_the_order_of_the_items(count: int) -> None:
         assert parallel_map(str, iter([])) == []
 
 
-def test_one_pool_works_at_once() -> None:
+def test_pool_works_on_as_many_items_at_once_as_threads() -> None:
     barrier = threading.Barrier(3, timeout=30)  # breaks unless three threads wait together
     with use_threads(3) as count:
         assert count == 3
@@ -59,7 +61,7 @@ def test_torch_that_is_imported_later_is_held_too(monkeypatch: pytest.MonkeyPatc
     assert counts == [2, 1, 2]
 
 
-def test_outer_block_wins() -> None:
+def test_outer_block_decides_the_number_of_threads() -> None:
     with use_threads(3):
         with use_threads(7) as count:
             assert count == 3
@@ -89,7 +91,7 @@ def test_a_thread_that_works_alone_has_no_helpers() -> None:
     assert seen == [{reader.ident}]
 
 
-def test_errors_come_through_and_leave_the_pool_usable() -> None:
+def test_error_of_an_item_leaves_the_pool_usable() -> None:
     def fail(i: int) -> int:
         if i == 1:
             raise KeyError("one")
@@ -127,7 +129,7 @@ def test_overlapping_blocks_give_the_libraries_their_threads_back() -> None:
 
 
 @pytest.mark.parametrize("at_once", [1, 4, 100])
-def test_in_turn_gives_all_results_in_order_and_holds_few(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
+def test_in_turn_gives_results_in_order_and_begins_few_ahead(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
     begun: list[int] = []
 
     def work(i: int) -> int:
@@ -142,7 +144,7 @@ def test_in_turn_gives_all_results_in_order_and_holds_few(monkeypatch: pytest.Mo
     assert sorted(begun) == list(range(10))
 
 
-def test_nothing_is_kept_once_it_is_done() -> None:
+def test_pool_keeps_no_item_once_it_is_done() -> None:
     class Item:
         pass
 

@@ -1,4 +1,4 @@
-"""A ``.ply`` with nothing beside it whose rows are a grid: its cameras follow from its rows."""
+"""Cameras of a ``.ply`` with nothing beside it follow from its rows if they are a grid."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ORDERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @sweep("order", ORDERS, often=2)
 @sweep("size", [(96, 64), (64, 64), (64, 96)])
-def test_the_views_of_a_grid(tmp_path: Path, order: str, size: tuple[int, int]) -> None:
+def test_rows_of_a_grid_give_its_views_and_focal_length(tmp_path: Path, order: str, size: tuple[int, int]) -> None:
     width, height = size
     tiny = made(np.array([[110.0, 0, width / 2], [0, 110, height / 2], [0, 0, 1]]), *size)
     ids = np.arange(3 * width * height).reshape(3, height, width)
@@ -81,7 +81,7 @@ def test_focal_lengths_of_the_views_differ(tmp_path: Path) -> None:
     assert noted(loaded.notes, "focal", "differ")
 
 
-def test_rows_that_are_no_numbers(tmp_path: Path) -> None:
+def test_focal_length_is_found_beside_rows_of_nan(tmp_path: Path) -> None:
     tiny = made()
     means = tiny.gaussians.means.copy()
     means[np.random.default_rng(0).random(len(means)) < 0.1] = np.nan
@@ -89,7 +89,7 @@ def test_rows_that_are_no_numbers(tmp_path: Path) -> None:
     assert np.allclose(loaded.scene.cameras.Ks[:, 0, 0], 110, rtol=0.01)
 
 
-def test_rows_that_are_no_grid(tmp_path: Path) -> None:
+def test_rows_in_no_grid_have_no_views(tmp_path: Path) -> None:
     tiny, rng = made(), np.random.default_rng(0)
     count = len(tiny.gaussians)
     others = {"shuffled": rng.permutation(count), "sorted": np.lexsort(tiny.gaussians.means.T)}
@@ -118,7 +118,7 @@ def write_photos(folder: Path, tiny: Smooth, larger: int, margin: int, names: st
 
 
 @sweep(("larger", "margin", "trim"), [(3, 0, 0), (1, 0, 0), (3, 10, 0), (3, 0, 8), (3, 10, 8)], often=2)
-def test_photos_of_any_size(tmp_path: Path, larger: int, margin: int, trim: int) -> None:
+def test_photos_of_any_size_are_those_of_the_grid(tmp_path: Path, larger: int, margin: int, trim: int) -> None:
     tiny = made()
     ids = np.arange(3 * WIDTH * HEIGHT).reshape(3, HEIGHT, WIDTH)[:, trim : HEIGHT - trim, trim : WIDTH - trim]
     write_photos(tmp_path / "images", tiny, larger, margin)

@@ -1,4 +1,4 @@
-"""Files as exporters write them: each is read without a word, and every row comes to its own pixel."""
+"""Files are read as exporters write them, without a word, and every row comes to its own pixel."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from gsmerge.scene.read import load_scene, read_scene
 
 @pytest.fixture(scope="module")
 def smooth() -> Tiny:
-    """Three views of 48 x 36 of a smooth surface."""
+    """Return three views of 48 x 36 of a smooth surface."""
     return smooth_scene(48, 36)
 
 
 @pytest.mark.parametrize(("order", "axes"), [("view-fastest", (1, 2, 0)), ("view-major", (0, 1, 2))])
-def test_orders(tmp_path: Path, smooth: Tiny, order: str, axes: tuple[int, int, int]) -> None:
+def test_order_of_rows_is_recognised(tmp_path: Path, smooth: Tiny, order: str, axes: tuple[int, int, int]) -> None:
     index = np.arange(3 * smooth.height * smooth.width).reshape(3, smooth.height, smooth.width)
     index = index[:, 1:-1, 1:-1]
     path = save_export(tmp_path, smooth, export_rows(smooth, index.transpose(axes).reshape(-1)))
@@ -35,7 +35,7 @@ def test_orders(tmp_path: Path, smooth: Tiny, order: str, axes: tuple[int, int, 
     assert home(load_scene(path, order=order).scene, smooth) == 1
 
 
-def test_columns_before_lines_have_cameras_alone(tmp_path: Path, smooth: Tiny) -> None:
+def test_rows_column_by_column_have_cameras_and_no_pixels(tmp_path: Path, smooth: Tiny) -> None:
     index = np.arange(3 * smooth.height * smooth.width).reshape(3, smooth.height, smooth.width)
     scene = load_scene(save_export(tmp_path, smooth, export_rows(smooth, index.transpose(0, 2, 1).reshape(-1)))).scene
     assert not scene.has_own_pixels
@@ -44,7 +44,7 @@ def test_columns_before_lines_have_cameras_alone(tmp_path: Path, smooth: Tiny) -
 
 
 @sweep("views", [(0, 2), (0, 1), (1, 2), (2,)])
-def test_some_of_the_views(tmp_path: Path, smooth: Tiny, views: tuple[int, ...]) -> None:
+def test_rows_of_some_views_keep_the_photos_of_all(tmp_path: Path, smooth: Tiny, views: tuple[int, ...]) -> None:
     """Cameras and photos of the others stay."""
     size = smooth.height * smooth.width
     index = np.concatenate([np.arange(size) + view * size for view in views])
@@ -54,7 +54,7 @@ def test_some_of_the_views(tmp_path: Path, smooth: Tiny, views: tuple[int, ...])
 
 
 @pytest.mark.parametrize("layers", [1, 3])
-def test_a_world_moved_by_any_similarity(tmp_path: Path, smooth: Tiny, layers: int) -> None:
+def test_world_moved_by_any_similarity_is_followed(tmp_path: Path, smooth: Tiny, layers: int) -> None:
     """As the family of pixelSplat moves it; with raw opacities, and one or several Gaussians of a pixel."""
     turn = rotation(1.0, -1.2, 0.6)
     index = np.arange(len(smooth.gaussians)).repeat(layers)
@@ -89,7 +89,7 @@ def test_rotations_with_w_last(tmp_path: Path, smooth: Tiny) -> None:
     assert np.abs((quats * true.gaussians.quats).sum(1)).min() > 0.9999
 
 
-def test_logits_under_the_name_of_an_exporter_of_raw_opacities(tmp_path: Path, smooth: Tiny) -> None:
+def test_logits_are_read_under_the_name_of_an_exporter_of_raw_opacities(tmp_path: Path, smooth: Tiny) -> None:
     """Versions differ: a later AnySplat writes logits."""
     path = save_export(tmp_path, smooth, export_rows(smooth))
     read = read_scene(path, exporter="noposplat").gaussians.opacities
@@ -102,7 +102,7 @@ def test_a_scene_can_be_given_as_unaligned(tmp_path: Path, smooth: Tiny) -> None
     assert not read_scene(path, exporter="volsplat").has_own_pixels
 
 
-def test_a_given_scale(tmp_path: Path, smooth: Tiny) -> None:
+def test_given_scene_scale_is_applied_to_the_cameras(tmp_path: Path, smooth: Tiny) -> None:
     c2w = smooth.c2w.copy()
     c2w[:, :3, 3] *= 2
     path = save_export(tmp_path, replace(smooth, c2w=c2w), export_rows(smooth))
@@ -114,21 +114,21 @@ def test_a_given_scale(tmp_path: Path, smooth: Tiny) -> None:
 @pytest.mark.parametrize(
     ("name", "value"), [("order", "spiral"), ("quats", "zyxw"), ("scene_scale", 0.0), ("exporter", "x"), ("magic", 1)]
 )
-def test_wrong_arguments(tmp_path: Path, smooth: Tiny, name: str, value: object) -> None:
+def test_unknown_or_impossible_arguments_are_refused(tmp_path: Path, smooth: Tiny, name: str, value: object) -> None:
     path = save_export(tmp_path, smooth, export_rows(smooth))
     with pytest.raises(ValueError, match="expected"):
         read_scene(path, **{name: value})
 
 
 def dump_of(tiny: Tiny, folder: Path, root: Path, **changes: Any) -> Path:
-    """``views.npz`` beside the Gaussians, written by the lines of the example."""
+    """Write ``views.npz`` beside the Gaussians by the lines of the example."""
     save_export(folder, tiny, export_rows(tiny), cameras=False)
     values = {"c2w": tiny.c2w, "K": np.tile(tiny.K, (3, 1, 1)), "images": tiny.images} | changes
     load_script(root / "examples" / "04_dump_views.py").dump_views(str(folder / "views.npz"), **values)
     return folder
 
 
-def test_views_dumped_from_a_model(tmp_path: Path, smooth: Tiny, root: Path) -> None:
+def test_views_dumped_from_a_model_are_read_in_every_form(tmp_path: Path, smooth: Tiny, root: Path) -> None:
     normalised = np.tile(smooth.K / np.array([[smooth.width], [smooth.height], [1.0]]), (3, 1, 1))
     forms: dict[str, dict[str, Any]] = {
         "plain": {},

@@ -1,4 +1,4 @@
-"""Facts about exporters that break a naive reader, each in a small file of its own."""
+"""Some facts about exporters would break a naive reader; each is in a small file of its own."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
 
 
 @pytest.mark.parametrize("aligned", [True, False])
-def test_poses_of_the_user(tmp_path: Path, aligned: bool) -> None:
+def test_gaussians_in_a_predicted_world_follow_the_user_s_cameras(tmp_path: Path, aligned: bool) -> None:
     """Cameras and depths in the user's world, Gaussians in the predicted one: any similarity, and a mask."""
     tiny = smooth_scene(96, 72)
     turn, shift, scale = rotation(0.5, -0.8, 0.3), np.array([2.0, -1, 4]), 1.9
@@ -47,7 +47,7 @@ def test_poses_of_the_user(tmp_path: Path, aligned: bool) -> None:
     assert loaded.alignment.worst_px < 0.5
 
 
-def test_arrays_as_the_demo_names_them(tmp_path: Path) -> None:
+def test_arrays_as_the_demo_names_them_are_cameras_and_photos(tmp_path: Path) -> None:
     K = np.array([[52.8, 0, 24], [0, 54, 18], [0, 0, 1]])
     tiny = with_intrinsics(SMOOTH, K)
     tiny.save(tmp_path, cameras=False, images=False)
@@ -64,7 +64,7 @@ def test_arrays_as_the_demo_names_them(tmp_path: Path) -> None:
 # Columns
 
 
-def test_harmonics_in_any_order_of_columns(tmp_path: Path) -> None:
+def test_harmonics_are_read_in_any_order_of_columns(tmp_path: Path) -> None:
     """``f_rest_10`` comes before ``f_rest_2`` where names were sorted as text; all columns may be anywhere."""
     rng = np.random.default_rng(0)
     rows = export_rows(SMOOTH, rest=45)
@@ -81,7 +81,7 @@ def test_harmonics_in_any_order_of_columns(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_harmonics_of_long_lrm(tmp_path: Path, degree: int) -> None:
+def test_harmonics_of_long_lrm_are_read_from_the_first_columns(tmp_path: Path, degree: int) -> None:
     """45 columns whatever the degree: those of a lower one stand side by side in the first columns."""
     rng, higher = np.random.default_rng(0), (degree + 1) ** 2 - 1
     shN = rng.normal(size=(ROWS.size, higher, 3)).astype(np.float32)
@@ -97,7 +97,7 @@ def test_harmonics_of_long_lrm(tmp_path: Path, degree: int) -> None:
 
 
 def sharp_rows(square: Smooth) -> np.ndarray:
-    """Two layers seen by a camera at the origin."""
+    """Return two layers seen by a camera at the origin."""
     one = np.arange(36 * 36)
     rows = turned(export_rows(square, np.concatenate([one, one]), normals=""), square.w2c[0, :3, :3],
                   shift=square.w2c[0, :3, 3])  # fmt: skip
@@ -106,7 +106,7 @@ def sharp_rows(square: Smooth) -> np.ndarray:
 
 
 @pytest.mark.parametrize("legacy", [False, True])
-def test_all_elements_of_sharp(tmp_path: Path, legacy: bool) -> None:
+def test_elements_of_sharp_give_its_camera_and_photo(tmp_path: Path, legacy: bool) -> None:
     size = (48, 36)
     (tmp_path / "images").mkdir()
     square = with_intrinsics(smooth_scene(36, 36), np.array([[39.6, 0, 18], [0, 54, 18], [0, 0, 1]]))
@@ -160,7 +160,7 @@ def test_sharp_turns_photos_upright(tmp_path: Path, tag: int) -> None:
 # Cameras
 
 
-def test_image_ids_in_another_order_than_names(tmp_path: Path) -> None:
+def test_rows_follow_names_of_images_and_not_their_ids(tmp_path: Path) -> None:
     """COLMAP numbers images as it pleases, and writes them in any order; the rows follow the names."""
     SMOOTH.save(tmp_path, cameras=False)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
@@ -177,7 +177,7 @@ def test_image_ids_in_another_order_than_names(tmp_path: Path) -> None:
     assert np.allclose(opacities, SMOOTH.gaussians.opacities.reshape(3, -1)[order], atol=1e-5)
 
 
-def test_views_in_the_order_of_names_sorted_as_text(tmp_path: Path) -> None:
+def test_rows_in_the_order_of_names_sorted_as_text_are_recognised(tmp_path: Path) -> None:
     """Exporters sort names as text: 10, 11, 2."""
     rows = export_rows(SMOOTH, ROWS[[1, 2, 0]].reshape(-1))
     scene = load_scene(save_export(tmp_path, SMOOTH, rows)).scene
@@ -202,7 +202,7 @@ def test_inria_s_test_cameras_come_first(tmp_path: Path) -> None:
 
 
 def save_world_mirror(folder: Path, scene: Smooth, photos: np.ndarray, ids: Sequence[object] = range(3)) -> None:
-    """Rows of no pixels, photos under names of their own, and ``camera_params.json`` with the cameras in reverse."""
+    """Save rows of no pixels, photos under their own names, and ``camera_params.json`` with cameras in reverse."""
     scene = replace(scene, names=tuple(f"image_{i:04d}.png" for i in range(3)))
     some = np.random.default_rng(0).permutation(len(scene.gaussians))[len(scene.gaussians) // 9 + 1 :]
     save_export(folder, scene, export_rows(scene, some), cameras=False)
@@ -216,7 +216,7 @@ def save_world_mirror(folder: Path, scene: Smooth, photos: np.ndarray, ids: Sequ
 
 
 @sweep("ids", [(0, 1, 2), ("image_0000", "image_0001", "image_0002"), ("0", "1", "2")])
-def test_cameras_of_world_mirror_by_number_or_stem(tmp_path: Path, ids: tuple) -> None:
+def test_cameras_of_world_mirror_name_photos_by_number_or_stem(tmp_path: Path, ids: tuple) -> None:
     save_world_mirror(tmp_path, SMOOTH, SMOOTH.images, ids)
     scene = load_scene(tmp_path).scene
     order = [0, 1, 2] if str(ids[0]).isdecimal() else [2, 1, 0]
@@ -227,7 +227,7 @@ def test_cameras_of_world_mirror_by_number_or_stem(tmp_path: Path, ids: tuple) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shown", [True, False])
-def test_photos_that_a_model_cropped_for_rows_without_pixels(tmp_path: Path, shown: bool) -> None:
+def test_photos_of_rows_without_pixels_are_cropped_as_the_model_did(tmp_path: Path, shown: bool) -> None:
     """WorldMirror and its relatives crop upright photos to squares; the colours confirm it."""
     square = smooth_scene(48, 48, np.array([[60.0, 0, 24], [0, 60, 24], [0, 0, 1]]))
     images = square.images if shown else np.random.default_rng(1).integers(0, 256, square.images.shape, np.uint8)
@@ -245,7 +245,7 @@ def test_photos_that_a_model_cropped_for_rows_without_pixels(tmp_path: Path, sho
     ((24.0, 18.0), (48, 36), 3),  # in the middle of it
     ((24.0, 18.0), (48, 36), 0),  # no photos
 ])  # fmt: skip
-def test_photos_of_another_size_than_world_mirror_s(
+def test_cameras_of_world_mirror_are_scaled_to_the_photos(
     tmp_path: Path, middle: tuple[float, float], size: tuple[int, int], factor: int
 ) -> None:
     """Its intrinsics are of the processed size, which the principal point shows."""

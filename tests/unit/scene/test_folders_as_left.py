@@ -1,4 +1,4 @@
-"""Folders as the programs of models leave them: Gaussians one folder down, cameras under names of their own."""
+"""Folders of models are read as left: Gaussians one folder down, cameras under names of their own."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
     ],
     often=4,
 )
-def test_the_scene_of_a_folder(tmp_path: Path, ply: str, beside: tuple[str, ...]) -> None:
+def test_gaussians_in_a_program_s_folder_are_found_among_other_files(
+    tmp_path: Path, ply: str, beside: tuple[str, ...]
+) -> None:
     """Files of other kinds and point clouds are beside it, and hidden folders."""
     path = save_export(tmp_path / Path(ply).parent, SMOOTH, export_rows(SMOOTH), cameras=False, name=Path(ply).name)
     points = np.zeros(7, [*((name, "f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))])
@@ -57,7 +59,7 @@ def test_the_scene_of_a_folder(tmp_path: Path, ply: str, beside: tuple[str, ...]
     assert [main_file(scene) for scene in find_scenes([str(tmp_path)], tmp_path / "out")] == [tmp_path / ply]
 
 
-def test_points_of_a_usual_name(tmp_path: Path) -> None:
+def test_points_under_a_usual_name_are_no_scene(tmp_path: Path) -> None:
     """Gaussians beside them are the scene; alone, the reader says what they lack."""
     points = np.zeros(7, [(name, "f4") for name in "xyz"])
     save_export(tmp_path, SMOOTH, points, cameras=False, name="scene.ply")
@@ -67,7 +69,7 @@ def test_points_of_a_usual_name(tmp_path: Path) -> None:
     assert find_scene_files(tmp_path).ply == tmp_path / "room.ply"
 
 
-def test_the_most_steps_of_gsplat_s_trainer(tmp_path: Path) -> None:
+def test_result_of_the_most_steps_of_gsplat_s_trainer_is_the_scene(tmp_path: Path) -> None:
     for name in ("ply/point_cloud_6999.ply", "ply/point_cloud_29999.ply"):
         save_export(tmp_path / "ply", SMOOTH, export_rows(SMOOTH), cameras=False, name=Path(name).name)
     save_json(tmp_path / "transforms.json", frames_of(SMOOTH))
@@ -96,7 +98,7 @@ def test_a_folder_of_too_many_files_is_not_searched(tmp_path: Path, monkeypatch:
         find_scene_files(tmp_path)
 
 
-def test_beside_what_a_link_leads_to(tmp_path: Path, tiny: Tiny) -> None:
+def test_files_beside_what_a_link_leads_to_are_found(tmp_path: Path, tiny: Tiny) -> None:
     write_transforms(tmp_path / "transforms.json", tiny)
     write_images(tmp_path / "images", tiny)
     (tmp_path / "a.ply").write_text("ply\n")
@@ -108,7 +110,7 @@ def test_beside_what_a_link_leads_to(tmp_path: Path, tiny: Tiny) -> None:
 
 
 @pytest.mark.parametrize("ends", ["recon_sampled", "da3", "da3_pred"])
-def test_lyra_2_s_cameras(tmp_path: Path, ends: str) -> None:
+def test_cameras_of_lyra_2_are_those_of_its_reconstruction(tmp_path: Path, ends: str) -> None:
     """Its scripts name the poses of the reconstruction by what made them, with those of the video beside them."""
     tiny = SMOOTH
     save_export(tmp_path, tiny, export_rows(tiny), cameras=False, name="reconstructed_scene.ply")
@@ -122,7 +124,7 @@ def test_lyra_2_s_cameras(tmp_path: Path, ends: str) -> None:
 
 
 @pytest.mark.parametrize("written", ["AnySplat", "VGGT"])
-def test_gaussians_among_the_photos_and_poses_as_a_model_returns_them(tmp_path: Path, written: str) -> None:
+def test_gaussians_among_photos_are_read_with_poses_as_a_model_returns_them(tmp_path: Path, written: str) -> None:
     """AnySplat's script writes among the photos; poses have no names then: photos are taken in order."""
     tiny = replace(SMOOTH, names=("2.png", "10.png", "11.png"))
     some = np.random.default_rng(0).permutation(ROWS.size)[:2999]
@@ -145,7 +147,7 @@ def test_gaussians_among_the_photos_and_poses_as_a_model_returns_them(tmp_path: 
 
 
 @pytest.mark.parametrize("frames", [True, False])
-def test_long_lrm_s_folders(tmp_path: Path, frames: bool) -> None:
+def test_folders_of_long_lrm_are_read_in_their_mean_pose(tmp_path: Path, frames: bool) -> None:
     """The origin is the mean pose of the inputs, which lie within +-1.
 
     tttLRM does not say which frames they are; of its rows the faint ones are missing.

@@ -30,7 +30,7 @@ def some(views: Sequence[int], scene: Tiny = SMOOTH) -> Tiny:
 
 
 def astray(count: int) -> Tiny:
-    """More cameras than photos, at random places."""
+    """Return more cameras than photos, at random places."""
     c2w = np.tile(np.eye(4), (count, 1, 1))
     for pose, numbers in zip(c2w, np.random.default_rng(1).uniform(-1, 1, (count, 6)), strict=True):
         pose[:3, :3], pose[:3, 3] = rotation(*3 * numbers[:3]), 9 * numbers[3:]
@@ -47,7 +47,7 @@ def resized(scale: float) -> Tiny:
 
 
 def flat(scene: Tiny = SMOOTH) -> Tiny:
-    """Photos and cameras without folders in their names."""
+    """Return photos and cameras without folders in their names."""
     return replace(scene, names=tuple(Path(name).name for name in scene.names))
 
 
@@ -89,7 +89,7 @@ def several_folders(folder: Path) -> None:
 
 
 def other_places(folder: Path) -> None:
-    """Photos of another scene, and those of other names in the usual place."""
+    """Write photos of another scene, and those of other names in the usual place."""
     write_images(folder / "images", replace(dark(), names=("x.png", "y.png", "z.png")))
     write_images(folder / "another/images", flat(dark()))
     write_ply(folder / "another/scene.ply", SMOOTH.gaussians)
@@ -125,7 +125,7 @@ def load(tmp_path: Path, kind: str, make: Callable[[Path], None]) -> Loaded:
         (below, "COLMAP/sparse/0", "COLMAP/images", ("COLMAP/sparse/0 (3 images)", "--cameras")),
     ],
 )
-def test_what_is_found(
+def test_cameras_and_photos_in_odd_places_are_found_with_a_note(
     tmp_path: Path, kind: str, make: Callable[[Path], None], cameras: str, images: str, said: tuple[str, ...]
 ) -> None:
     loaded = load(tmp_path, kind, make)
@@ -159,7 +159,7 @@ def test_cameras_below_that_no_photo_confirms_are_named(tmp_path: Path) -> None:
     assert noted(load_scene(tmp_path).notes, "several folders", f"--cameras {tmp_path}/COLMAP/sparse/0")
 
 
-def test_one_model_in_its_place_has_no_note(tmp_path: Path) -> None:
+def test_model_in_its_usual_place_gets_no_note(tmp_path: Path) -> None:
     def one(folder: Path) -> None:
         write_images(folder / "images", SMOOTH)
         write_colmap_binary(folder / "sparse/0", SMOOTH)
@@ -169,7 +169,7 @@ def test_one_model_in_its_place_has_no_note(tmp_path: Path) -> None:
 
 
 def mask_paths(folder: Path, paths: Sequence[object], *, size: tuple[int, int] = (56, 40), shared: str = "") -> Path:
-    """Masks that leave out the upper quarter, in a folder of any name."""
+    """Write masks that leave out the upper quarter, in a folder of any name; return the scene's folder."""
     save_export(folder, SMOOTH, export_rows(SMOOTH, ROWS["grid"]))
     picture = np.full(size[::-1], 255, np.uint8)
     picture[: size[1] // 4] = 0

@@ -1,4 +1,4 @@
-"""Held-out views: which they are, and that they come in the frame of the Gaussians."""
+"""Held-out views are known from others, and come in the frame of the Gaussians."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def tiny() -> Tiny:
 
 
 def write_views(folder: Path, poses: dict[str, np.ndarray], tiny: Tiny, size: tuple[int, int] = (32, 24)) -> Path:
-    """``transforms.json`` and a photo for each pose (camera to world, OpenCV)."""
+    """Write ``transforms.json`` and a photo for each pose (camera to world, OpenCV)."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     scale = size[0] / tiny.width
     frames = []
@@ -43,7 +43,7 @@ def write_views(folder: Path, poses: dict[str, np.ndarray], tiny: Tiny, size: tu
 
 
 def between(tiny: Tiny) -> np.ndarray:
-    """A pose that is none of the scene's."""
+    """Return a pose that is none of the scene's."""
     pose = tiny.c2w[0].copy()
     pose[:3, 3] = tiny.c2w[:2, :3, 3].mean(0)
     return pose
@@ -53,7 +53,7 @@ def stems(tiny: Tiny) -> list[str]:
     return [Path(name).stem for name in tiny.names]
 
 
-def test_context_views_are_left_out_and_places_are_those_of_the_file(tiny: Tiny, tmp_path: Path) -> None:
+def test_targets_are_the_other_views_of_the_file_in_its_order(tiny: Tiny, tmp_path: Path) -> None:
     load = load_scene(tiny.save(tmp_path / "scene"))
     a, b, c = stems(tiny)
     poses = {a: tiny.c2w[0], "held": between(tiny), b: tiny.c2w[1], c: tiny.c2w[2]}
@@ -128,7 +128,7 @@ def test_photos_of_another_size_bring_their_intrinsics(tiny: Tiny, tmp_path: Pat
     assert np.allclose(targets.cameras.Ks[0][:2], 2 * tiny.K[:2])
 
 
-def test_photos_elsewhere(tiny: Tiny, tmp_path: Path) -> None:
+def test_photos_of_targets_elsewhere_have_to_be_named(tiny: Tiny, tmp_path: Path) -> None:
     load = load_scene(tiny.save(tmp_path / "scene"))
     cameras = write_views(tmp_path / "held", {"q": between(tiny)}, tiny)
     shutil.move(str(tmp_path / "held" / "images"), str(tmp_path / "photos"))
@@ -154,7 +154,7 @@ def test_targets_of_a_scene_without_views(tiny: Tiny, tmp_path: Path) -> None:
     assert (len(targets), targets.context_places) == (1, None)
 
 
-def test_similarity_of_one_place_keeps_the_scale(tiny: Tiny) -> None:
+def test_similarity_of_cameras_in_one_place_keeps_the_scale(tiny: Tiny) -> None:
     theirs = np.tile(np.eye(4), (2, 1, 1))
     ours = theirs.copy()
     ours[:, 0, 3] = -5.0
@@ -164,7 +164,7 @@ def test_similarity_of_one_place_keeps_the_scale(tiny: Tiny) -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1.0, 1e4])
-def test_views_beside_a_single_one_are_other_views_in_any_unit(factor: float, tiny: Tiny, tmp_path: Path) -> None:
+def test_view_beside_a_single_input_view_is_a_target_in_any_unit(factor: float, tiny: Tiny, tmp_path: Path) -> None:
     c2w = tiny.c2w.copy()
     c2w[:, :3, 3] *= factor
     gaussians = replace(tiny.gaussians, means=tiny.gaussians.means * factor, scales=tiny.gaussians.scales * factor)

@@ -1,4 +1,4 @@
-"""Rows that are the pixels of more views than the file has cameras: the rows give the poses of all views."""
+"""Rows of more views than the file has cameras give the poses of all views."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FAR = np.argsort(-SMOOTH.gaussians.means[:, 2], kind="stable")[: len(ALL) // 12]
 
 
 def registered(views: list[int], *, moved: bool = False) -> Tiny:
-    """Some of the cameras, as they are or in a world of another frame and scale."""
+    """Return some of the cameras, as they are or in a world of another frame and scale."""
     c2w = SMOOTH.c2w[views].copy()
     if moved:
         turn = rotation(0.4, -0.8, 0.3)
@@ -46,7 +46,7 @@ def read_with(
 @sweep("views", [[0], [2], [0, 1], [0, 2]], often=2)
 @sweep("kind", [(False, write_colmap_binary), (True, write_colmap_binary), (False, write_transforms)], often=1)
 @pytest.mark.parametrize("index", [ALL, np.setdiff1d(ALL, FAR)], ids=["all rows", "far rows dropped"])
-def test_all_views_have_poses_and_photos(
+def test_views_without_a_camera_get_poses_and_photos(
     tmp_path: Path, views: list[int], kind: tuple[bool, Callable[..., object]], index: np.ndarray
 ) -> None:
     moved, write = kind
@@ -60,7 +60,7 @@ def test_all_views_have_poses_and_photos(
 
 
 @pytest.mark.parametrize("photos", [[0], []])
-def test_photos_of_these_views_may_be_missing_too(tmp_path: Path, photos: list[int]) -> None:
+def test_views_without_a_camera_may_lack_photos_too(tmp_path: Path, photos: list[int]) -> None:
     loaded = read_with(tmp_path, registered([0]), write_transforms, registered(photos) if photos else None, ALL)
     assert len(loaded.scene) == 3
     assert len(loaded.scene.photo_views) == len(photos)
@@ -77,7 +77,7 @@ def test_cameras_of_another_scene_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("views", [[0, 1], [0, 1, 2]])
-def test_of_rows_without_pixels_photos_without_a_camera_are_named(tmp_path: Path, views: list[int]) -> None:
+def test_photos_without_a_camera_are_named_for_rows_without_pixels(tmp_path: Path, views: list[int]) -> None:
     index = np.random.default_rng(0).permutation(ALL)[:4027]
     loaded = read_with(tmp_path, registered(views), write_transforms, SMOOTH, index)
     spare = [name.rpartition("/")[2] for view, name in enumerate(SMOOTH.names) if view not in views]

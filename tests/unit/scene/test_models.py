@@ -1,4 +1,4 @@
-"""Files as models leave them, by what is beside them: read right, or refused with what to do."""
+"""Files of models are read right by what is beside them, or refused with what to do."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ MARKED = {"Long-LRM": "longlrm", "SHARP": "sharp", "nerfstudio": "nerfstudio", "
 
 
 @sweep("name", (*PIXELS, *SEEN), often=8)
-def test_cameras_and_photos_of_all_views(tmp_path: Path, name: str) -> None:
+def test_files_of_a_model_give_cameras_and_photos_of_all_views(tmp_path: Path, name: str) -> None:
     """And every row is there, at its pixel if it has one."""
     export = MODELS[name](tmp_path / "out")
     loaded = load_scene(export.path, **export.options)
@@ -114,7 +114,9 @@ def test_photos_whose_cameras_cannot_be_found(tmp_path: Path) -> None:
         ("VGGT", "out", "--cameras"),
     ],
 )  # fmt: skip
-def test_outputs_without_gaussians(tmp_path: Path, name: str, place: str, said: str) -> None:
+def test_outputs_without_gaussians_are_refused_with_what_to_do(
+    tmp_path: Path, name: str, place: str, said: str
+) -> None:
     export = MODELS[name](tmp_path / "out")
     with refuses(SceneError, place, said):
         load_scene(export.path, **export.options)
@@ -149,7 +151,7 @@ def test_made_files_are_of_models_in_the_table() -> None:
         *((name, ()) for name in ("AnySplat", "pixelSplat", "WorldMirror 2")),
     ],
 )
-def test_what_brings_cameras_is_said_by_the_model(tmp_path: Path, name: str, said: tuple[str, ...]) -> None:
+def test_options_that_bring_cameras_are_named_for_the_model(tmp_path: Path, name: str, said: tuple[str, ...]) -> None:
     """And of no model where the file may be that of several."""
     MODELS[name](tmp_path / "out")
     (path,) = (tmp_path / "out").rglob("*.ply")

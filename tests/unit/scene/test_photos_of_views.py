@@ -1,4 +1,4 @@
-"""Photos as they lie beside scenes: each view has the one that shows it, or none, whatever the files are called."""
+"""Each view has the photo that shows it, or none, whatever the files beside the scene are called."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def write_room(folder: Path) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The scene of :func:`write_room`, which a test may change."""
+    """Return the scene of :func:`write_room`, which a test may change."""
     return write_room(tmp_path / "scene")
 
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
-    """The photos of all views ``[v,h,w,3]``."""
+    """Return the photos of all views ``[v,h,w,3]``."""
     return np.stack([read(path) for path in photos_in(write_room(tmp_path_factory.mktemp("photos") / "room"))])
 
 
@@ -50,9 +50,16 @@ def photos_in(folder: Path) -> list[Path]:
 
 
 def right_ones(loaded: Loaded, truth: np.ndarray) -> list[bool]:
-    """Whether each view has its photo."""
+    """Return whether each view has its photo."""
     assert loaded.scene.images is not None
     return [bool(np.abs(a - b).mean() < 0.02) for a, b in zip(loaded.scene.images, truth, strict=True)]
+
+
+def load_with_right_photos(folder: Path, truth: np.ndarray) -> Loaded:
+    """Load a scene, and check that each view has its photo."""
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    return loaded
 
 
 def absent(loaded: Loaded) -> list[int]:
@@ -69,13 +76,12 @@ def name_frames(folder: Path, rename: Callable[[int, str], str]) -> None:
 
 
 def test_right_names_are_used_without_a_word(folder: Path, truth: np.ndarray) -> None:
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert not any("photo" in text for text in loaded.notes)
 
 
 @pytest.mark.parametrize("tagged", [True, False])
-def test_photos_that_lie_on_their_side(folder: Path, truth: np.ndarray, tagged: bool) -> None:
+def test_photos_that_lie_on_their_side_are_turned(folder: Path, truth: np.ndarray, tagged: bool) -> None:
     """As a phone writes them, with a tag that says how to hold them, or without."""
     for path, quarters in zip(photos_in(folder), (3, 0, 1, 2), strict=True):
         exif = Image.Exif()
@@ -83,27 +89,24 @@ def test_photos_that_lie_on_their_side(folder: Path, truth: np.ndarray, tagged: 
             exif[0x0112] = TAGS[quarters]
         lying = np.rot90((read(path) * 255).round().astype(np.uint8), -quarters)
         Image.fromarray(np.ascontiguousarray(lying)).save(path, exif=exif)
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any("are turned" in text and "3 of 4 photos" in text for text in loaded.notes) is not tagged
 
 
-def test_photos_that_are_mirrored(folder: Path, truth: np.ndarray) -> None:
+def test_mirrored_photos_are_mirrored_back(folder: Path, truth: np.ndarray) -> None:
     for path in photos_in(folder):
         Image.fromarray(np.ascontiguousarray((read(path) * 255).round().astype(np.uint8)[:, ::-1])).save(path)
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any("or mirrored" in text and "4 of 4 photos" in text for text in loaded.notes)
 
 
-def test_tags_of_photos_that_are_upright(folder: Path, truth: np.ndarray) -> None:
+def test_wrong_tags_of_upright_photos_are_undone(folder: Path, truth: np.ndarray) -> None:
     """A program has turned the pixels, and kept the tag."""
     exif = Image.Exif()
     exif[0x0112] = 6
     for path in photos_in(folder):
         Image.open(path).convert("RGB").save(path, exif=exif)
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any("4 of 4 photos are turned" in text for text in loaded.notes)
 
 
@@ -111,8 +114,7 @@ def test_a_photo_without_a_camera_is_named(folder: Path, truth: np.ndarray) -> N
     """As where a program could not place it; of a film whose frames mostly have none, nothing is said."""
     spare = photos_in(folder)[0]
     spare.with_name("spare.png").write_bytes(spare.read_bytes())
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any(names(text, "no camera", "1 of 5", "spare.png") for text in loaded.notes)
     for number in range(VIEWS):
         spare.with_name(f"frame {number}.png").write_bytes(spare.read_bytes())
@@ -152,7 +154,7 @@ def test_a_photo_whose_content_is_in_a_format_that_is_not_read(folder: Path, sta
 
 
 @pytest.mark.parametrize("sizes", ["apart", "of all"])
-def test_one_photo_of_another_shape(folder: Path, truth: np.ndarray, sizes: str) -> None:
+def test_photo_of_another_shape_is_left_out(folder: Path, truth: np.ndarray, sizes: str) -> None:
     """A portrait among landscapes: its view is left out with its Gaussians' pixels, and the others are used."""
     path, file = photos_in(folder)[3], folder / "transforms.json"
     picture = (read(path)[:, 42:150] * 255).astype(np.uint8)
@@ -215,10 +217,9 @@ def test_views_without_gaussians_are_not_there_where_cameras_are_estimated(
     assert right_ones(load_scene(folder), np.delete(truth, view, 0)) == [True] * 3
 
 
-def test_smaller_copies_alone(folder: Path, truth: np.ndarray) -> None:
+def test_smaller_copies_of_photos_are_used_where_they_are_alone(folder: Path, truth: np.ndarray) -> None:
     (folder / "images").rename(folder / "images_4")
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert absent(loaded) == []
 
 
@@ -232,7 +233,9 @@ def dangle(path: Path) -> None:
     [os.unlink, lambda path: path.write_bytes(b""), lambda path: path.write_bytes(path.read_bytes()[:20_000]), dangle],
     ids=["missing", "empty", "cut off", "a link to nothing"],
 )
-def test_one_photo_that_is_not_there(folder: Path, truth: np.ndarray, spoil: Callable[[Path], object]) -> None:
+def test_missing_or_damaged_photo_leaves_out_its_view_alone(
+    folder: Path, truth: np.ndarray, spoil: Callable[[Path], object]
+) -> None:
     path = photos_in(folder)[1]
     spoil(path)
     loaded = load_scene(folder)
@@ -242,18 +245,17 @@ def test_one_photo_that_is_not_there(folder: Path, truth: np.ndarray, spoil: Cal
     assert names(str(loaded.doubts), "photos of 1 of 4 views are left out", path.name)
 
 
-def test_names_that_were_given_to_other_photos(folder: Path, truth: np.ndarray) -> None:
+def test_photos_under_names_of_others_are_matched_by_content(folder: Path, truth: np.ndarray) -> None:
     """As where a film's frames were numbered anew."""
     paths = photos_in(folder)
     contents = [path.read_bytes() for path in paths]
     for view, path in enumerate(paths):
         path.write_bytes(contents[(view + 1) % VIEWS])
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert any("matched with views by their content" in text and ": photo " in text for text in loaded.notes)
 
 
-def test_numbers_of_which_names_say_nothing(folder: Path, truth: np.ndarray) -> None:
+def test_photos_of_other_numbers_are_matched_by_content(folder: Path, truth: np.ndarray) -> None:
     """Files 8 to 11, newest first, for cameras that name others."""
     for view, path in enumerate(photos_in(folder)):
         path.rename(path.with_name(f"{11 - view}.png"))
@@ -270,6 +272,5 @@ def test_thumbnails_stand_for_no_photo(folder: Path, truth: np.ndarray) -> None:
         for place in (".thumbs", "thumbs", "images_2"):
             cv2.imwrite(str(path.parent / place / path.name), small)
     name_frames(folder, lambda _, name: Path(name).name)
-    loaded = load_scene(folder)
-    assert right_ones(loaded, truth) == [True] * VIEWS
+    loaded = load_with_right_photos(folder, truth)
     assert absent(loaded) == []

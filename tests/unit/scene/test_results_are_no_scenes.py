@@ -35,12 +35,12 @@ def save_result(path: Path, tiny: Tiny) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The tiny scene as another program writes it, called ``room.ply``."""
+    """Return the tiny scene as another program writes it, called ``room.ply``."""
     tiny = make_tiny()
     return save_export(tmp_path / "scene", tiny, export_rows(tiny), name="room.ply")
 
 
-def test_results_of_commands_say_so(folder: Path, tmp_path: Path) -> None:
+def test_results_of_commands_say_in_their_headers_what_they_are(folder: Path, tmp_path: Path) -> None:
     compact_files(find_scene_files(folder), PLAIN, Outputs(folder / "x.ply"))
     assert main(["extend", str(tmp_path / "x.gsm"), str(folder), "--set", "superpixels=20%", "-q"]) == 0
     assert main(["compact", str(tmp_path / "x.gsm"), "--fit", "none", "-o", str(folder / "y.ply"), "-q"]) == 0
@@ -62,7 +62,7 @@ def test_a_result_beside_the_scene_is_not_taken(folder: Path, tiny: Tiny, name: 
     assert find_scene_files(folder / name).ply == folder / name  # where it is named
 
 
-def test_a_result_among_parts_or_steps_is_not_taken(tmp_path: Path, tiny: Tiny) -> None:
+def test_result_is_not_taken_for_a_part_or_a_step_of_training(tmp_path: Path, tiny: Tiny) -> None:
     for i in range(2):
         write_ply(tmp_path / f"view_{i}.ply", tiny.gaussians[i * 280 : (i + 1) * 280])
     save_result(tmp_path / "view_2.ply", tiny)
@@ -74,7 +74,7 @@ def test_a_result_among_parts_or_steps_is_not_taken(tmp_path: Path, tiny: Tiny) 
     assert find_scene_files(tmp_path / "run").ply == steps / "point_cloud_6999.ply"
 
 
-def test_what_the_library_writes_may_be_a_scene(tmp_path: Path, tiny: Tiny) -> None:
+def test_files_written_by_the_library_may_be_scenes(tmp_path: Path, tiny: Tiny) -> None:
     """Generated scenes, too, are written without the comment of results."""
     tiny.save(tmp_path)
     assert header_content(tmp_path / "scene.ply") == "Gaussians"
@@ -83,7 +83,7 @@ def test_what_the_library_writes_may_be_a_scene(tmp_path: Path, tiny: Tiny) -> N
     assert header_content(tmp_path / "made/scene_0000/scene.ply") == "Gaussians"
 
 
-def test_a_folder_of_results_alone(folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+def test_single_result_of_a_folder_is_taken_and_several_are_refused(folder: Path, tiny: Tiny, tmp_path: Path) -> None:
     """The only one is taken with a note; several are named, and batch takes none."""
     (folder / "room.ply").unlink()
     path = save_result(folder / "x.ply", tiny)

@@ -1,4 +1,4 @@
-"""Rows of a file as Gaussians of a scene: those that are there, in the order of their pixels."""
+"""Rows of a file become Gaussians of a scene in the order of their pixels."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_rows_that_are_in_the_order_of_their_pixels_are_not_copied(room: Scene, 
     assert np.array_equal(pixels.homes, np.arange(0, len(room.gaussians), 2))
 
 
-def test_of_several_rows_of_a_pixel_the_nearest_is_in_front(room: Scene, tmp_path: Path) -> None:
+def test_nearest_of_several_rows_of_a_pixel_is_in_front(room: Scene, tmp_path: Path) -> None:
     """And all stay; a row that no view sees has no pixel."""
     g = room.gaussians[:100]
     near = replace(g, means=room.cameras.centres[0] + 0.5 * (g.means - room.cameras.centres[0]))
@@ -67,7 +67,7 @@ def test_of_several_rows_of_a_pixel_the_nearest_is_in_front(room: Scene, tmp_pat
     np.testing.assert_allclose(front.means, near.means, rtol=1e-6)
 
 
-def test_what_nothing_draws_is_not_there(room: Scene, tmp_path: Path) -> None:
+def test_rows_too_faint_to_be_drawn_are_left_out(room: Scene, tmp_path: Path) -> None:
     opacities = room.gaussians.opacities.copy()
     opacities[::7] = 1 / 300
     faint = replace(room.gaussians, opacities=opacities)

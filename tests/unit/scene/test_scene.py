@@ -1,3 +1,5 @@
+"""A folder is read as a scene with cameras, photos and pixels, or refused."""
+
 from __future__ import annotations
 
 import json
@@ -29,7 +31,7 @@ def name_photos(folder: Path, names: list[str]) -> None:
             frame["file_path"] = name
 
 
-def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
+def test_plain_scene_has_its_cameras_photos_and_pixels(tiny_folder: Path, tiny: Tiny) -> None:
     scene = read_scene(tiny_folder)
     assert len(scene) == 3
     assert (scene.cameras.width, scene.cameras.height) == (20, 14)
@@ -46,7 +48,7 @@ def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
     assert (loaded.notes, tuple(loaded.moves)) == ((), ())
 
 
-def test_an_npz_with_its_own_images(tmp_path: Path, tiny: Tiny) -> None:
+def test_images_of_an_npz_are_the_photos(tmp_path: Path, tiny: Tiny) -> None:
     tiny.save(tmp_path / "gs_ply", cameras=False, images=False)
     (tmp_path / "gs_ply" / "scene.ply").rename(tmp_path / "gs_ply" / "0000.ply")
     write_npz(tmp_path / "exports/npz/results.npz", tiny)
@@ -59,7 +61,7 @@ def test_an_npz_with_its_own_images(tmp_path: Path, tiny: Tiny) -> None:
 
 
 @pytest.mark.parametrize("name", ["../other/{}", "{root}/other/{}", "images/../../other/{}"])
-def test_photos_of_others_are_refused(name: str, tmp_path: Path, tiny: Tiny) -> None:
+def test_photos_outside_the_scene_are_not_read_unless_named(name: str, tmp_path: Path, tiny: Tiny) -> None:
     """Whatever a stranger's camera file names; --images may name them."""
     folder = tiny.save(tmp_path / "scene", images=False)
     write_images(tmp_path / "other", tiny)
@@ -84,7 +86,7 @@ def test_photos_beside_a_colmap_scene_are_not_its_own(tmp_path: Path, tiny: Tiny
     assert np.array_equal((read_scene(folder).images * 255).round(), tiny.images)
 
 
-def test_photos_inside_by_other_names(tmp_path: Path, tiny: Tiny) -> None:
+def test_photos_inside_the_scene_are_found_by_any_path(tmp_path: Path, tiny: Tiny) -> None:
     """With their whole paths, through a link to the folder, and with .. that comes back."""
     tiny.save(tmp_path / "scene", images=False)
     write_images(tmp_path / "scene" / "train", tiny)
@@ -136,7 +138,7 @@ def test_cameras_of_a_resized_image_are_scaled(tiny_folder: Path, tiny: Tiny) ->
 
 
 @pytest.mark.slow
-def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
+def test_cameras_of_another_shape_are_refused(tiny_folder: Path, tiny: Tiny) -> None:
     rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=30))
     with refuses(SceneError, "images", "20 x 14", "30 x 14", "no part"):
         read_scene(tiny_folder, order="view-major", cameras=tiny_folder, images=tiny_folder / "images")
@@ -145,14 +147,14 @@ def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
         read_scene(tiny_folder, order="view-major", cameras=tiny_folder, images=tiny_folder / "images")
 
 
-def test_swapped_sizes_without_images(tmp_path: Path, tiny: Tiny) -> None:
+def test_swapped_sizes_without_images_are_refused(tmp_path: Path, tiny: Tiny) -> None:
     folder = tiny.save(tmp_path, images=False)
     rewrite(folder / "transforms.json", lambda data: data.update(w=14, h=20))
     with refuses(SceneError, "transforms.json", "median", "cameras"):
         read_scene(folder, order="view-major", cameras=folder)
 
 
-def test_too_few_images_in_an_npz(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+def test_npz_of_too_few_images_is_refused(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
     two = {"extrinsics": tiny.w2c[:2], "intrinsics": np.tile(tiny.K, (2, 1, 1)), "depth": None}
     write_npz(tmp_path / "two.npz", tiny, image=tiny.images[:2], **two)
     with refuses(SceneError, "two.npz", "3 images", 2):
@@ -167,7 +169,7 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
         read_scene(tiny_folder, order="view-major", cameras=tiny_folder)
 
 
-def test_rows_in_order_are_known_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_order_of_rows_is_checked_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rows, "_BLOCK", 4)
     ids = np.arange(11, dtype=np.int32)
     assert rows._counts_up(ids)

@@ -1,3 +1,5 @@
+"""The files of a scene are found beside it by their names."""
+
 from __future__ import annotations
 
 import os
@@ -21,7 +23,7 @@ def make(folder: Path, *names: str) -> Path:
     return folder
 
 
-def test_cameras_and_photos_above_the_scene_up_to_the_named_folder(tmp_path: Path, tiny: Tiny) -> None:
+def test_cameras_and_photos_are_found_up_to_the_named_folder(tmp_path: Path, tiny: Tiny) -> None:
     top, run = tmp_path / "captures", tmp_path / "captures/room/run 1"
     run.mkdir(parents=True)
     write_ply(run / "scene.ply", tiny.gaussians)
@@ -38,7 +40,7 @@ def test_cameras_and_photos_above_the_scene_up_to_the_named_folder(tmp_path: Pat
     assert find_scene_files(top).images == top / "images/run 1"  # beside the photos of other scenes
 
 
-def test_a_trained_model_s_folders(tmp_path: Path, tiny: Tiny) -> None:
+def test_last_step_of_a_trained_model_is_the_scene(tmp_path: Path, tiny: Tiny) -> None:
     make(tmp_path, "point_cloud/iteration_7000/point_cloud.ply", "point_cloud/iteration_30000/point_cloud.ply")
     make(tmp_path, "input.ply", "cameras.json")
     actual = find_scene_files(tmp_path)
@@ -47,7 +49,7 @@ def test_a_trained_model_s_folders(tmp_path: Path, tiny: Tiny) -> None:
     assert find_scene_files(actual.ply).cameras == tmp_path / "cameras.json"
 
 
-def test_which_ply_of_a_folder(tmp_path: Path) -> None:
+def test_scene_of_a_folder_is_its_only_ply_or_that_of_a_usual_name(tmp_path: Path) -> None:
     make(tmp_path, "room.ply", "room.compact.ply", "points3D.ply", ".room-12.ply")
     assert find_scene_files(tmp_path).ply == tmp_path / "room.ply"
     make(tmp_path, "hall.ply")
@@ -59,7 +61,7 @@ def test_which_ply_of_a_folder(tmp_path: Path) -> None:
     assert find_scene_files(tmp_path).ply == tmp_path / "scene.ply"
 
 
-def test_named_files_go_first(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
+def test_named_cameras_and_photos_go_before_found_ones(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
     write_colmap_text(tmp_path / "other", tiny)
     write_images(tmp_path / "photos", tiny)
     actual = find_scene_files(tiny_folder, cameras=tmp_path / "other", images=str(tmp_path / "photos"))
@@ -67,7 +69,7 @@ def test_named_files_go_first(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> 
     assert actual.images == tmp_path / "photos"
 
 
-def test_image_folders_in_order(tmp_path: Path, tiny: Tiny) -> None:
+def test_folders_of_images_are_preferred_in_order(tmp_path: Path, tiny: Tiny) -> None:
     make(tmp_path, "scene.ply", "rgb/1.png", "context/1.png", "images/readme.txt")
     assert find_scene_files(tmp_path).images == tmp_path / "context"
     make(tmp_path, "input/1.jpg")
@@ -106,7 +108,7 @@ LAYOUTS = {  # files of Gaussians, pictures and cameras -> the scene, and where 
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_what_belongs_to_a_scene_of_many(tmp_path: Path, layout: str) -> None:
+def test_scene_among_many_has_its_own_files(tmp_path: Path, layout: str) -> None:
     """Masks lie beside its photos or in its folder; no file of another scene is its own."""
     files, scene, *places = LAYOUTS[layout]
     make(tmp_path, *files.split())
@@ -139,19 +141,19 @@ def test_masks_beside_the_file_to_which_a_link_leads(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("folder", ["color", "corrected_images", "keyframes/corrected_images", "keyframes/images"])
-def test_image_folders_of_other_programs(tmp_path: Path, folder: str) -> None:
+def test_folders_of_images_of_other_programs_are_found(tmp_path: Path, folder: str) -> None:
     make(tmp_path, "scene.ply", f"{folder}/1.png")
     assert find_scene_files(tmp_path).images == tmp_path / folder
 
 
-def test_blender_s_training_views(tmp_path: Path, tiny: Tiny) -> None:
+def test_cameras_of_blender_are_those_of_training(tmp_path: Path, tiny: Tiny) -> None:
     make(tmp_path, "scene.ply")
     for part in ("train", "test", "val"):
         write_transforms(tmp_path / f"transforms_{part}.json", tiny)
     assert find_scene_files(tmp_path).cameras == tmp_path / "transforms_train.json"
 
 
-def test_what_is_not_there(tmp_path: Path, tiny: Tiny) -> None:
+def test_missing_files_that_are_named_are_refused(tmp_path: Path, tiny: Tiny) -> None:
     with refuses(SceneError, "none.ply", "no such"):
         find_scene_files(tmp_path / "none.ply")
     with refuses(SceneError, tmp_path, ".ply", "none"):
@@ -171,7 +173,9 @@ def test_a_broken_npz_is_no_source_of_images(tmp_path: Path, tiny: Tiny) -> None
     assert find_scene_files(tmp_path).images is None
 
 
-def test_files_beside_a_relative_path(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch, tiny: Tiny) -> None:
+def test_cameras_beside_a_relative_path_are_found(
+    tiny_folder: Path, monkeypatch: pytest.MonkeyPatch, tiny: Tiny
+) -> None:
     monkeypatch.chdir(tiny_folder)
     write_transforms(tiny_folder / "transforms.json", tiny)
     actual = find_scene_files("scene.ply")
@@ -179,7 +183,7 @@ def test_files_beside_a_relative_path(tiny_folder: Path, monkeypatch: pytest.Mon
     assert actual.cameras == tiny_folder.resolve() / "transforms.json"
 
 
-def test_what_lies_one_folder_above_is_named_and_not_read(tmp_path: Path, tiny: Tiny) -> None:
+def test_cameras_and_photos_one_folder_above_are_offered_unread(tmp_path: Path, tiny: Tiny) -> None:
     (run := tmp_path / "room/run").mkdir(parents=True)
     write_ply(run / "x.ply", tiny.gaussians)
     write_transforms(cameras := tmp_path / "room/transforms.json", tiny)
@@ -193,7 +197,7 @@ def test_what_lies_one_folder_above_is_named_and_not_read(tmp_path: Path, tiny: 
     assert find_scene_files(tmp_path / "room").notes == find_scene_files(run, cameras="none", images="none").notes == ()
 
 
-def test_files_of_a_neighbouring_folder(tmp_path: Path, tiny: Tiny) -> None:
+def test_cameras_in_a_neighbouring_folder_are_offered(tmp_path: Path, tiny: Tiny) -> None:
     """Cameras alone are offered; those beside other Gaussians belong to them."""
     (run := tmp_path / "run").mkdir()
     write_ply(run / "x.ply", tiny.gaussians)

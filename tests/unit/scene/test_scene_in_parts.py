@@ -1,4 +1,4 @@
-"""Scenes whose rows are in several files: one for each view, or chunks."""
+"""The rows of a scene may be in several files: one for each view, or chunks."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_parts_are_one_scene(tmp_path: Path, tiny: Tiny, names: list[str], cuts:
         np.testing.assert_array_equal(getattr(load.scene.gaussians, name), column)
 
 
-def test_a_part_that_is_not_there(tmp_path: Path, tiny: Tiny) -> None:
+def test_missing_part_is_named(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path / "near", tiny, ["part_0.ply", "part_1.ply", "part_3.ply"], [280, 560])
     with refuses(SceneError, folder, "part_0.ply", "part_3.ply", "number 2"):
         find_scene_files(folder)
@@ -64,7 +64,7 @@ def test_a_part_that_is_not_there(tmp_path: Path, tiny: Tiny) -> None:
         find_scene_files(folder)
 
 
-def test_parts_of_different_kinds(tmp_path: Path, tiny: Tiny) -> None:
+def test_parts_of_different_kinds_are_refused(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply"], [280])
     degree = replace(tiny.gaussians[:280], shN=np.zeros((280, 3, 3), np.float32))
     write_ply(folder / "view_1.ply", degree, overwrite=True)
@@ -102,7 +102,7 @@ def test_files_of_the_same_bytes_are_one_scene(tmp_path: Path, tiny: Tiny, named
 
 
 @pytest.mark.parametrize("cuts", [[280, 560], [100, 300]])
-def test_moments_name_both_calls(tmp_path: Path, tiny: Tiny, cuts: list[int]) -> None:
+def test_moments_are_refused_with_calls_that_compact_or_join_them(tmp_path: Path, tiny: Tiny, cuts: list[int]) -> None:
     folder = split(tmp_path, tiny, ["0000.ply", "0001.ply", "0002.ply"], cuts)
     (folder / "transforms.json").unlink()
     calls = f"gsmerge batch {folder}", f"gsmerge convert {folder}/*.ply one.ply"
@@ -113,7 +113,7 @@ def test_moments_name_both_calls(tmp_path: Path, tiny: Tiny, cuts: list[int]) ->
     assert gsmerge.read_ply(out).info.count == len(tiny.gaussians)
 
 
-def test_a_state_is_of_all_parts(tmp_path: Path, tiny: Tiny) -> None:
+def test_state_of_a_scene_in_parts_has_all_of_them(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
     assert main(["extend", str(folder / "scene.gsm"), str(folder), "--set", "superpixels=20%", "-q"]) == 0
     (batch,) = load_state(folder / "scene.gsm").about["batches"]

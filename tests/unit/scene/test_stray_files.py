@@ -1,4 +1,4 @@
-"""Cameras, photos and masks beside a file that belong to something else, and ``none`` in their place."""
+"""Cameras, photos and masks of something else are left out, and ``none`` takes their place."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KINDS = {"grid": ALL, "voxels": SOME[np.lexsort(SMOOTH.gaussians.means[SOME].rou
 
 
 def another() -> Tiny:
-    """Cameras and photos of another capture, of four views."""
+    """Return cameras and photos of another capture, of four views."""
     c2w = np.concatenate([SMOOTH.c2w, SMOOTH.c2w[:1]])
     for pose, (x, y, z) in zip(c2w, np.random.default_rng(1).uniform(-1, 1, (4, 3)), strict=True):
         pose[:3, :3], pose[:3, 3] = rotation(3 * x, 3 * y, z), (50 + x, y, 9 * z)
@@ -57,7 +57,7 @@ def save(folder: Path, kind: str, *, cameras: bool = False) -> Path:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Loaded]:
-    """What each kind of file is without anything beside it."""
+    """Return what each kind of file is without anything beside it."""
     folder = tmp_path_factory.mktemp("alone")
     return {kind: load_scene(save(folder / kind, kind)) for kind in KINDS}
 
@@ -133,7 +133,7 @@ def test_photos_of_something_else_beside_a_grid(tmp_path: Path) -> None:
     assert names(str(load_scene(folder).doubts), "the photos in", folder / "images", "left out")
 
 
-def test_a_picture_beside_a_grid_that_cannot_be_read(tmp_path: Path) -> None:
+def test_damaged_pictures_beside_a_grid_are_a_doubt(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid")
     for number in range(3):
         (folder / f"{number}.png").write_bytes(b"\x89PNG nothing")
@@ -141,7 +141,7 @@ def test_a_picture_beside_a_grid_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_cameras_photos_and_masks_may_be_none(tmp_path: Path, kind: str) -> None:
+def test_none_leaves_out_cameras_photos_or_masks(tmp_path: Path, kind: str) -> None:
     folder = save(tmp_path, kind, cameras=True)
     write_images(folder / "masks", replace(SMOOTH, images=np.full_like(SMOOTH.images, 255)))
     assert load_scene(folder, images="none").scene.images is None
@@ -162,7 +162,7 @@ def test_a_folder_called_none_has_a_path(tmp_path: Path, kind: str, monkeypatch:
     assert load_scene(folder, cameras="./none").files.cameras == Path("none")
 
 
-def test_masks_that_nothing_names(tmp_path: Path) -> None:
+def test_found_masks_that_are_dark_or_damaged_are_left_out(tmp_path: Path) -> None:
     """Dark nearly everywhere, or damaged."""
     folder = save(tmp_path, "grid", cameras=True)
     write_images(folder / "masks", replace(SMOOTH, images=np.zeros_like(SMOOTH.images)))

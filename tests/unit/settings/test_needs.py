@@ -1,4 +1,4 @@
-"""What settings ask of a run: one piece, all views, a number of Gaussians."""
+"""Settings ask of a run one piece, all views, or a number of Gaussians."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_settings_that_need_the_scene_in_one_piece_are_named() -> None:
     assert uncut.whole_only == []
 
 
-def test_what_decides_instead_of_the_scene() -> None:
+def test_settings_tell_whether_the_scene_decides_the_count() -> None:
     def decides(**settings: object) -> tuple[bool, bool, bool]:
         options = CompactOptions().with_settings(settings)
         return options.scene_decides, options.replaces_stages, options.changes_superpixels

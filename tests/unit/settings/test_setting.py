@@ -1,4 +1,4 @@
-"""Declarations of settings, and what is made of them."""
+"""Declarations of settings make checks, help and options."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_impossible_values_are_refused(name: str, value: Any, expected: str) -> 
 
 
 @pytest.mark.parametrize("value", [0.0, math.inf, math.nan, -1])
-def test_open_ranges(value: float) -> None:
+def test_values_at_or_beyond_the_end_of_an_open_range_are_refused(value: float) -> None:
     with pytest.raises(ValueError, match="depth: expected a number above 0 m"):
         Inner(value)
 
@@ -76,7 +76,7 @@ def test_possible_values_are_kept() -> None:
     assert Example(share=0).share == 0
 
 
-def test_names_are_flat() -> None:
+def test_settings_of_inner_classes_are_listed_flat() -> None:
     assert list(flat_settings(Example)) == ["word", "count", "number", "share", "switch", "sizes", "file", "depth"]
     assert settings_of(Example)["inner"].kind is Inner
 

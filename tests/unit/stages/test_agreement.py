@@ -1,4 +1,4 @@
-"""What the depths of other views say: fainter groups, and a share of superpixels."""
+"""The depths of other views make groups fainter, and set the share of superpixels."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(wall: Scene)
         assert "agreement" not in log.choices
 
 
-def test_a_run_says_what_it_chose(wall: Scene) -> None:
+def test_run_reports_the_budget_it_chose(wall: Scene) -> None:
     auto, usual = (
         scenes.compacted(wall, superpixels=share, effort="draft", fit_steps=10, poses="fixed")
         for share in ("auto", "4.4%")

@@ -1,3 +1,5 @@
+"""Gaussians in no order belong to the superpixels that show them."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -39,7 +41,7 @@ def groups() -> Groups:
     return segment(make_room().images, SegmentOptions(), 40)
 
 
-def test_middle_pixels() -> None:
+def test_middle_pixel_of_a_superpixel_is_nearest_to_its_mean() -> None:
     labels = np.array([[0, 0, 0, 2], [0, 0, 0, 2], [0, 0, 0, 2]], np.int32)
     assert middle_pixels(labels, 4).tolist() == [5, 0, 7, 0]
 
@@ -94,13 +96,13 @@ def test_members_without_a_pixel_are_in_no_group(room: Scene, groups: Groups) ->
     np.testing.assert_allclose(members.footprints[::3], (away / focals).min(1)[::3], rtol=1e-5)
 
 
-def test_frame_is_that_of_the_grid(room: Scene) -> None:
+def test_frame_of_gaussians_in_no_order_is_that_of_the_grid(room: Scene) -> None:
     actual, expected = canonicalise(unaligned_scenes.without_order(room))[1], scene_frame(room)
     assert actual.unit == expected.unit
     assert np.abs(actual.origin - expected.origin).max() < 0.5
 
 
-def test_density_is_of_the_gaussians_where_those_are_fewer(room: Scene) -> None:
+def test_share_of_superpixels_is_of_gaussians_where_these_are_fewer(room: Scene) -> None:
     options = SegmentOptions(superpixels="10%")
     whole = unaligned_scenes.without_order(room)
     sizes = [whole, room, *(replace(whole, gaussians=room.gaussians[rows]) for rows in (slice(0, None, 2), slice(1)))]
@@ -108,7 +110,7 @@ def test_density_is_of_the_gaussians_where_those_are_fewer(room: Scene) -> None:
     assert superpixels_per_view(measure_size(whole), SegmentOptions(superpixels=50)) == 50
 
 
-def test_few_gaussians_are_as_many_as_of_pixels(room: Scene) -> None:
+def test_few_gaussians_get_half_as_many_superpixels_at_most(room: Scene) -> None:
     """A share of tokens is too few to show the photos; half of them are the most."""
     tokens = replace(measure_size(unaligned_scenes.without_order(room)), rendered=False)
     sizes = [replace(tokens, num_gaussians=count) for count in (1151, 200)]
@@ -132,14 +134,14 @@ def test_unknown_cameras_are_placed(room: Scene) -> None:
     assert "photos" in log.notes[-1]
 
 
-def test_placed_cameras_see_most(room: Scene) -> None:
+def test_placed_cameras_see_most_gaussians(room: Scene) -> None:
     blind = add_views(Scene(room.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ()))
     groups = Groups(np.zeros((len(blind), blind.cameras.height, blind.cameras.width), np.int32), (1,) * len(blind))
     owners = find_owners(blind, groups)
     assert (owners.values > 0).mean() > 0.8
 
 
-def test_nothing_seen_at_all(room: Scene) -> None:
+def test_scene_that_no_camera_sees_is_refused(room: Scene) -> None:
     scene = replace(unaligned_scenes.without_order(room), gaussians=unaligned_scenes.far_behind(room.gaussians, 500))
     with refuses(UsageError, "", "none of 3", 500):
         compact(scene)

@@ -1,4 +1,4 @@
-"""What is left out of a result: crops, floaters, and a budget that is met after them."""
+"""Crops and floaters are left out of a result, and a budget is met after them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def scene() -> Scene:
 
 
 def sphere_in(scene: Scene, share: float) -> str:
-    """A sphere about the scene's middle that holds that share of its Gaussians."""
+    """Return a sphere about the scene's middle that holds that share of its Gaussians."""
     means = scene.gaussians.means.astype(float)
     middle = np.median(means, axis=0)
     radius = np.quantile(np.linalg.norm(means - middle, axis=1), share)
@@ -35,7 +35,7 @@ def sphere_in(scene: Scene, share: float) -> str:
 
 
 def wall(n: int = 40) -> Gaussians:
-    """n x n Gaussians that touch, at a distance of 1, on a plane that is not along an axis."""
+    """Return n x n Gaussians that touch, at a distance of 1, on a plane that is not along an axis."""
     y, x = np.divmod(np.arange(n * n), n)
     means = np.stack([x, y, (x + y) / 4], 1).astype(np.float32)
     count = len(means)
@@ -105,7 +105,7 @@ def test_curtains_are_floaters() -> None:
     assert not floaters(replace(given, scales=np.full_like(scales, 12))).any()  # all alike
 
 
-def test_the_faintest_go_first() -> None:
+def test_faintest_gaussians_are_dropped_first() -> None:
     given = wall(3)
     opacities = np.array([5, 1, 8, 2, 7, 3, 9, 4, 6], np.float32) / 10
     assert faintest_dropped(replace(given, opacities=opacities), 4).opacities.tolist() == pytest.approx(
@@ -123,7 +123,7 @@ def test_a_budget_is_met_after_the_crop(scene: Scene, share: float) -> None:
     assert sum("clean-up: " in note for note in result.report.notes) == 1
 
 
-def test_counts_fit_and_scores_are_of_the_inside(scene: Scene) -> None:
+def test_cropped_fit_shows_the_inside_better_than_cropping_afterwards(scene: Scene) -> None:
     """The same number of Gaussians shows the inside better than where all was fitted and then cut, over two seeds."""
     crop, fitted = sphere_in(scene, 0.5), QUICK | {"fit": "full", "fit_steps": 80}
     part = compact(scene, **fitted, crop=crop)
@@ -197,32 +197,42 @@ def test_a_crop_leaves_what_shows_it(scene: Scene) -> None:
     assert whole.gaussians is scene.gaussians
 
 
-def test_levels_and_baselines_are_cropped(scene: Scene) -> None:
+def test_coarser_levels_are_cropped(scene: Scene) -> None:
     crop = sphere_in(scene, 0.5)
     result = compact(scene, **QUICK, crop=crop, budget=160, levels=2)
     assert [len(one.gaussians) for one in (result, *result.coarser)] == [160, 40]
     assert inside_crop(result.coarser[0].gaussians.means, crop).all()
+
+
+def test_baselines_are_cropped(scene: Scene) -> None:
+    crop = sphere_in(scene, 0.5)
     opaque = compact(scene, method="opacity", crop=crop, budget=100)
     assert len(opaque.gaussians) == 100
     assert inside_crop(opaque.gaussians.means, crop).all()
     assert not any("use" in note for note in opaque.report.notes)
 
 
-def test_what_cannot_be(scene: Scene) -> None:
+def test_crop_of_nothing_and_dropped_sky_with_a_target_are_refused(scene: Scene) -> None:
     with refuses(UsageError, "crop", "sphere:0,0,1e9,1", "none"):
         compact(scene, **QUICK, crop="sphere:0,0,1e9,1")
     with refuses(ValueError, "drop sky", "budget", "quality 30dB"):
         CompactOptions().with_settings({"drop": "sky", "quality": "30dB"})
+
+
+def test_budget_beyond_a_crop_is_noted(scene: Scene) -> None:
     few = sphere_in(scene, 0.002)
     result = compact(scene, **QUICK, crop=few, budget=5000)
     assert 0 < len(result.gaussians) < 5000
     assert noted(result.report.notes, "crop", f"{result.report.num_input} of 5,184")
+
+
+def test_crop_and_dropped_floaters_need_the_whole_scene() -> None:
     assert CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "drop": "floaters"}).whole_only == [
         "crop", "drop floaters",
     ]  # fmt: skip
 
 
-def test_what_no_view_shows_is_left_out(scene: Scene) -> None:
+def test_gaussians_that_no_view_shows_are_left_out(scene: Scene) -> None:
     """What stands behind the cameras, and nothing that takes part in a picture."""
     given = scene.gaussians
     behind = given.means - 1000 * scene.cameras.viewmats[0, 2, :3].astype(np.float32)
@@ -235,7 +245,7 @@ def test_what_no_view_shows_is_left_out(scene: Scene) -> None:
     assert len(clean(given[:0], options, None, None, lambda g: g)[0]) == 0
 
 
-def test_a_result_without_what_no_view_shows_has_its_count(scene: Scene) -> None:
+def test_result_without_unseen_gaussians_is_what_views_show(scene: Scene) -> None:
     result = compact(scene, budget=150, drop="unseen", **QUICK)
     assert (count_views(result.gaussians, scene.cameras) > 0).mean() > 0.9
     assert any("that no view shows" in note for note in result.report.notes)

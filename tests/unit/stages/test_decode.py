@@ -1,3 +1,5 @@
+"""Groups are split into children that keep their moments."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -6,18 +8,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry.pooling import Members, feature_to_gaussians, scene_members
 from gsmerge.geometry.transforms import covariances
 from gsmerge.kernels import elementary
 from gsmerge.settings.stages import DecodeOptions
-from gsmerge.stages.decode import deal_visible, decode, mixed_counts, split_counts
+from gsmerge.stages.decode import deal_visible, decode, hull_gains, mixed_counts, split_counts
 from gsmerge.stages.encode import encode
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import FeatureGaussians, Groups
 
-COUNT = 8  # so that no superpixel has fewer than 8 pixels
+COUNT = 12  # so that no superpixel has fewer than 8 pixels
 
 
 def make_scene() -> Scene:
@@ -48,7 +51,7 @@ def assert_alike(a: Gaussians, b: Gaussians) -> None:
     np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-9)
 
 
-def test_one_child_is_the_feature(features: FeatureGaussians, members: Members) -> None:
+def test_single_child_is_the_feature(features: FeatureGaussians, members: Members) -> None:
     assert_alike(decode(features, members, DecodeOptions(k=1)), feature_to_gaussians(features))
 
 
@@ -80,7 +83,9 @@ def test_mixed_k_goes_by_the_saliency(features: FeatureGaussians, members: Membe
     assert options.mean_k == pytest.approx(1.9)
 
 
-def test_mixed_k_by_distortion_has_as_many(features: FeatureGaussians, members: Members) -> None:
+def test_mixed_k_has_as_many_children_by_distortion_as_by_saliency(
+    features: FeatureGaussians, members: Members
+) -> None:
     saliency = np.random.default_rng(0).random(len(members.means)).astype(np.float32)
     by_saliency = mixed_counts(features, members, saliency, DecodeOptions(k="mixed"))
     by_distortion = mixed_counts(features, members, saliency, DecodeOptions(k="mixed", k_rule="distortion"))
@@ -95,7 +100,7 @@ def test_percentiles_out_of_range_are_refused(low: float, high: float) -> None:
         DecodeOptions(k="mixed", k_low=low, k_high=high)
 
 
-def test_single_members_stay_themselves(scene: Scene, members: Members) -> None:
+def test_groups_of_one_member_are_not_split(scene: Scene, members: Members) -> None:
     """Every pixel its own superpixel: K changes nothing."""
     labels = np.stack([np.arange(scene.pixels_per_view, dtype=np.int32).reshape(18, 24)] * 2)
     features = encode(scene, members, Groups(labels, (432, 432)))
@@ -112,7 +117,7 @@ def test_gains_reach_the_children(features: FeatureGaussians, members: Members) 
 
 
 @pytest.mark.parametrize("k", [1, 4])
-def test_faint_ones_are_left_out(scene: Scene, k: int) -> None:
+def test_faint_children_are_left_out(scene: Scene, k: int) -> None:
     opacities = scene.gaussians.opacities.copy()
     opacities[: scene.pixels_per_view] = 0
     half = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
@@ -125,7 +130,7 @@ def test_faint_ones_are_left_out(scene: Scene, k: int) -> None:
 
 
 def faint_division(counts: np.ndarray) -> Gaussians:
-    """Groups whose further children are too faint to be seen, except the last two groups'."""
+    """Return groups whose further children are too faint to be seen, except the last two groups'."""
     opacities = np.concatenate(
         [[0.5] + [0.5 if i > 1 else 1e-4 * j for j in range(1, n)] for i, n in enumerate(counts)]
     )
@@ -140,3 +145,49 @@ def test_faint_gaussians_make_way_for_others(total: int, faint: int) -> None:
     actual = deal_visible(order, 4, total, 1 / 255, faint_division)
     assert len(actual) == min(total, 14)
     assert int((actual.opacities < 1 / 255).sum()) == faint
+
+
+def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, members: Members) -> None:
+    assert split_counts(features, members, 10_000).tolist() == [8] * 24
+    assert split_counts(features, members, 10_000, 3).tolist() == [3] * 24
+
+
+def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Members) -> None:
+    """Group 5 gets many colours, all others one each, on a plane."""
+    sh0, own = np.zeros_like(members.sh0), features.members[features.starts[5] : features.starts[6]]
+    sh0[own, 0] = np.random.default_rng(0).normal(size=(len(own), 3))
+    means = members.means.copy()
+    means[:, 2] = 0
+    counts = split_counts(features, replace(members, sh0=sh0, means=means), 6)
+    assert counts.tolist() == [7 if group == 5 else 1 for group in range(24)]
+
+
+def test_gains_of_two_steps_are_averaged_where_only_the_second_pays() -> None:
+    """Errors of 10, 9, 0: the two steps gain five each on average, so they come before a single gain of four."""
+    gains = hull_gains(np.array([[10.0, 9.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, np.nan], [1.0, np.nan, np.nan]]))
+    assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
+
+
+def test_split_counts_out_of_range_are_refused(features: FeatureGaussians, members: Members) -> None:
+    with refuses(ValueError, "extra", 0, -1):
+        split_counts(features, members, -1)
+    with refuses(ValueError, "max_children", 1, 0):
+        split_counts(features, members, 1, 0)
+
+
+def test_children_stand_in_the_order_of_their_groups(features: FeatureGaussians, members: Members) -> None:
+    counts = np.arange(24) % 3 + 1
+    children = decode(features, members, DecodeOptions(min_opacity=0), counts)
+    one = decode(features, members, DecodeOptions(min_opacity=0))
+    for group, (first, last) in enumerate(pairwise(np.append(0, np.cumsum(counts)))):
+        low, high = children.means[first:last].min(0), children.means[first:last].max(0)
+        assert (one.means[group] >= low - 1e-5).all()
+        assert (one.means[group] <= high + 1e-5).all()
+    whole = counts == 1
+    np.testing.assert_array_equal(children.means[np.repeat(whole, counts)], one.means[whole])
+
+
+@pytest.mark.parametrize("counts", [np.ones(3, int), np.zeros(24, int)])
+def test_decode_refuses_strange_counts(counts: np.ndarray, features: FeatureGaussians, members: Members) -> None:
+    with refuses(ValueError, "counts", 24):
+        decode(features, members, DecodeOptions(), counts)

@@ -1,3 +1,5 @@
+"""Groups of Gaussians become Feature Gaussians."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -20,7 +22,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def groups() -> Groups:
-    """Squares of four pixels."""
+    """Return squares of four pixels."""
     ys, xs = np.mgrid[:HEIGHT, :WIDTH]
     labels = (ys // 4 * (WIDTH // 4) + xs // 4).astype(np.int32)
     return Groups(np.stack([labels, labels]), (6, 6))
@@ -30,7 +32,7 @@ def encoded(scene: Scene, groups: Groups, rule: str = "depth") -> FeatureGaussia
     return encode(scene, scene_members(scene), groups, rule=rule)
 
 
-def test_rows_of_the_groups(scene: Scene, groups: Groups) -> None:
+def test_member_rows_are_those_of_their_group_and_view(scene: Scene, groups: Groups) -> None:
     starts, ids, views = member_rows(scene, scene_members(scene), groups)
     assert np.diff(starts).tolist() == [16] * 12
     assert views.tolist() == [0] * 6 + [1] * 6
@@ -55,7 +57,7 @@ def test_invalid_pixels_are_left_out(scene: Scene, groups: Groups) -> None:
 
 
 @pytest.mark.parametrize("rule", ["depth", "paper"])
-def test_no_valid_pixel(scene: Scene, groups: Groups, rule: str) -> None:
+def test_scene_without_valid_pixels_has_no_features(scene: Scene, groups: Groups, rule: str) -> None:
     assert len(encoded(scenes.shown_in(scene, np.zeros_like(scene.pixels.shown)), groups, rule)) == 0
 
 
@@ -66,7 +68,7 @@ def test_views_may_have_different_counts(scene: Scene, groups: Groups) -> None:
     assert views.tolist() == [0] * 6 + [1]
 
 
-def test_sums_add_up(scene: Scene, groups: Groups) -> None:
+def test_features_keep_the_sums_of_weights_masses_and_extinctions(scene: Scene, groups: Groups) -> None:
     features = encoded(scene, groups)
     assert len(features) == 12
     assert float(features.weights.sum()) == pytest.approx(float(scene.gaussians.opacities.sum()), rel=1e-5)

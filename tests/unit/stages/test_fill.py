@@ -1,4 +1,4 @@
-"""Gaussians for what cameras between the views see empty."""
+"""Gaussians are added where cameras between the views see nothing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmerge.types import Cameras, Gaussians
 
 
 def sheet(left: float, right: float, depth: float, color: float) -> Gaussians:
-    """A plane across the cameras' axis, from ``left`` to ``right``, of opaque Gaussians."""
+    """Return a plane across the cameras' axis, from ``left`` to ``right``, of opaque Gaussians."""
     step = 0.004 * depth
     x, y = np.meshgrid(np.arange(left, right, step), np.arange(-0.5 * depth, 0.5 * depth, step))
     means = np.stack([x.ravel(), y.ravel(), np.full(x.size, depth)], 1).astype(np.float32)
@@ -29,7 +29,7 @@ def sheet(left: float, right: float, depth: float, color: float) -> Gaussians:
 
 
 def slit(*centres: float) -> tuple[Gaussians, Cameras]:
-    """Two posts before a wall, of which is there what cameras at -0.6 and 0.6 see: nothing behind the slit."""
+    """Return two posts before a wall, of which is there what cameras at -0.6 and 0.6 see: nothing behind the slit."""
     wall = [(-4, -1.2), (-0.9, -0.3), (0.3, 0.9), (1.2, 4)]
     parts = [sheet(-0.9, -0.15, 3, 0.8), sheet(0.15, 0.9, 3, 0.8), *(sheet(*span, 6, 0.3) for span in wall)]
     viewmats = np.tile(np.eye(4), (len(centres), 1, 1))
@@ -39,7 +39,7 @@ def slit(*centres: float) -> tuple[Gaussians, Cameras]:
 
 
 def fill(gaussians: Gaussians, cameras: Cameras, **settings: bool) -> Gaussians:
-    """What is added where there is room for a tenth as many."""
+    """Return what is added where there is room for a tenth as many."""
     return fill_between(gaussians, cameras, None, len(gaussians) // 10, **settings)
 
 
@@ -78,7 +78,7 @@ def test_only_what_is_enclosed_is_filled() -> None:
     assert not (new.means[:, 0] > 0.2).any()
 
 
-def test_between_is_a_line_from_one_to_another() -> None:
+def test_pixels_between_known_ones_of_a_row_or_column_lie_between() -> None:
     known = np.zeros((5, 7), bool)
     known[2, 1] = known[2, 4] = known[0, 6] = known[3, 6] = True
     expected = np.zeros((5, 7), bool)
@@ -102,7 +102,7 @@ def test_cameras_between_do_not_fill_the_same_twice() -> None:
 
 
 @pytest.mark.parametrize("most", [0, 7])
-def test_no_more_than_there_is_room_for(most: int) -> None:
+def test_no_more_gaussians_are_filled_in_than_there_is_room_for(most: int) -> None:
     assert len(fill_between(*slit(-0.6, 0.6), None, most)) == most
 
 
@@ -111,5 +111,5 @@ def test_what_each_view_shows_as_empty_stays_empty() -> None:
 
 
 @pytest.mark.parametrize("count", [1, MOST_FILLED_VIEWS + 1])
-def test_one_view_and_very_many_are_not_filled(count: int) -> None:
+def test_scenes_of_one_or_very_many_views_are_not_filled(count: int) -> None:
     assert len(fill(*slit(*np.linspace(-0.6, 0.6, count)))) == 0

@@ -1,3 +1,5 @@
+"""Features of several views that overlap and agree in colour match."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -31,12 +33,12 @@ def test_twins_of_two_views_match(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_twins_of_one_view_do_not(method: str) -> None:
+def test_twins_of_one_view_do_not_match(method: str) -> None:
     assert sets(make_features([[0, 0, 0], [0, 0, 0], [1, 0, 0]], views=[0, 0, 1]), match=method) == alone(3)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_colours_must_agree(method: str) -> None:
+def test_twins_of_different_colours_do_not_match(method: str) -> None:
     means = np.zeros((2, 3))
     near, far = (make_features(means, colors=np.array([[0.5, 0.5, 0.5], [0.5 + d, 0.5, 0.5]])) for d in (0.11, 0.13))
     assert len(sets(near, match=method)) == 1
@@ -89,23 +91,23 @@ def test_a_crowd_of_the_own_view_hides_nobody(method: str) -> None:
     assert max(map(len, sets(features, match=method))) == (2 if method == "overlap" else 41)
 
 
-def test_none_leaves_everything_alone() -> None:
+def test_match_none_leaves_every_feature_alone() -> None:
     assert sets(make_features(np.zeros((4, 3))), match="none") == alone(4)
 
 
 @pytest.mark.parametrize("method", [*METHODS, "none"])
 @pytest.mark.parametrize("count", [0, 1])
-def test_few(method: str, count: int) -> None:
+def test_no_feature_or_one_makes_no_pair(method: str, count: int) -> None:
     assert sets(make_features(np.zeros((count, 3))), match=method) == alone(count)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_one_view_is_left_alone(method: str) -> None:
+def test_features_of_a_single_view_are_left_alone(method: str) -> None:
     assert sets(make_features(np.zeros((5, 3)), views=[2] * 5), match=method) == alone(5)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_transparent_ones_are_left_alone(method: str) -> None:
+def test_transparent_features_are_left_alone(method: str) -> None:
     features = make_features(np.zeros((4, 3)), opacities=[0.8, 0.0, 0.8, 0.0])
     assert sets(features, match=method) == {frozenset([0, 2]), frozenset([1]), frozenset([3])}
 
@@ -116,7 +118,7 @@ def test_as_many_to_a_cluster_as_there_are_views() -> None:
     assert sorted(map(len, sets(features))) == [1, 4, 4]
 
 
-def test_heaviest_leads() -> None:
+def test_heaviest_feature_leads_a_chain() -> None:
     """A chain of three: the middle one takes both when it is the heaviest, else it goes to the heavier end."""
     means = [[0, 0, 0], [0.012, 0, 0], [0.024, 0, 0]]
     assert sets(make_features(means, opacities=[0.5, 0.9, 0.6])) == {frozenset([0, 1, 2])}

@@ -1,3 +1,5 @@
+"""Matched features merge with their moments and members."""
+
 from __future__ import annotations
 
 from dataclasses import fields, replace
@@ -26,7 +28,7 @@ def with_members(features: FeatureGaussians, sizes: list[int]) -> FeatureGaussia
     return replace(features, starts=starts, members=np.arange(int(starts[-1])) + 100)
 
 
-def test_two_by_hand() -> None:
+def test_merged_pair_has_the_values_computed_by_hand() -> None:
     features = make_features([[0, 0, 0], [7, 7, 7], [4, 0, 0]], sizes=1.0, opacities=[0.6, 0.5, 0.2], degree=1)
     features = replace(
         with_members(features, [2, 1, 3]),
@@ -46,7 +48,7 @@ def test_two_by_hand() -> None:
     assert merged.members.tolist() == [102, 100, 101, 103, 104, 105]
 
 
-def test_gains_weigh_and_carry_over() -> None:
+def test_gains_weigh_means_and_scale_optical_depths() -> None:
     """A Gaussian that the photos distrust counts less in the mean; gained optical depths add up."""
     features = make_features([[0, 0, 0], [1, 0, 0]], opacities=0.5)
     features = replace(features, gains=np.array([3.0, 1.0], np.float32))
@@ -56,7 +58,7 @@ def test_gains_weigh_and_carry_over() -> None:
     assert float(merged.extinctions[0] * merged.gains[0]) == pytest.approx(float(gained), rel=1e-5)
 
 
-def test_latents_are_averaged_and_gradients_pass(torch: Any) -> None:
+def test_latents_are_averaged_in_arrays_and_through_gradients(torch: Any) -> None:
     """With the weights of the means; those that are alone keep theirs. Arrays and tensors alike."""
     features = make_features(np.zeros((3, 3)), opacities=[0.6, 0.5, 0.2])
     latents = torch.tensor([[1.0, 2.0], [7.0, 8.0], [5.0, 0.0]], requires_grad=True)
@@ -69,7 +71,7 @@ def test_latents_are_averaged_and_gradients_pass(torch: Any) -> None:
     assert isinstance(merge(features, matches(0, 1, 0)).latents, np.ndarray)
 
 
-def test_transparent_ones_merge_without_nan() -> None:
+def test_transparent_features_merge_without_nan() -> None:
     features = make_features([[0, 0, 0], [1, 0, 0]], opacities=0.0)
     merged = merge(features, matches(0, 0))
     for f in fields(FeatureGaussians):
@@ -78,7 +80,7 @@ def test_transparent_ones_merge_without_nan() -> None:
     assert feature_to_gaussians(merged).opacities.tolist() == [0]
 
 
-def test_far_from_the_origin_nothing_cancels() -> None:
+def test_merged_covariance_is_exact_far_from_the_origin() -> None:
     features = make_features(np.array([[0, 0, 0], [0.02, 0, 0]]) + 1000.0, opacities=0.5)
     merged = merge(features, matches(0, 0))
     apart = float(features.means[1, 0] - features.means[0, 0])
@@ -98,7 +100,7 @@ def test_every_member_once_whatever_the_clusters() -> None:
     assert float(merged.masses.sum()) == pytest.approx(float(features.masses.sum()), rel=1e-5)
 
 
-def test_take_brings_the_members() -> None:
+def test_taken_features_bring_their_members() -> None:
     features = with_members(make_features(np.eye(3)), [1, 2, 3])
     taken = take_features(features, np.array([2, 0]))
     assert taken.starts.tolist() == [0, 3, 4]

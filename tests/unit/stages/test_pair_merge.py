@@ -1,4 +1,4 @@
-"""Merging by positions and colours alone."""
+"""Gaussians are merged by positions and colours alone."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def room() -> Scene:
 
 
 def shown(gaussians: Gaussians, scene: Scene) -> float:
-    """PSNR (dB) of the views against those of the scene's Gaussians."""
+    """Return the PSNR (dB) of the views against those of the scene's Gaussians."""
     pictures = [render(g, scene.cameras).images.clip(0, 1) for g in (gaussians, scene.gaussians)]
     return float(np.mean([psnr(*pair) for pair in zip(*pictures, strict=True)]))
 
 
 @pytest.mark.parametrize("count", [1, 7, 100, 1999])
-def test_as_many_as_asked_for(count: int) -> None:
+def test_merging_leaves_as_many_as_asked_for(count: int) -> None:
     gaussians = random_gaussians(2000, 0, degree=2)
     merged = merge_neighbors(gaussians, count)
     assert len(merged) == count
@@ -40,13 +40,13 @@ def test_as_many_as_asked_for(count: int) -> None:
     assert (merged.opacities < 1).all()
 
 
-def test_no_more_than_there_are() -> None:
+def test_merging_to_a_count_beyond_the_gaussians_changes_none() -> None:
     gaussians = random_gaussians(50, 0)
     assert merge_neighbors(gaussians, 50) is gaussians
     assert merge_neighbors(gaussians, 90) is gaussians
 
 
-def test_what_is_alone_stays_as_it_was() -> None:
+def test_unmerged_gaussians_stay_as_they_were() -> None:
     gaussians = random_gaussians(500, 1, degree=1)
     merged = merge_neighbors(gaussians, 400)
     same = (merged.means[:, None] == gaussians.means).all(2)
@@ -56,7 +56,7 @@ def test_what_is_alone_stays_as_it_was() -> None:
         assert np.array_equal(column[rows], getattr(gaussians, name)[sources]), name
 
 
-def test_copies_become_one_first() -> None:
+def test_copies_are_merged_first() -> None:
     gaussians = random_gaussians(300, 2)
     twice = Gaussians.concat([gaussians, gaussians])
     merged = merge_neighbors(replace(twice, opacities=np.full(600, 0.3, np.float32)), 300)
@@ -74,7 +74,7 @@ def test_scales_grow_where_opacity_cannot(opacity: float, wider: float) -> None:
 
 
 @pytest.mark.parametrize(("power", "kept"), [(1.0, [0, 1]), (0.3, [2, 3])])
-def test_powers_of_masses_decide_between_large_and_small(power: float, kept: list[int]) -> None:
+def test_power_of_masses_decides_between_large_and_small_pairs(power: float, kept: list[int]) -> None:
     """The pair of the smaller ones fits ten times worse, and has a 64th of the area."""
     sizes, places = np.array([8, 8, 1, 1], np.float32), np.array([0, 4, 1000, 1001.8], np.float32)
     means, scales = np.zeros((4, 3), np.float32), np.repeat(sizes[:, None], 3, 1)
@@ -85,7 +85,7 @@ def test_powers_of_masses_decide_between_large_and_small(power: float, kept: lis
     assert np.isin(places[kept], merged.means[:, 0]).all()
 
 
-def test_a_fifth_looks_nearly_as_all(room: Scene) -> None:
+def test_merged_fifth_of_a_scene_looks_nearly_the_same(room: Scene) -> None:
     fifth = len(room.gaussians) // 5
     merged = merge_neighbors(room.gaussians, fifth)
     chosen = np.random.default_rng(0).choice(len(room.gaussians), fifth, replace=False)
@@ -108,7 +108,7 @@ def test_order_scale_and_threads_do_not_matter(room: Scene) -> None:
     assert shown(shuffled, room) == pytest.approx(shown(expected, room), abs=0.5)
 
 
-def test_gaussians_in_one_place() -> None:
+def test_cells_without_a_finite_cost_are_merged() -> None:
     """Cells of which no cost is a number end nowhere."""
     gaussians = random_gaussians(300, 3)
     same = replace(gaussians, means=np.zeros_like(gaussians.means), scales=np.full_like(gaussians.scales, 1e-9))

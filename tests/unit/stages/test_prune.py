@@ -28,7 +28,7 @@ def peaks_of(gaussians: Gaussians, scene: Scene) -> np.ndarray:
 
 
 def change(before: Gaussians, after: Gaussians, scene: Scene) -> float:
-    """Largest root mean square over the views of the change from one scene to another."""
+    """Return the largest root mean square over the views of the change from one scene to another."""
     pictures = [render(gaussians, scene.cameras).images.clip(0, 1) for gaussians in (before, after)]
     return float(np.sqrt(((pictures[0] - pictures[1]) ** 2).mean((1, 2, 3)).max()))
 
@@ -55,7 +55,7 @@ def test_pictures_change_by_no_more_than_rounding(made: Made) -> None:
     assert change(fading, more, scene) > 4 * ROUNDING
 
 
-def test_the_clearest_of_those_left_out_come_first(made: Made) -> None:
+def test_clearest_of_the_gaussians_left_out_come_first(made: Made) -> None:
     scene, truth = made
     opacities = (truth.opacities * np.random.default_rng(3).random(len(truth)) ** 6).astype(np.float32)
     fading = Gaussians.concat([truth, replace(truth, opacities=opacities)])
@@ -67,13 +67,13 @@ def test_the_clearest_of_those_left_out_come_first(made: Made) -> None:
     assert weakest.max() < peaks_of(seen, scene).max()
 
 
-def test_what_no_picture_holds_stays(made: Made) -> None:
+def test_gaussians_outside_all_pictures_stay(made: Made) -> None:
     scene, truth = made
     behind = replace(truth[:5], means=-truth.means[:5] - np.array([0, 0, 40], np.float32))
     seen, _ = split_unseen(Gaussians.concat([truth, behind]), scene.cameras)
     assert scenes.identical(seen[-5:], behind)
 
 
-def test_nothing_is_seen_of_nothing(made: Made) -> None:
+def test_pruning_no_gaussians_gives_none(made: Made) -> None:
     seen, unseen = split_unseen(made[1][:0], made[0].cameras)
     assert len(seen) == len(unseen) == 0

@@ -1,7 +1,7 @@
+"""Regions of all views form one tree that is cut to any count."""
+
 from __future__ import annotations
 
-import itertools
-from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -9,13 +9,9 @@ import pytest
 import scenes
 from messages import refuses
 
-from gsmerge import Scene
 from gsmerge.facts.counts import CountLimits
-from gsmerge.geometry.pooling import Members, scene_members
-from gsmerge.settings.stages import DecodeOptions, SegmentOptions
+from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages import segment as module
-from gsmerge.stages.decode import decode, split_counts
-from gsmerge.stages.encode import encode
 from gsmerge.stages.segment import (
     RegionTree,
     SharedTree,
@@ -27,7 +23,7 @@ from gsmerge.stages.segment import (
     region_tree,
 )
 from gsmerge.stages.superpixels import segment
-from gsmerge.types import FeatureGaussians, Groups, PicturedScene
+from gsmerge.types import Groups, PicturedScene
 
 HEIGHT, WIDTH = 40, 60
 
@@ -37,7 +33,7 @@ def cut(images: np.ndarray, count: int) -> Groups:
 
 
 def tree_of(images: np.ndarray, depths: np.ndarray, count: int = 200, **constants: float) -> RegionTree:
-    """The tree of whole pictures, with other constants, named as those of the module."""
+    """Return the tree of whole pictures, with other constants, named as those of the module."""
     valid = np.ones(depths.shape, bool)
     with mock.patch.dict(vars(module), constants):
         return region_tree(images, depths, cut(images, count), valid)
@@ -52,7 +48,7 @@ def noise(num_views: int = 1) -> np.ndarray:
 
 
 def slanted(num_views: int = 1) -> np.ndarray:
-    """Depths of a wall that is not parallel to the image."""
+    """Return depths of a wall that is not parallel to the image."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     return np.stack([(1 / (1 + 0.01 * x - 0.008 * y)).astype(np.float32)] * num_views)
 
@@ -60,7 +56,7 @@ def slanted(num_views: int = 1) -> np.ndarray:
 # ---------------------------------------------------------------- merging regions
 
 
-def test_wall_is_cheap_and_texture_is_not() -> None:
+def test_noise_gets_nearly_all_regions_beside_a_plain_wall() -> None:
     """One view of a plain wall and one of noise: nearly all regions go to the noise."""
     images = np.concatenate([grey(), noise()])
     groups = cut_tree(tree_of(images, slanted(2), MAX_EXTENT=0.5), 200)
@@ -138,7 +134,7 @@ def test_strange_depths_do_no_harm() -> None:
     assert len(cut_tree(tree, 100)) == 100
 
 
-def test_front_depths() -> None:
+def test_front_depths_are_along_the_axis_of_the_camera() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 8, 6))
     depths = front_depths(scene)
     eyes = scene.cameras.centres.repeat(48, 0)
@@ -157,7 +153,7 @@ def test_front_depths() -> None:
         ("groups", Groups(np.ones((1, HEIGHT, WIDTH), np.int32), (1,)), ["1 superpixels", "view 0"]),
     ],
 )
-def test_arguments_that_do_not_fit(name: str, value: object, found: list[object]) -> None:
+def test_arguments_that_do_not_fit_are_refused(name: str, value: object, found: list[object]) -> None:
     good = {"images": grey(), "depths": slanted(), "groups": cut(grey(), 5), "valid": slanted() > 0}
     with refuses(ValueError, name, *found):
         region_tree(**good | {name: value})
@@ -171,7 +167,7 @@ def test_budget_below_the_number_of_views() -> None:
 # ---------------------------------------------------------------- the knee
 
 
-def test_knee_of_a_wall_and_of_a_texture() -> None:
+def test_knee_is_at_one_for_a_wall_and_far_up_for_a_texture() -> None:
     wall, texture = tree_of(grey(), slanted()), tree_of(noise(), slanted())
     assert knee(wall.counts, wall.distortions) == 1
     assert knee(texture.counts, texture.distortions) > 100
@@ -207,77 +203,6 @@ def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(floor: float, monke
     assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
 
 
-def test_knee_of_nothing() -> None:
+def test_knee_of_no_distortions_is_refused() -> None:
     with refuses(ValueError, "", "distortions", "(0,)"):
         knee(np.array([], int), np.array([]))
-
-
-# ---------------------------------------------------------------- splitting groups
-
-
-def make_scene() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18))
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return make_scene()
-
-
-@pytest.fixture(scope="module")
-def members() -> Members:
-    return scene_members(make_scene())
-
-
-@pytest.fixture(scope="module")
-def features() -> FeatureGaussians:
-    scene = make_scene()
-    return encode(scene, scene_members(scene), cut(scene.images, 12))
-
-
-def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, members: Members) -> None:
-    assert split_counts(features, members, 10_000).tolist() == [8] * 24
-    assert split_counts(features, members, 10_000, 3).tolist() == [3] * 24
-
-
-def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Members) -> None:
-    """Group 5 gets many colours, all others one each, on a plane."""
-    sh0, own = np.zeros_like(members.sh0), features.members[features.starts[5] : features.starts[6]]
-    sh0[own, 0] = np.random.default_rng(0).normal(size=(len(own), 3))
-    means = members.means.copy()
-    means[:, 2] = 0
-    counts = split_counts(features, replace(members, sh0=sh0, means=means), 6)
-    assert counts.tolist() == [7 if group == 5 else 1 for group in range(24)]
-
-
-def test_a_first_step_that_only_pays_with_the_second() -> None:
-    """Errors of 10, 9, 0: the two steps gain five each on average, so they come before a single gain of four."""
-    from gsmerge.stages.decode import hull_gains
-
-    gains = hull_gains(np.array([[10.0, 9.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, np.nan], [1.0, np.nan, np.nan]]))
-    assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
-
-
-def test_splits_out_of_range(features: FeatureGaussians, members: Members) -> None:
-    with refuses(ValueError, "extra", 0, -1):
-        split_counts(features, members, -1)
-    with refuses(ValueError, "max_children", 1, 0):
-        split_counts(features, members, 1, 0)
-
-
-def test_children_stand_in_the_order_of_their_groups(features: FeatureGaussians, members: Members) -> None:
-    counts = np.arange(24) % 3 + 1
-    children = decode(features, members, DecodeOptions(min_opacity=0), counts)
-    one = decode(features, members, DecodeOptions(min_opacity=0))
-    for group, (first, last) in enumerate(itertools.pairwise(np.append(0, np.cumsum(counts)))):
-        low, high = children.means[first:last].min(0), children.means[first:last].max(0)
-        assert (one.means[group] >= low - 1e-5).all()
-        assert (one.means[group] <= high + 1e-5).all()
-    whole = counts == 1
-    np.testing.assert_array_equal(children.means[np.repeat(whole, counts)], one.means[whole])
-
-
-@pytest.mark.parametrize("counts", [np.ones(3, int), np.zeros(24, int)])
-def test_decode_refuses_strange_counts(counts: np.ndarray, features: FeatureGaussians, members: Members) -> None:
-    with refuses(ValueError, "counts", 24):
-        decode(features, members, DecodeOptions(), counts)

@@ -1,4 +1,4 @@
-"""How many superpixels a scene gets."""
+"""The plan tells how many superpixels a scene gets."""
 
 from __future__ import annotations
 

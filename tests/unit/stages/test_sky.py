@@ -1,4 +1,4 @@
-"""Gaussians of sky: found where photos show one, and nowhere else."""
+"""Gaussians of sky are found where photos show one, and nowhere else."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ def test_sky_is_found(top: np.ndarray, bottom: np.ndarray, depth: float) -> None
 
 
 @pytest.mark.parametrize(("top", "bottom"), [(CEILING, CEILING), (OVERCAST, OVERCAST), (HAZE, ZENITH)])
-def test_ceilings_and_walls_are_not(top: np.ndarray, bottom: np.ndarray) -> None:
+def test_ceilings_and_walls_are_not_found_as_sky(top: np.ndarray, bottom: np.ndarray) -> None:
     """Warm white, cold white as near as the rest, and blue that grows paler upwards."""
     scene, _ = painted(top, bottom)
     assert not sky(scene.gaussians, scene.cameras, scene.images).any()
 
 
-def test_one_view_may_be_mistaken() -> None:
+def test_sky_in_one_photo_alone_is_not_believed() -> None:
     scene, _ = painted(ZENITH, HAZE)
     indoors = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT)).images
     photos = np.concatenate([scene.images[:1], indoors[1:]])
     assert not sky(scene.gaussians, scene.cameras, photos).any()
 
 
-def test_a_region_begins_above() -> None:
+def test_region_of_sky_begins_at_the_upper_edge() -> None:
     photo = np.full((HEIGHT, WIDTH, 3), (0.4, 0.3, 0.2), np.float32)
     photo[:20] = ZENITH
     photo[40:60] = ZENITH
@@ -53,7 +53,7 @@ def test_a_region_begins_above() -> None:
     assert not sky_region((ZENITH + noise).clip(0, 1)).any()  # as leaves in blue light
 
 
-def test_compact_leaves_it_out_and_counts_it() -> None:
+def test_compact_leaves_out_and_counts_the_sky() -> None:
     scene, _ = painted(ZENITH, HAZE, 4.0)
     whole, without = compact(scene, **QUICK), compact(scene, **QUICK, drop="sky")
     count = without.report.choices["clean"]["sky"]
@@ -66,14 +66,14 @@ def test_compact_leaves_it_out_and_counts_it() -> None:
     assert shown[:, HORIZON + 4 :].mean() > 0.9
 
 
-def test_indoors_nothing_changes() -> None:
+def test_leaving_out_sky_changes_nothing_indoors() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
     whole, same = compact(scene, **QUICK), compact(scene, **QUICK, drop="sky")
     np.testing.assert_array_equal(whole.gaussians.means, same.gaussians.means)
     assert same.report.choices["clean"] == {"sky": 0}
 
 
-def test_views_that_show_it_are_counted() -> None:
+def test_views_that_show_sky_are_found() -> None:
     """For ``inspect``."""
     indoors = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
     for scene, views in ((painted(ZENITH, HAZE)[0], [0, 1, 2, 3]), (indoors, [])):

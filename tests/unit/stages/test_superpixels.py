@@ -1,3 +1,5 @@
+"""Superpixels follow colours, and their number is exact."""
+
 from __future__ import annotations
 
 from typing import Any
@@ -33,7 +35,7 @@ def test_detail_gets_the_superpixels(segmentation: str) -> None:
     assert len(np.unique(labels[:, 34:])) > 2 * len(np.unique(labels[:, :30])), segmentation
 
 
-def test_bytes_and_floats_are_the_same_picture() -> None:
+def test_superpixels_of_bytes_and_of_floats_are_the_same() -> None:
     image = (random_image(20, 30) * 255).astype(np.uint8)
     expected = superpixels(image, 40)
     assert np.array_equal(superpixels(image / 255.0, 40), expected)
@@ -57,7 +59,7 @@ def test_tensors_give_tensors(segmentation: str, torch: Any) -> None:
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)
-def test_count_is_checked(segmentation: str) -> None:
+def test_count_out_of_range_is_refused(segmentation: str) -> None:
     image = random_image(4, 5)
     with refuses(ValueError, "count", 20, 21):
         superpixels(image, 21, segmentation)
@@ -73,16 +75,19 @@ def test_count_is_checked(segmentation: str) -> None:
         (np.full((4, 4, 3), np.inf), "inf"), (np.zeros((4, 4, 3), np.int64), "int64"),
     ],
 )  # fmt: skip
-def test_image_is_checked(image: np.ndarray, found: object) -> None:
+def test_image_of_a_wrong_shape_or_type_is_refused(image: np.ndarray, found: object) -> None:
     for use in (lambda: superpixels(image, 2), lambda: saliency(image)):
         with refuses(ValueError, "image", found):
             use()
 
 
-def test_counts_of_options() -> None:
+def test_count_follows_a_number_or_a_share_of_pixels() -> None:
     assert count_for(SegmentOptions(superpixels=7), 100, 100) == 7
     assert count_for(SegmentOptions(superpixels="5%"), 20, 30) == 30
     assert count_for(SegmentOptions(superpixels="0.1%"), 5, 5) == 1
+
+
+def test_number_or_share_of_no_superpixels_is_refused() -> None:
     with refuses(ValueError, "superpixels", 1, 0):
         SegmentOptions(superpixels=0)
     with refuses(ValueError, "superpixels", "4.4%", "'0%'"):

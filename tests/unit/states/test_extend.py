@@ -1,4 +1,4 @@
-"""Batches whose results, cameras and pictures are kept, and compact scenes of all of them."""
+"""States keep results, cameras and pictures of batches, and give compact scenes of all of them."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ SHAPES = {"room": scenes.room, "wall": scenes.wall, "planes": scenes.two_planes}
 
 @pytest.fixture(scope="module")
 def room() -> Scene:
-    """Six views of 48 x 36."""
+    """Return six views of 48 x 36."""
     return scenes.make_scene(scenes.room(), scenes.arc(6, 48, 36), noise=0.005)
 
 
 def parts_of(scene: Scene, size: int) -> list[Scene]:
-    """The views in batches, under their own names."""
+    """Return the views in batches, under their own names."""
     batches = [list(range(first, min(first + size, len(scene)))) for first in range(0, len(scene), size)]
     return [
         replace(scenes.take_views(scene, views), names=tuple(scene.names[view] for view in views)) for views in batches
@@ -51,7 +51,7 @@ def scene_of(compactor: Compactor) -> Scene:
     return scene
 
 
-def test_gaussians_cameras_and_photos_add_up(room: Scene) -> None:
+def test_batch_adds_its_gaussians_cameras_and_photos(room: Scene) -> None:
     first, second = parts_of(room, 3)
     compactor = fed(first)
     one = scene_of(compactor)
@@ -67,7 +67,7 @@ def test_gaussians_cameras_and_photos_add_up(room: Scene) -> None:
     assert not both.has_own_pixels
 
 
-def test_a_name_that_is_taken_gets_a_number(room: Scene) -> None:
+def test_name_of_a_view_that_is_taken_gets_a_number(room: Scene) -> None:
     again = replace(scenes.take_views(room, range(3, 6)), names=room.names[:3])
     names = scene_of(fed(scenes.take_views(room, range(3)), again, again)).names
     assert len(set(names)) == len(names) == 9
@@ -85,7 +85,9 @@ def test_views_have_the_size_of_the_first_batch(room: Scene) -> None:
 
 
 @pytest.mark.parametrize(("photos", "pictures"), [(True, PHOTOS), (False, ROW_COLORS)])
-def test_what_stands_in_for_photos_is_kept_and_said(photos: bool, pictures: str, room: Scene, tmp_path: Path) -> None:
+def test_state_keeps_and_names_what_stands_in_for_photos(
+    photos: bool, pictures: str, room: Scene, tmp_path: Path
+) -> None:
     compactor = fed(room if photos else replace(room, images=None))
     compactor.save(tmp_path / "room.gsm")
     load = load_scene(tmp_path / "room.gsm")
@@ -95,7 +97,7 @@ def test_what_stands_in_for_photos_is_kept_and_said(photos: bool, pictures: str,
     assert any(pictures in note for note in load.notes) is not photos
 
 
-def test_gaussians_without_pixels_and_photos_keep_renders(room: Scene) -> None:
+def test_batch_without_pixels_and_photos_keeps_renders(room: Scene) -> None:
     rows = Scene(room.gaussians[::2], room.cameras, None, None, room.names)
     compactor = fed(rows)
     assert compactor.batches[0]["pictures"] == RENDERS
@@ -154,13 +156,13 @@ def test_a_batch_without_cameras_adds_gaussians_alone(room: Scene) -> None:
     assert len(only.compact(budget=100).gaussians) == 100
 
 
-def test_harmonics_of_several_degrees(room: Scene) -> None:
+def test_state_has_the_highest_degree_of_its_batches(room: Scene) -> None:
     rich = scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18), degree=1)
     for batches in ((room, rich), (rich, room)):
         assert scene_of(fed(*batches)).gaussians.sh_degree == 1
 
 
-def test_few_pictures_are_kept(room: Scene) -> None:
+def test_state_keeps_no_more_pictures_than_asked(room: Scene) -> None:
     compactor = fed(*parts_of(room, 2), max_views=3)
     assert [batch["num_kept"] for batch in compactor.batches] == [2, 3, 3]
     assert len(scene_of(compactor)) == 3
@@ -198,7 +200,7 @@ def test_a_state_comes_back_from_its_file(room: Scene, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 2, 3])
-def test_batches_of_any_size(size: int) -> None:
+def test_views_in_batches_of_any_size_are_nearly_as_good_as_at_once(size: int) -> None:
     """For as many Gaussians no more than 0.5 dB below all views at once, on average over scenes of six views.
 
     Over three seeds, too: of the wall with its 40 dB they differ by 6. Of what late splits gain, all views at once have
@@ -215,7 +217,7 @@ def test_batches_of_any_size(size: int) -> None:
     assert np.mean(differences) > -0.5
 
 
-def test_wrong_use(room: Scene) -> None:
+def test_wrong_calls_of_a_compactor_are_refused(room: Scene) -> None:
     empty, compactor = Compactor(), fed(scenes.take_views(room, range(2)))
     for call in (empty.compact, lambda: empty.save("a.gsm")):
         with pytest.raises(ValueError, match="at least one batch"):

@@ -1,4 +1,4 @@
-"""Feature Gaussians across batches: encoded once, decoded at any K, matched and merged (paper section 4.5)."""
+"""Feature Gaussians are encoded once, decoded at any K, matched and merged across batches (paper section 4.5)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PAPER: dict[str, Any] = {"recipe": "paper", "superpixels": "10%"}
 
 
 def make_room() -> Scene:
-    """Four views of 36 x 24."""
+    """Return four views of 36 x 24."""
     return scenes.make_scene(scenes.room(), scenes.arc(4, 36, 24), noise=0.005)
 
 
@@ -91,19 +91,19 @@ def test_batches_show_the_views_as_all_at_once_do(room: Scene, whole: Compactor)
     assert psnrs[1] > psnrs[0] - 1.5
 
 
-def test_the_same_views_again_add_little(room: Scene, whole: Compactor) -> None:
+def test_same_views_again_add_few_features(room: Scene, whole: Compactor) -> None:
     twice = fed(room, room)
     assert len(whole) <= len(twice) <= 1.35 * len(whole)
 
 
-def test_views_of_another_size(room: Scene) -> None:
+def test_cameras_of_another_size_are_scaled_to_the_first_batch(room: Scene) -> None:
     small = scenes.make_scene(scenes.room(), scenes.arc(2, 24, 16), noise=0.005)
     cameras = state_of(fed(room, small)).cameras
     assert (len(cameras), cameras.width, cameras.height) == (6, 36, 24)
     np.testing.assert_allclose(cameras.Ks[4:, :2], 1.5 * small.cameras.Ks[:, :2], rtol=1e-6)
 
 
-def test_its_own_networks_go_on_without_their_file(room: Scene, tmp_path: Path) -> None:
+def test_state_goes_on_with_its_networks_without_their_file(room: Scene, tmp_path: Path) -> None:
     options = replace(SMALL, outputs="absolute")
     path = written(tmp_path / "a.safetensors", noisy(options))
     compactor = saved(fed(halves(room)[0], checkpoint=str(path)), tmp_path / "a.gsm")
@@ -122,12 +122,14 @@ def test_its_own_networks_go_on_without_their_file(room: Scene, tmp_path: Path) 
         ({"checkpoint": "shipped"}, "absolute"),
     ],
 )  # fmt: skip
-def test_settings_that_do_not_go_with_it(wish: dict[str, Any], match: str, room: Scene) -> None:
+def test_settings_that_feature_gaussians_cannot_follow_are_refused(
+    wish: dict[str, Any], match: str, room: Scene
+) -> None:
     with pytest.raises(ValueError, match=match):
         fed(room, **wish)
 
 
-def test_what_cannot_be_decoded(room: Scene, whole: Compactor) -> None:
+def test_decoding_beyond_the_paper_s_heads_is_refused(room: Scene, whole: Compactor) -> None:
     for wish, match in (({"k": 8}, "1 to 4"), ({"k": "mixed", "k_rule": "distortion"}, "saliency")):
         with pytest.raises(ValueError, match=match):
             whole.decode(**wish)

@@ -1,4 +1,4 @@
-"""What the file of a state may be read as. ``tests/damage/tensors.py`` has every kind of damage."""
+"""The file of a state is read as a scene only if it has results; ``tests/damage/tensors.py`` has every damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Arguments of public functions of the wrong type, name or range: one clear line each."""
+"""Arguments of public functions of the wrong type, name or range are refused in one clear line each."""
 
 from __future__ import annotations
 

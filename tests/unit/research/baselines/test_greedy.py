@@ -1,4 +1,4 @@
-"""Pairwise merging against loops over all pairs."""
+"""Pairwise merging matches loops over all pairs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsmerge.research.baselines import greedy
 
 
 def slow_area(covar: np.ndarray) -> float:
-    """Knud Thomsen's formula."""
+    """Return an area by Knud Thomsen's formula."""
     a, b, c = np.sqrt(np.linalg.eigvalsh(covar))
     p = 1.6075
     return float(4 * np.pi * (((a * b) ** p + (a * c) ** p + (b * c) ** p) / 3) ** (1 / p))
@@ -40,7 +40,7 @@ class Blob:
 
 
 def slow_greedy(gaussians: Gaussians, count: int) -> list[Blob]:
-    """Round after round, pair after pair."""
+    """Merge round after round, pair after pair."""
     covars = covariances(gaussians.quats.astype(np.float64), gaussians.scales.astype(np.float64))
     sh = np.concatenate([gaussians.sh0, gaussians.shN], 1).astype(np.float64).reshape(len(gaussians), -1)
     rows = zip(gaussians.means.astype(np.float64), covars, gaussians.opacities.astype(np.float64), sh, strict=True)
@@ -63,7 +63,7 @@ def slow_greedy(gaussians: Gaussians, count: int) -> list[Blob]:
 
 @pytest.mark.parametrize("count", [1, 5, 20, 41, 59, 60])
 @pytest.mark.parametrize("degree", [0, 1])
-def test_the_same_as_the_slow_twin(count: int, degree: int) -> None:
+def test_greedy_merging_matches_a_slow_twin(count: int, degree: int) -> None:
     gaussians = some(60, seed=count, degree=degree)
     merged, slow = greedy.merge_greedily(gaussians, count), slow_greedy(gaussians, count)
     means = np.stack([blob.mean for blob in slow])
@@ -93,7 +93,7 @@ def slow_matching(left: np.ndarray, right: np.ndarray, costs: np.ndarray, limit:
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("limit", [1, 7, 1000])
 @pytest.mark.parametrize("equal", [False, True])
-def test_disjoint_pairs_are_those_taken_one_by_one(seed: int, limit: int, equal: bool) -> None:
+def test_matched_pairs_are_those_taken_one_by_one(seed: int, limit: int, equal: bool) -> None:
     """Equal costs too."""
     rng = np.random.default_rng(seed)
     left = rng.integers(0, 100, 400)
@@ -104,7 +104,7 @@ def test_disjoint_pairs_are_those_taken_one_by_one(seed: int, limit: int, equal:
 
 
 @pytest.mark.parametrize("count", [1, 3, 30])
-def test_hostile_sets(count: int) -> None:
+def test_coincident_flat_transparent_gaussians_merge_to_finite_ones(count: int) -> None:
     """All in one place, flat, of no opacity."""
     gaussians = some(60)
     stacked = Gaussians(

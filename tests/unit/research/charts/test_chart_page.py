@@ -1,4 +1,4 @@
-"""Figures that repeat to the byte, and a page that stands alone and escapes text."""
+"""Figures repeat to the byte, and the page stands alone and escapes text."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def page_of(records: list[RunRecord], folder: Path) -> str:
     return make_chart_page(records, figures, draw_figures(figures, folder / "charts"), "gsmerge lab chart")
 
 
-def test_the_page_stands_alone_and_says_what_was_found(tmp_path: Path) -> None:
+def test_page_fetches_nothing_and_lists_the_runs(tmp_path: Path) -> None:
     """One figure; Matplotlib takes half a second for it."""
     page = page_of(make_grid(budgets=("1%", "4.4%")), tmp_path)
     actual = Outline(page)
@@ -59,7 +59,7 @@ def test_the_page_stands_alone_and_says_what_was_found(tmp_path: Path) -> None:
         assert text in page
 
 
-def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
+def test_names_from_files_are_escaped(tmp_path: Path) -> None:
     records = [make_record("fern", "input"), make_record("fern", "gsmerge")]
     records = [replace(r, scene=EVIL, settings={EVIL: EVIL}) for r in records]
     made = page_of([*records, replace(records[0], label=EVIL, error=EVIL)], tmp_path)
@@ -77,7 +77,7 @@ def test_the_table_has_a_row_for_each_run() -> None:
     assert rows[-1]["error"] == "'=cmd()"
 
 
-def test_figures_need_their_data() -> None:
+def test_figures_without_their_data_are_left_out() -> None:
     figures = make_figures(Results(make_grid()))
     assert [figure.name for figure in figures] == ["quality-seconds", "quality-ratio"]
     assert all("3 scenes" in figure.caption for figure in figures)
@@ -89,14 +89,14 @@ def test_figures_need_their_data() -> None:
 
 
 def figure_of(count: int, name: str = "method") -> Chart:
-    """One panel with so many lines of a point each, and the input."""
+    """Return one panel with so many lines of a point each, and the input."""
     points = [Point("1%", 0.1 * (i + 1), Interval(20 + i, 19 + i, 21 + i, 4), {}) for i in range(count)]
     lines = tuple(Line(f"{name} {i}", i == 0, (point,)) for i, point in enumerate(points))
     return Chart("quality", "", "", "Seconds", (), (), (Panel("PSNR", True, lines, 22.0),))
 
 
 @pytest.mark.parametrize("count", [1, 25])
-def test_the_key_names_every_line_and_fits(count: int) -> None:
+def test_key_names_every_line_within_the_figure(count: int) -> None:
     figure = figure_of(count)
     names = [line.name for line in figure.panels[0].lines]
     styles = line_styles((name, False) for name in names)

@@ -1,4 +1,4 @@
-"""The grid: products, the scenes that it is run on, and records that come back whatever is beside them."""
+"""The grid multiplies lists, finds its scenes, and reads its records back whatever is beside them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsmerge.research.charts.grid import find_sources, list_settings, make_runs,
 from gsmerge.research.charts.measure_run import RUNS, ChartScene, hold_out, read_runs
 
 
-def test_lists_are_multiplied_and_sizes_stand_next_to_each_other() -> None:
+def test_grid_multiplies_lists_other_than_sizes() -> None:
     assert list_settings({}, {}) == [("input", {}), ("gsmerge", {})]
     made = list_settings(parse_grid(["k=1,2", "budget=0.5%, 2%,4000", "superpixels=1%"]), {"robust": False})
     assert len(made) == 1 + 2 * 4
@@ -40,19 +40,19 @@ def test_baselines_run_once_for_the_settings_that_they_use() -> None:
 
 
 @pytest.mark.parametrize("pairs", [["kk=1"], ["k=1", "k=2"], ["k"], ["k= , "]])
-def test_lists_that_cannot_be(pairs: list[str]) -> None:
+def test_malformed_lists_of_a_grid_are_refused(pairs: list[str]) -> None:
     with refuses(UsageError, f"--grid {pairs[-1]}", "NAME=A,B"):
         parse_grid(pairs)
 
 
-def test_wrong_values_and_missing_programs_are_told_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_values_and_missing_programs_are_refused_before_the_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", "/nowhere/splat-transform")
     for pair, *named in (("k=9", "1 to 8"), ("method=nothing", "nothing"), ("method=splat-transform", "/nowhere")):
         with refuses(UsageError, "", *named):
             make_runs([], parse_grid([pair]), {}, EvaluateOptions(()))
 
 
-def test_names_are_as_short_as_can_be() -> None:
+def test_scene_names_are_as_short_as_they_can_differ() -> None:
     assert scene_names([Path("a/room"), Path("b/fern.ply")]) == ["room", "fern"]
     assert scene_names([Path("a/scene.ply"), Path("b/scene.ply")]) == ["a/scene", "b/scene"]
     assert scene_names([]) == []
@@ -89,7 +89,7 @@ def test_keys_depend_on_what_changes_measurements(name: str, counts: bool, scene
     assert (key() != before) is bool(counts)
 
 
-def test_records_come_back_and_the_newest_counts(tmp_path: Path) -> None:
+def test_newest_whole_record_of_each_run_is_read_back(tmp_path: Path) -> None:
     fern, fox = make_record("fern", "gsmerge", {"k": 2}), make_record("fox", "greedy")
     again = replace(fern, seconds=1.5, notes=("odd \u2028 line\n",))
     for value in (asdict(fern), {"scene": "fern"}, asdict(fox), asdict(again) | {"views": 3}, asdict(again)):

@@ -1,4 +1,4 @@
-"""Which runs make a line, what it is called, its means, and statistics against known values and slow twins."""
+"""Runs make named lines of means, with statistics that match known values and slow twins."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsmerge.research.charts.lines import Results, line_key, line_names, mean_in
 PSNR = "psnr_target_visible"
 
 
-def test_lines_are_methods_with_their_settings() -> None:
+def test_each_method_with_its_settings_is_a_line() -> None:
     lines = Results(make_grid()).by_size("percent", PSNR)
     assert [line.name for line in lines] == ["gsmerge", "gsmerge, fit none", "greedy", "random"]
     assert [line.is_own for line in lines] == [True, True, False, False]
@@ -27,7 +27,7 @@ def test_lines_are_methods_with_their_settings() -> None:
     assert point.y.high - point.y.low < 0.2  # the scenes' own level, 5 dB apart, is taken off
 
 
-def test_names_tell_only_what_differs() -> None:
+def test_names_of_lines_tell_only_the_settings_that_differ() -> None:
     settings = [{"k": 2, "effort": "fast"}, {"k": 2, "effort": "best", "segmentation": "slic"}]
     keys = [line_key(make_record("fern", "gsmerge", one)) for one in settings]
     names = ["gsmerge, effort fast", "gsmerge, effort best, segmentation slic"]
@@ -49,7 +49,7 @@ def test_means_are_over_the_same_scenes() -> None:
     assert {len(p.by_scene) for line in lines for p in line.points} == {3}
 
 
-def test_parts_and_metrics() -> None:
+def test_results_choose_the_views_and_metrics_that_most_runs_have() -> None:
     records = make_grid()
     assert (Results(records).part, Results(records).caveat) == ("target_visible", "")
     assert Results(records).metrics == ["psnr", "ssim", "lpips_vgg"]
@@ -60,24 +60,33 @@ def test_parts_and_metrics() -> None:
     assert Results([]).part == "context"
 
 
-def test_the_input_is_a_level() -> None:
+def test_level_of_the_input_is_its_mean_over_the_scenes() -> None:
     assert Results(make_grid()).input_mean(PSNR, SCENES) == pytest.approx(18 + (2 + 0 - 3) / 3 + 0.01)
     assert Results(make_grid()).input_mean(PSNR, ["unknown"]) is None
 
 
 @pytest.mark.parametrize(("count", "factor"), [(2, 12.706), (3, 4.303), (5, 2.776), (11, 2.228), (31, 2.042)])
-def test_t_factors_are_those_of_the_tables(count: int, factor: float) -> None:
+def test_confidence_interval_has_the_t_factors_of_the_tables(count: int, factor: float) -> None:
     values = [0.0, 1.0] + [0.5] * (count - 2)
     half = mean_interval(values).high - 0.5
     assert half * math.sqrt(count) / np.std(values, ddof=1) == pytest.approx(factor, abs=5e-4)
 
 
-def test_one_value_has_a_mean_and_no_width() -> None:
+def test_confidence_interval_of_one_value_has_no_width() -> None:
     actual = mean_interval([21.5])
     assert (actual.mean, actual.low, actual.high, actual.count) == (21.5, 21.5, 21.5, 1)
+
+
+def test_confidence_interval_of_no_values_is_refused() -> None:
     with refuses(ValueError, "", "value", "none"):
         mean_interval([])
+
+
+def test_paired_intervals_of_one_scene_have_no_width() -> None:
     assert [(i.low, i.high) for i in paired_intervals(np.array([[1.0, 2.0]]))] == [(1, 1), (2, 2)]
+
+
+def test_paired_interval_of_one_line_is_its_confidence_interval() -> None:
     assert paired_intervals(np.array([[1.0], [3.0]])) == [mean_interval([1.0, 3.0])]
 
 

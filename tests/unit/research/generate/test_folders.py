@@ -1,4 +1,4 @@
-"""Made scenes as folders: the same for the same seed, read back aligned, kept when they are there."""
+"""Made scenes are folders, the same for the same seed, read back aligned, and kept when they are there."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def folder() -> Path:
 
 @pytest.fixture
 def first(tmp_path: Path) -> Path:
-    """A folder with the first scene alone, which a test may change."""
+    """Return a folder with the first scene alone, which a test may change."""
     shutil.copytree(make_two() / "scene_0000", tmp_path / "scene_0000")
     return tmp_path
 
 
 @pytest.mark.slow
-def test_the_folders_are_complete(folder: Path) -> None:
+def test_made_folders_have_all_files(folder: Path) -> None:
     views = {f"{sub}images/view_00{i}.png" for sub, n in (("", 3), ("targets/", 2)) for i in range(n)}
     files = {"scene.ply", "transforms.json", "targets/transforms.json", "generated.json"} | views
     for index in range(NUM_SCENES):
@@ -70,7 +70,7 @@ def test_scenes_are_read_back_aligned(folder: Path, index: int) -> None:
         assert depths[view, own].min() > 0
 
 
-def test_targets_look_at_the_same_scene(folder: Path) -> None:
+def test_held_out_photos_show_the_same_scene(folder: Path) -> None:
     """Renders of the Gaussians are nearer to the held-out photos than those photos are to one another's places."""
     better = []
     for index in range(NUM_SCENES):
@@ -84,7 +84,7 @@ def test_targets_look_at_the_same_scene(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_there_is_kept_and_the_rest_added(folder: Path, first: Path) -> None:
+def test_generate_keeps_scenes_that_are_there_and_adds_the_rest(folder: Path, first: Path) -> None:
     """The same bytes on one thread as on two."""
     before = (first / "scene_0000" / "scene.ply").stat().st_mtime_ns
     calls: list[tuple[int, int]] = []
@@ -95,11 +95,14 @@ def test_what_is_there_is_kept_and_the_rest_added(folder: Path, first: Path) -> 
     assert contents(first / "scene_0001") == contents(folder / "scene_0001")
 
 
-def test_other_scenes_and_strangers_are_not_replaced(first: Path) -> None:
+def test_scene_of_another_seed_is_not_replaced(first: Path) -> None:
     before = contents(first)
     with refuses(UsageError, "scene_0000", "remove it"):
         generate(first, 1, TINY, seed=6)
     assert contents(first) == before
+
+
+def test_folder_of_other_files_is_not_replaced(first: Path) -> None:
     stranger = first / "scene_0001"
     stranger.mkdir()
     (stranger / "thesis.txt").write_text("years of work")
@@ -114,7 +117,7 @@ def test_a_damaged_record_is_no_scene(first: Path) -> None:
         generate(first, 1, TINY)
 
 
-def test_what_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_scene_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -125,6 +128,6 @@ def test_what_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(("count", "seed"), [(0, 0), (1, -1)])
-def test_counts_and_seeds_are_checked(count: int, seed: int, tmp_path: Path) -> None:
+def test_count_or_seed_out_of_range_is_refused(count: int, seed: int, tmp_path: Path) -> None:
     with refuses(ValueError, "", "1 scene", "seed"):
         generate(tmp_path, count, TINY, seed=seed)

@@ -1,4 +1,4 @@
-"""The noise model: nothing drawn changes nothing, and what is drawn is found again in the Gaussians."""
+"""The noise model changes nothing where nothing is drawn, and what is drawn is found in the Gaussians."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CLEAN = replace(
 
 
 def seen(step: float = 0.0) -> TrueView:
-    """A slanted wall with detail; its right half is nearer by ``step``."""
+    """Return a slanted wall with detail; its right half is nearer by ``step``."""
     rng = np.random.default_rng(0)
     x = np.broadcast_to(np.arange(W), (H, W))
     depth = 1 / (0.3 + 0.001 * x) * np.where(x < W // 2, 1, 1 - step)
@@ -49,7 +49,7 @@ def made(noise: Noise, given: TrueView | None = None, seed: int = 0) -> Gaussian
 
 
 def seen_again(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions and depths of means."""
+    """Return pixel positions and depths of means."""
     cameras = Cameras(np.linalg.inv(POSE)[None], LENS.intrinsics[None], W, H)
     pixels, depths = project(gaussians.means, cameras)
     return pixels[0], depths[0].reshape(H, W)
@@ -66,7 +66,7 @@ def test_without_noise_every_gaussian_is_where_its_pixel_looks() -> None:
     np.testing.assert_allclose(colors, seen().image.reshape(-1, 3), atol=1e-6)
 
 
-def test_thin_axes_are_the_normals() -> None:
+def test_thin_axes_of_gaussians_are_normals_of_the_surface() -> None:
     turns = quat_to_rotmat(made(replace(CLEAN, flatness=0.2)).quats)
     np.testing.assert_allclose(np.abs(turns[:, :, 2] @ POSE[:3, 2]), 1, atol=1e-5)
     normals = np.random.default_rng(0).normal(size=(50, 3))
@@ -90,7 +90,7 @@ def test_grain_and_drift_have_their_strengths() -> None:
     assert np.abs(np.diff(drift, axis=1)).mean() < 0.15 * drift.std()
 
 
-def test_edges_bleed_and_are_not_trusted() -> None:
+def test_depths_bleed_across_edges_with_low_confidence() -> None:
     given = seen(step=0.4)
     depth, confidence = predict_depth(given, replace(CLEAN, bleed=1.0, bleed_width=1.5), np.random.default_rng(0))
     off = np.abs(log(depth / given.depth))
@@ -119,7 +119,7 @@ def test_the_sky_is_as_far_as_the_network_can_say() -> None:
     assert np.isfinite(actual).all()
 
 
-def test_shares_are_met() -> None:
+def test_floaters_oversized_gaussians_and_patches_have_their_shares() -> None:
     noise = replace(CLEAN, floaters=0.1, oversized=0.1, oversize=8.0)
     gaussians = made(noise)
     ratio = seen_again(gaussians)[1] / seen().depth
@@ -141,7 +141,7 @@ def test_harmonics_show_the_photo_to_their_own_camera(degree: int) -> None:
     np.testing.assert_allclose(actual, seen().image.reshape(-1, 3), atol=1e-4)
 
 
-def test_what_is_drawn_lies_in_the_ranges() -> None:
+def test_drawn_noise_lies_in_its_ranges() -> None:
     options = NoiseOptions()
     drawn = [draw_noise(options, np.random.default_rng(s)) for s in range(200)]
     for f in fields(Noise):

@@ -1,4 +1,4 @@
-"""Photos and depth of rooms whose geometry is known by hand."""
+"""Photos and depths are those of rooms whose geometry is known by hand."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WHITE = np.ones((32, 32, 3), np.float32)
 DOWN = Light(np.array([0.0, -1.0, 0.0]), np.array([0.0, -5.0, 0.0]), np.ones(3), 0.2 * np.ones(3), 0.01)
 
 
-def test_no_rectangle_cuts_off_what_is_seen() -> None:
+def test_screen_box_of_a_shape_holds_all_its_pixels() -> None:
     """Near, far, beside and around the camera."""
     rng = np.random.default_rng(2)
     shapes = [box(p - 0.3, p + 0.3, LOOK) for p in rng.uniform(-2, 2, (20, 3))]
@@ -69,7 +69,7 @@ def test_exposure_meets_the_brightness() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_textures_repeat_and_are_not_flat(kind: str) -> None:
+def test_textures_of_a_seed_are_equal_and_not_flat(kind: str) -> None:
     picture = KINDS[kind](np.random.default_rng(5), 128)
     again = KINDS[kind](np.random.default_rng(5), 128)
     np.testing.assert_array_equal(picture, again)

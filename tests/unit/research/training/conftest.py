@@ -1,4 +1,4 @@
-"""What the tests of training share."""
+"""Tests of training share this fixture."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ from gsmerge.runtime.threads import use_threads
 
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
-    """As in a run: torch's own threads cost more than these sizes take."""
+    """Use one thread, as in a run: torch's own cost more than these sizes take."""
     with use_threads(1):
         yield

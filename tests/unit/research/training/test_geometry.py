@@ -60,7 +60,7 @@ def scene() -> Made:
 
 
 def pairs(features: FeatureGaussians) -> Matches:
-    """The rows of the first view with those of the second; the others alone."""
+    """Match the rows of the first view with those of the second; leave the others alone."""
     clusters = np.arange(len(features))
     second = np.flatnonzero(features.views == 1)
     clusters[second] = np.flatnonzero(features.views == 0)[: len(second)]
@@ -74,7 +74,7 @@ def contexts(scene: Made, networks: Networks) -> tuple[NetworkContext, TrainingC
 
 
 @pytest.mark.parametrize("start", ["pooled", "first"])
-def test_every_stage_has_the_values_of_its_kernels(scene: Made, start: str) -> None:
+def test_tensors_of_every_stage_are_those_of_its_kernels(scene: Made, start: str) -> None:
     networks = noisy_networks(replace(SMALL, merger_start=start))
     plain, training = contexts(scene, networks)
     _, order, cuts = cluster_runs(pairs(scene.features))
@@ -133,7 +133,7 @@ def tiny_example() -> Example:
 
 @pytest.fixture
 def fixed_choices(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Clusters, neighbours, and what other views say of a group, stay: they jump, and have no gradient."""
+    """Hold clusters, neighbours, and what other views say of a group: they jump, and have no gradient."""
     example = tiny_example()
     matches = match(example.features, PAPER.match_options())
     assert matches.count < len(example.features)
@@ -152,7 +152,7 @@ def fixed_choices(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def measure(crop: Crop, networks: Networks) -> torch.Tensor:
-    """A smooth number that depends on every column of the children."""
+    """Return a smooth number that depends on every column of the children."""
     prediction = predict(crop, networks, PAPER, 0)
     g, generator = prediction.gaussians, torch.Generator().manual_seed(3)
     half = quat_to_rotmat(g.quats) * (g.scales / SIZE_OF_ROOM)[:, None]

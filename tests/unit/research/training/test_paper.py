@@ -1,4 +1,4 @@
-"""What ``--preset paper`` trains with: random views, clusters, the teacher, absolute heads."""
+"""``--preset paper`` trains with random views, clusters, the teacher and absolute heads."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_photos_have_the_longer_side_that_is_asked_for() -> None:
     assert make_example(training, replace(PAPER, photo_side=476), 0.1, "room").images.shape == (2, 36, 48, 3)
 
 
-def test_every_window_has_views_of_its_own(example: Example) -> None:
+def test_every_window_draws_its_own_views(example: Example) -> None:
     rng = np.random.default_rng(0)
     drawn = [draw_random_views(example, PAPER, rng) for _ in range(80)]
     counts = Counter(len(part.cameras) for part in drawn)
@@ -56,7 +56,7 @@ def test_every_window_has_views_of_its_own(example: Example) -> None:
     assert {len(draw_random_views(example, few, rng).cameras) for _ in range(20)} == {2, 3}
 
 
-def test_some_views_of_an_example_are_an_example_of_some_views(example: Example) -> None:
+def test_views_taken_from_an_example_are_an_example_of_those_views(example: Example) -> None:
     """As if it had been made of them, apart from the frame."""
     part = select_example_views(example, [1, 3])
     pixels = 32 * 24
@@ -103,7 +103,7 @@ def test_every_network_gets_a_gradient(example: Example) -> None:
 
 
 def teacher_of(example: Example) -> Prediction:
-    """The Gaussians of the paper's two equations, by hand, for a whole example."""
+    """Return the Gaussians of the paper's two equations, by hand, for a whole example."""
     m, merged = example.members, merge(example.features, match(example.features, PAPER.match_options()))
     means, covars, colors = [], [], []
     for first, last in zip(merged.starts[:-1].tolist(), merged.starts[1:].tolist(), strict=True):
@@ -149,7 +149,7 @@ def test_the_teacher_is_the_paper_s_two_equations(example: Example) -> None:
 
 
 def turn(quats: torch.Tensor, angle: float) -> torch.Tensor:
-    """Rotated about the first axis of the world."""
+    """Return rotations turned about the first axis of the world."""
     w, x, y, z = quats.unbind(1)
     c, s = elementary.cos(angle / 2), elementary.sin(angle / 2)
     return torch.stack([c * w - s * x, c * x + s * w, c * y - s * z, c * z + s * y], 1)

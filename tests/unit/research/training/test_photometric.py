@@ -1,3 +1,5 @@
+"""Training on photos sees the views, windows and losses that it should."""
+
 from __future__ import annotations
 
 import csv
@@ -60,13 +62,13 @@ def windows(example: Example, count: int, options: TrainOptions = PHOTO, novel: 
     return [sample_window(example, options.levels, options.window, options.most, novel, rng) for _ in range(count)]
 
 
-def test_subsets_of_views() -> None:
+def test_view_subsets_are_spread_over_the_scene() -> None:
     assert view_subsets(12, (3, 6, 0)) == [[0, 6, 11], [0, 2, 4, 7, 9, 11], list(range(12))]
     assert view_subsets(3, (3, 6, 0)) == [[0, 1, 2]]
     assert view_subsets(4, (9,)) == [[0, 1, 2, 3]]
 
 
-def test_photos_of_the_views_come_first_and_all_look_at_one_world(example: Example) -> None:
+def test_photos_of_the_input_views_come_first_in_one_world(example: Example) -> None:
     full = make_training_scene(scene(), [0, 3])
     photos = full.photos()
     images = scene().images
@@ -107,12 +109,12 @@ def test_masks_leave_out_what_the_views_have_not_seen() -> None:
     assert not masks[3].any()
 
 
-def test_views_cover_together_what_half_covers() -> None:
+def test_pixel_is_covered_where_views_cover_half_together() -> None:
     covers = np.array([[[255, 127, 80, 0]], [[0, 0, 80, 128]]], np.uint8)
     np.testing.assert_array_equal(covered_pixels(covers), [[True, False, True, True]])
 
 
-def test_windows_lie_in_the_photo_and_hold_what_can_be_seen(example: Example) -> None:
+def test_windows_lie_in_the_photo_and_hold_all_that_shows_there(example: Example) -> None:
     for window in windows(example, 12):
         box = window.box
         assert 0 <= box.left <= box.left + box.width <= WIDTH // 2
@@ -148,14 +150,14 @@ def test_a_window_with_too_much_in_it_is_halved(example: Example) -> None:
 
 
 def uniform_ssim(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """``[h,w]`` scores of uniform windows of 7 x 7 pixels, zero beyond the border."""
+    """Return ``[h,w]`` scores of uniform windows of 7 x 7 pixels, zero beyond the border."""
     x, y = image.astype(np.float64), photo.astype(np.float64)
     ux, uy, xx, yy, xy = (uniform_filter(a, (7, 7, 0), mode="constant") for a in (x, y, x * x, y * y, x * y))
     above = (2 * ux * uy + 1e-4) * (2 * (xy - ux * uy) + 9e-4)
     return (above / ((ux**2 + uy**2 + 1e-4) * (xx - ux**2 + yy - uy**2 + 9e-4))).mean(-1)
 
 
-def test_losses_by_hand() -> None:
+def test_losses_match_their_formulas() -> None:
     rng = np.random.default_rng(0)
     photo, mask = rng.random((20, 24, 3), dtype=np.float32), rng.random((20, 24)) < 0.7
     image = np.clip(photo + rng.normal(0, 0.1, photo.shape), 0, 1).astype(np.float32)
@@ -236,7 +238,7 @@ def test_untrained_networks_render_what_the_analytic_stages_do(example: Example)
 
 @pytest.mark.parametrize("network", [TINY, PAPER.network], ids=["ours", "paper"])
 @pytest.mark.parametrize("k", [1, 2])
-def test_what_is_rendered_is_what_the_stages_make(example: Example, network: NetworkOptions, k: int) -> None:
+def test_rendered_windows_are_what_the_stages_make(example: Example, network: NetworkOptions, k: int) -> None:
     networks = noisy_networks(network)
     learned = NetworkContext(networks, example.members, example.cameras, 0)
     encoded = learned.encode(example.features)
@@ -321,7 +323,7 @@ def test_renders_change_colours_as_photos_do(example: Example) -> None:
 
 
 @pytest.mark.slow
-def test_training_on_renders_makes_them_better(example: Example, tmp_path: Path) -> None:
+def test_training_raises_the_quality_of_renders(example: Example, tmp_path: Path) -> None:
     shard = written(example, tmp_path / "shards")
     done = train([shard], [shard], tmp_path, replace(PHOTO, steps=40, save_every=20, warmup=5))
     rows = list(csv.DictReader((tmp_path / "losses.csv").read_text().splitlines()))

@@ -1,4 +1,4 @@
-"""Examples in files."""
+"""Examples are kept in files."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def example() -> Example:
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two of ``gsmerge lab generate``'s. Read only."""
+    """Return two scenes of ``gsmerge lab generate``. Read only."""
     options = GenerateOptions(width=32, height=24, views=2)
     return [scene.folder for scene in generate(tmp_path_factory.mktemp("made"), 2, options, threads=1)]
 
 
 def assert_same(one: object, other: object) -> None:
-    """Two dataclasses of arrays, bit for bit."""
+    """Check that two dataclasses of arrays are equal, bit for bit."""
     for f in fields(one):
         a, b = getattr(one, f.name), getattr(other, f.name)
         if isinstance(a, np.ndarray):

@@ -1,3 +1,5 @@
+"""Training runs write, resume and refuse what they should, and presets have their values."""
+
 from __future__ import annotations
 
 import csv
@@ -34,7 +36,7 @@ def files(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_a_run_has_a_table_and_the_best_checkpoint(shard: Shard, tmp_path: Path) -> None:
+def test_run_writes_its_losses_and_the_best_checkpoint(shard: Shard, tmp_path: Path) -> None:
     """Three steps of training with a validation after each take a second."""
     options = replace(OPTIONS, steps=3, save_every=1)
     done = train([shard], [], tmp_path, options)
@@ -50,7 +52,7 @@ def test_a_run_has_a_table_and_the_best_checkpoint(shard: Shard, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_with_its_own_options_and_data_alone(shard: Shard, tmp_path: Path) -> None:
+def test_interrupted_run_refuses_other_options_or_data(shard: Shard, tmp_path: Path) -> None:
     options = replace(OPTIONS, steps=1, save_every=1)
     train([shard], [], tmp_path, options)
     with refuses(SceneError, "state.safetensors", "options", "--output"):
@@ -93,7 +95,7 @@ def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(shard
         {"window": 5}, {"photo_loss": "l2"}, {"lpips_weight": -1}, {"teacher_steps": 0}, {"buffer": 0},
         {"segmentation": "slice"}, {"overlap": 2}, {"iou": -0.1}, {"photo_side": -1}, {"random_views": (3, 2)},
 ])  # fmt: skip
-def test_settings_are_checked(wrong: dict[str, object], tmp_path: Path) -> None:
+def test_settings_out_of_range_are_refused(wrong: dict[str, object], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         replace(OPTIONS, **wrong)
 
@@ -116,7 +118,7 @@ def test_checkpoints_show_more_than_the_networks_in_training(shard: Shard, tmp_p
     assert rows == (tmp_path / "0.0" / "losses.csv").read_text()
 
 
-def test_the_paper_s_preset() -> None:
+def test_paper_preset_has_the_paper_s_values() -> None:
     paper = preset_options("paper")
     assert (paper.photo_loss, paper.photo_weight, paper.ssim_weight, paper.lpips_weight) == ("mse", 1, 0.05, 0.05)
     assert (paper.teacher_weight, paper.diversity_weight, paper.steps) == (0.25, 1, 300_000)
@@ -128,14 +130,14 @@ def test_the_paper_s_preset() -> None:
     assert paper.photo_level(320, 240) == 1
 
 
-def test_the_preset_of_the_shipped_networks() -> None:
+def test_preset_of_the_shipped_networks_has_their_values() -> None:
     shipped = preset_options("shipped")
     assert [shipped.lpips_weight_at(step) for step in (0, 2079, 2080, 2599)] == [0, 0, 0.06, 0.06]
     assert not shipped.network.encoder
     assert Bounds(color=0) == shipped.network.bounds
 
 
-def test_the_default_preset_changes_nothing() -> None:
+def test_default_preset_changes_no_option() -> None:
     assert preset_options("default") == TrainOptions()
 
 
@@ -144,7 +146,7 @@ def test_unknown_presets_are_refused() -> None:
         preset_options("papers")
 
 
-def test_what_holds_the_gaussians_fades() -> None:
+def test_regularizer_weights_fade_with_the_steps() -> None:
     options = replace(OPTIONS, teacher_weight=0.25, teacher_steps=10, diversity_weight=1.0, diversity_steps=1000)
     assert options.regularizer_weights(0) == (0.25, 1)
     assert options.regularizer_weights(5) == pytest.approx((0.125, 0.995))
