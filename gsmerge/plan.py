@@ -344,11 +344,10 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     ``FIDELITY_PSNR``. With photos the result may show them ``FIDELITY_LOSS`` worse than the input. Measurements are in
     docs/internals/notebook.md.
     """
-    if not options.scene_decides:
-        return False
     # with half a Gaussian per pixel or more, the usual share of them is enough to show the photos
     is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
-    return scene.rendered or options.budget.keep or not (is_dense or options.budget.auto)
+    may_keep = scene.rendered or options.budget.keep or not (is_dense or options.budget.auto)
+    return may_keep and options.scene_decides
 
 
 def check_pictures(prepared: Prepared, options: CompactOptions) -> None:

@@ -531,7 +531,7 @@ def explain_mismatch(proposal: Proposal, camera_file: CameraFile) -> SceneError:
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:
     """Return a scene with pictures of its Gaussians in place of the photos of ``views``, whose pixels do not count."""
-    if not views or scene.images is None:
+    if scene.images is None:
         return scene
     images, ids = scene.images.copy(), list(views)
     shape = len(scene), scene.cameras.height, scene.cameras.width

@@ -544,7 +544,7 @@ def _make_loaded(
     source = "" if camera_file is None else camera_file.source
     order = "none" if recovery is None else recovery.layout.order
     return Loaded(
-        scene=without_photo(scene, absent),
+        scene=without_photo(scene, absent) if absent else scene,
         info=ply.info,
         files=files,
         cameras=camera_file,
