@@ -123,7 +123,8 @@ def _compact(
             source, settings, outputs, opacity=args.opacity, hints=hints, progress=progress,
             hashed=args.json, seconds_before=seconds_before, on_read=on_read or (lambda _: None),
         )  # fmt: skip
-    _say_result(args, document, out, shown=on_read is not None)
+    _print_result(args, document, out, shown=on_read is not None)
+    _judge_result(args, document)
 
 
 def _choose_levels(args: opt.Args, settings: CompactOptions, outputs: Outputs) -> CompactOptions:
@@ -159,31 +160,38 @@ def _check_outputs(args: opt.Args, files: SceneFiles, settings: CompactOptions, 
         raise UsageError(f"columns full: expected a --budget that is a number or a share, got {settings.budget.budget}")
 
 
-def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
-    """Print the report of a run and, unless a page will show the result (``shown``), how to view it.
-
-    Raises TargetError if a target is missed and, with ``--strict``, if the result is doubtful.
-    """
+def _print_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
+    """Print the report of a run and, unless a page will show the result (``shown``), how to view it."""
     from gsmerge.compaction.report import result_table
+
+    judged = document["doubts"] if args.strict else [document["worse"]]  # :func:`_judge_result` prints these
+    say_notes([note for note in document["notes"] if note not in judged], quiet=args.silent)
+    columns = terminal_columns(sys.stdout)
+    next_step = None if columns is None or shown else _view_command(args.scenes[0], out)
+    lines = result_table(document, next_step, columns=columns)
+    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
+
+
+def _view_command(scene: Path, out: Path) -> str | None:
+    """Return the command that compares a scene with its result on a page; None if a page cannot show the format."""
     from gsmerge.io.formats.table import VIEWED
 
-    printed_last = document["doubts"] if args.strict else [document["worse"]]
-    say_notes([note for note in document["notes"] if note not in printed_last], quiet=args.silent)
-    columns, next_step = terminal_columns(sys.stdout), None
-    if columns is not None:
-        words = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
-        # With ./ before it, a file name that begins with a dash is not taken for an option
-        next_step = shlex.join([f"./{word}" if word.endswith(out.name) and word[0] == "-" else word for word in words])
-    lines = result_table(document, next_step or None, columns=columns)
-    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
-    has_no_score = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]
-    if args.strict and has_no_score and not document["worse"]:
+    if out.suffix.lower() not in VIEWED:
+        return None
+    # With ./ before it, a path that begins with a dash is not taken for an option
+    paths = [f"./{path}" if str(path)[0] == "-" else str(path) for path in (scene, out)]
+    return shlex.join(["gsmerge", "view", *paths])
+
+
+def _judge_result(args: opt.Args, document: Mapping[str, Any]) -> None:
+    """Warn of a result that is worse than its input; TargetError for a missed target or, with ``--strict``, a doubt."""
+    psnr, worse, keeps_fidelity = document["psnr_input_views"], document["worse"], "fidelity" in document["choices"]
+    if args.strict and not (worse or keeps_fidelity) and psnr["before"] is None:
         say_notes(["--strict: nothing was checked, since there is no photo to compare with"], quiet=args.silent)
+    if worse and not args.strict:
+        has_loss = keeps_fidelity or (psnr["after"] is not None and psnr["after"] < psnr["before"])
+        say(f"{worse}; {REMEDY}" if has_loss else worse, kind="warning", quiet=args.silent)
     problems = [document["unmet"], *(document["doubts"] if args.strict else [])]
-    if document["worse"] and not args.strict:
-        psnr = document["psnr_input_views"]
-        has_loss = "fidelity" in document["choices"] or (psnr["after"] is not None and psnr["after"] < psnr["before"])
-        say(f"{document['worse']}; {REMEDY}" if has_loss else document["worse"], kind="warning", quiet=args.silent)
     if any(problems):
         raise TargetError("; ".join(filter(None, problems)))
 
