@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from os import PathLike
 from typing import Any
 from weakref import ref
 
@@ -87,7 +88,7 @@ def compact(
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
         result = compact_scene(as_scene(scene), options)
-    if not isinstance(scene, Scene):
+    if isinstance(scene, str | PathLike):
         result = replace(result, scene=scene)
     for text in filter(None, [*result.report.doubts, result.report.unmet]):
         warnings.warn(text, DoubtWarning, stacklevel=3)  # the caller: above this function and its decorator
