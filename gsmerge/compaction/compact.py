@@ -180,8 +180,7 @@ def run_search(search: CountSearch, build: Build, prepared: Prepared) -> Candida
         search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)))
         return build_again(build, prepared, plan, search.count)
     if plan.keeps_fidelity and plan.clean.asked:  # what clean-up leaves out would count as errors in the search
-        uncleaned = replace(plan, clean=CleanOptions())
-        search.run(partial(build_candidate, build, prepared, uncleaned))
+        search.run(partial(build_candidate, build, prepared, replace(plan, clean=CleanOptions())))
         return clean_best(search.best, prepared, plan)
     search.run(partial(build_candidate, build, prepared, plan))
     return search.best
