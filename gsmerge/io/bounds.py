@@ -1,7 +1,8 @@
 """Limit the memory and time for reading a file, so that a small damaged file cannot fill the memory.
 
-A reader may take 64 MB of memory and 20 bytes more for each byte of the file. Its loops may take 5 s, and 2 s more for
-each MB. A reader checks its :class:`ReadBudget` before it allocates memory or runs a loop whose size the file states.
+A reader may take 64 MB of memory and 20 bytes more for each byte of the file. The loops of a reader may take 5 seconds,
+and 2 seconds more for each MB. A reader checks its :class:`ReadBudget` before it allocates memory or runs a loop whose
+size the file states.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class ReadBudget:
     Args:
         path: The file.
         file_bytes: Size of the file, with all files that are read together with it.
-        memory_per_byte: Bytes of memory for each byte of the file, besides 64 MB for any file.
+        memory_per_byte: Bytes of memory that reading may take for each byte of the file, besides 64 MB for any file.
         remedy: Remedy in the error for a file that needs more memory.
     """
 
@@ -56,7 +57,7 @@ class ReadBudget:
         return _FREE_MEMORY + self.memory_per_byte * self.file_bytes
 
     def check_memory(self, num_bytes: float, what: str) -> None:
-        """Raise SceneError if ``what`` needs ``num_bytes`` of memory, and the file allows fewer."""
+        """Raise SceneError if ``num_bytes`` of memory, which ``what`` needs, are more than the file allows."""
         if not num_bytes <= self.memory:
             problem = f"expected at most {self.memory / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
             raise SceneError(self.path, f"{problem}, found {what} of {num_bytes / 1e6:,.0f} MB", self.remedy)
@@ -78,7 +79,7 @@ def read_budget(path: Path) -> ReadBudget:
 
 
 def parse_json(text: str, budget: ReadBudget) -> Any:
-    """Parse JSON; SceneError if its objects would take more memory than the budget, ValueError for other text."""
+    """Parse JSON; SceneError if its objects would take more memory than the budget, ValueError if it is no JSON."""
     objects = sum(size * text.count(character) for character, size in _JSON_BYTES.items())
     budget.check_memory(sys.getsizeof(text) + objects, "JSON")
     try:
@@ -117,7 +118,7 @@ def check_file(path: Path) -> int:
 
 
 def walk_files(folder: Path) -> list[Path]:
-    """List all files in and below a folder, but not behind links to folders; SceneError for too many files."""
+    """List all files in and below a folder, but not in linked folders; SceneError for more than ``MAX_FILES``."""
     files: list[Path] = []
     for num_folders, (base, _, names) in enumerate(os.walk(folder), 1):
         files += [Path(base) / name for name in names]

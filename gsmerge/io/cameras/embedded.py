@@ -15,7 +15,7 @@ _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first vers
 
 
 def read_sharp(source: CameraSource) -> StoredCameras | None:
-    """Read the camera of SHARP in a ``.ply``; None if it has no such camera.
+    """Read the camera that SHARP writes into a ``.ply``; None if the ``.ply`` has no such camera.
 
     The size of the view is that of the grid of Gaussians. The grid is square, because SHARP stretches photos of any
     shape to a square. SceneError if the numbers of the camera are damaged.

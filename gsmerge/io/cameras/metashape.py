@@ -59,7 +59,7 @@ def _sensor_values(sensor: Element) -> dict[str, Any]:
 
 
 def _largest_component(path: Path) -> tuple[Element, list[Element]]:
-    """Parse a file. Return its root, and the cameras with poses in the component that has most of them."""
+    """Parse a file. Return the root element, and the cameras with poses in the component with the most such cameras."""
     root = read_xml(path, _ATTRIBUTES)
     cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
     check_camera_count(path, len(cameras))

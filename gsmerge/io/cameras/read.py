@@ -47,9 +47,10 @@ def _is_camera_folder(folder: Path) -> bool:
 
 
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find the only file in a folder that can be read as cameras, whatever its name; None if there are several or none.
+    """Find the only file in a folder that can be read as cameras, whatever its name; None if there are several or no
+    files.
 
-    Intrinsics beside poses, and cameras that gsmerge wrote for viewers, are not searched.
+    Files of intrinsics beside poses, and cameras that gsmerge wrote for viewers, are left out.
     """
     candidates = [
         path
@@ -106,7 +107,7 @@ def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
 
 
 def _resolve(path: Path) -> Path:
-    """Return the camera file to which a path leads, or the folder of the cameras if their format has several files.
+    """Return the camera file to which a path leads, or the folder of the cameras if they are in several files.
 
     A folder leads to the camera file in it. A file of a COLMAP model or of Polycam's keyframes leads to its folder.
     SceneError if there are no cameras.
