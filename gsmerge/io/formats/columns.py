@@ -1,4 +1,4 @@
-"""Recognise columns of a PLY file that are not those of Gaussians: ignore them, note them, or refuse the file."""
+"""Recognise columns of a PLY file that do not belong to Gaussians, and ignore them, note them, or refuse the file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ class ColumnKind:
     remedy: str = ""  # in the error of files with these columns; empty: a note names the columns
 
 
-# A column belongs to the first kind whose pattern matches its name. A note lists other columns of floats as unknown
+# A column belongs to the first kind whose pattern matches its name. Columns of floats that belong to no kind are noted
+# as unknown
 COLUMN_KINDS = (
     ColumnKind(
         "when each Gaussian appears",
@@ -87,7 +88,7 @@ def _find_kind(name: str) -> ColumnKind | None:
 
 
 def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
-    """Note columns and elements that are not used, though they would change renders; empty if there are none.
+    """Return a note on columns and elements that are not used, though they would change renders; empty without such.
 
     ``layers``: names of other elements that hold Gaussians. SceneError if a column shows that Gaussians are incomplete
     without other data, or if a column of Gaussians has an integer type.

@@ -1,7 +1,7 @@
 """Read and write ``.splat``, the format of antimatter15/splat, which most viewers read.
 
-It has 32 bytes per Gaussian and no header. A component q of a quaternion wxyz is the byte 128 + 128 q. Harmonics above
-degree 0 cannot be stored.
+A ``.splat`` has 32 bytes per Gaussian and no header. A component q of a quaternion wxyz is the byte 128 + 128 q.
+Harmonics above degree 0 cannot be stored.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def splat_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a ``.splat``; SceneError unless it consists of whole rows of 32 bytes."""
+    """Read the Gaussians of a ``.splat``; SceneError unless the file consists of rows of 32 bytes."""
     size = check_file(path)
     if size % ROW.itemsize:
         problem = f"expected a .splat of {ROW.itemsize} bytes per Gaussian, found {size} bytes"
