@@ -9,13 +9,14 @@ from contextlib import contextmanager
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
 
-# With methods other than these two, zipfile may unpack more bytes of a member than the archive's directory states
+# With methods other than stored and deflated, zipfile may unpack more bytes of a member than the archive's directory
+# states
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 @contextmanager
 def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
-    """Open a zip archive; SceneError if a member is packed with a method other than "stored" or "deflated"."""
+    """Open a zip archive; raise SceneError if a member is packed with a method other than "stored" or "deflated"."""
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
             if info.compress_type not in _METHODS:

@@ -49,8 +49,8 @@ def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = 0o666) 
     """Yield an empty temporary file beside ``path``, and rename it to ``path`` when the block succeeds.
 
     Missing folders are made. If ``path`` is a link, the file to which it points is replaced. If ``path`` is already the
-    temporary file of an enclosing block, ``path`` is yielded unchanged. SceneError if the file cannot be written, or if
-    it exists and ``overwrite`` is False.
+    temporary file of an enclosing block, ``path`` is yielded unchanged. Raise SceneError if the file cannot be written,
+    or if it exists and ``overwrite`` is False.
     """
     with atomic_outputs(overwrite=overwrite, mode=mode) as add:
         yield add(Path(path))
@@ -58,12 +58,12 @@ def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = 0o666) 
 
 @contextmanager
 def atomic_outputs(*, overwrite: bool = False, mode: int = 0o666) -> Iterator[AddOutput]:
-    """Write several files and rename all of them at the end. If the block fails, no file remains.
+    """Write several files under temporary names, and rename all files at the end. If the block fails, no file remains.
 
     Yields a function that adds a file and returns its temporary file, as in :func:`atomic_output`. If the process is
     killed or the disk fails between two renames, each file is complete, either old or new. Files in deeper folders are
-    renamed first, and are on the disk under their names before files of the next folder are renamed. Therefore an index
-    never names a missing file in a folder below it.
+    renamed first, and are on the disk under their names before files of the next folder are renamed. An index thus
+    never names a missing file in a folder below its own.
 
     ``mode``: the most rights that new files get. For outputs with the content of input files, :func:`common_mode`
     computes ``mode``. If one call replaces some files and makes others, the new files get only rights that the replaced
@@ -205,7 +205,7 @@ def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
 
 
 def _rename_to_new(temporary: str, target: Path) -> None:
-    """Rename a file; FileExistsError if a file has the new name, even if another process makes that file meanwhile.
+    """Rename a file; raise FileExistsError if a file has the new name, even if another process makes it meanwhile.
 
     The temporary name may stay as a second name of the file, until :meth:`_Outputs.remove_rest` removes it.
     """
@@ -250,8 +250,8 @@ def temporary_path(path: Path) -> Path:
 def _machine_hash() -> str:
     """Return a hash of the machine and the container, since process ids are unique only within one container.
 
-    Different containers often have equal host names and equal ids of name spaces. Therefore the random boot id of Linux
-    is hashed, too.
+    Different containers often have equal host names and equal ids of name spaces. The random boot id of Linux is
+    therefore hashed, too.
     """
     try:
         names = f"{Path(_BOOT).read_text(encoding='ascii')} {os.readlink('/proc/self/ns/pid')}"
@@ -278,8 +278,8 @@ _remove_stale_once = cache(remove_stale)  # once per folder and process, since l
 def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
     """Return whether a temporary file is abandoned, because the process that wrote it has ended.
 
-    Processes of other machines are not visible, and on Windows ``os.kill`` would end a process instead of asking for
-    it. In both cases, a file counts as abandoned if it is a week old.
+    Processes of other machines are not visible, and on Windows ``os.kill`` would end a process. Files of other
+    machines, and all files on Windows, count as abandoned if they are a week old.
     """
     if machine != _machine_hash() or sys.platform == "win32":
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS

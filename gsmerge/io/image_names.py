@@ -73,7 +73,7 @@ def _path_endings(path: PurePath) -> list[str]:
 
 
 def _find_matches(by_ending: dict[str, list[Path]], name: str) -> list[Path]:
-    """List the files that match a name best: those whose paths share the longest ending with the name.
+    """List the files that match a name best: the files whose paths share the longest ending with the name.
 
     The list is empty if no file matches the name.
     """
@@ -119,8 +119,9 @@ def match_masks(
 ) -> tuple[list[Path | None], list[str]]:
     """Find the mask of every view by the name of its photo, with or without extension; None for a view without a mask.
 
-    Also return a list of notes. A note names masks that belong to no view, or says that no view has a mask. SceneError
-    if a view has two masks, or if the user ``named`` the folder and no view has a mask; the error names the ``option``.
+    Also return a list of notes. A note names masks that belong to no view, or says that no view has a mask. Raise
+    SceneError if a view has two masks, or if the user ``named`` the folder and no view has a mask; the error names the
+    ``option``.
     """
 
     def is_of_neighbour(mask: Path, photo: Path) -> bool:
@@ -146,7 +147,7 @@ def match_masks(
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List all images in and below a folder in natural order ("2" before "10"); SceneError for too many files."""
+    """List all images in and below a folder in natural order ("2" before "10"); raise SceneError for too many files."""
     images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
     return natural_order(images)
 
@@ -166,8 +167,8 @@ def check_photo_folder(path: Path) -> None:
 def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
     """Return a note on pictures or videos that cannot be read, in the sub-folders ``places`` or in the folder itself.
 
-    The note describes the first of the folders with unreadable pictures or videos. The list is empty without such
-    files.
+    The note describes the first of the folders with unreadable pictures or videos. The list is empty if no folder has
+    any.
     """
     for place in (*(folder / name for name in places), folder):
         with suppress(OSError):
@@ -212,7 +213,7 @@ def natural_order(paths: Iterable[PathT]) -> list[PathT]:
 def find_image(folder: Path, name: str, cameras: Path, *, option: str = "--images", remedy: str = "") -> Path | None:
     """Find the image that a file of ``cameras`` names, with or without extension; None if there is none.
 
-    SceneError for an image outside the folder, since a camera file from elsewhere could name any picture of this
+    Raise SceneError for an image outside the folder, since a camera file from elsewhere could name any picture of this
     machine. The remedy of the error is ``remedy``, or by default to name the folder with ``option``. Links inside the
     folder are followed.
     """

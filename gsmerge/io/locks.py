@@ -13,8 +13,8 @@ from gsmerge.errors import SceneError
 def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
     """Lock a file for the block against other processes, and yield whether this process has the lock.
 
-    If another process has the lock, the call waits until the lock is free, or yields False if ``wait`` is False.
-    SceneError if the lock file cannot be made.
+    If another process has the lock, the call waits until the lock is free, or yields False if ``wait`` is False. Raise
+    Raise SceneError if the lock file cannot be made.
     """
     from filelock import FileLock, Timeout  # most commands need no lock
 
@@ -29,7 +29,8 @@ def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
     try:
         yield True
     finally:
-        # The lock file is removed before the release, so that a waiting process notices that the file is gone
+        # The lock file is removed before the release, so that a waiting process notices that its file is no longer the
+        # lock file
         with suppress(OSError):  # Windows cannot remove an open file; there the release removes the file
             path.unlink()
         lock.release()

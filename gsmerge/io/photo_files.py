@@ -85,8 +85,8 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 
     ``source`` is a folder, which is searched with its sub-folders, or a list of image files. ``names`` are the names in
     a camera file, with or without folders and extension. If no name matches but there are as many images as names, the
-    images of a folder are used in natural order ("2" before "10"), and images of a list in the order of the list.
-    SceneError if an image is missing or cannot be read, or if images differ in size.
+    images of a folder are used in natural order ("2" before "10"), and images of a list in the order of the list. Raise
+    Raise SceneError if an image is missing or cannot be read, or if images differ in size.
     """
     return as_floats(decode_images(match_images(source, names)))
 
@@ -94,8 +94,8 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 def decode_images(paths: Sequence[Path]) -> PhotoArrays:
     """Decode image files of one size to ``[h,w,3]`` uint8 each. Large images are decoded at each use.
 
-    A file that is several times in ``paths`` is decoded once. SceneError if an image cannot be read, if two images
-    differ in size, or if all images together take more memory than the bytes of their files allow.
+    A file that is several times in ``paths`` is decoded once. Raise SceneError if an image cannot be read, if two
+    images differ in size, or if all images together take more memory than the bytes of their files allow.
     """
     files = list(dict.fromkeys(paths))
     sizes = {path: image_size(path) for path in files}
@@ -121,7 +121,8 @@ def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size
     """Decode the photo of each view, turn it upright, and resize a ``part`` of it to ``[h,w,3]`` uint8 of one ``size``.
 
     ``turns`` are those of :func:`orientation_turn`. A view without a file gets a black photo. Large photos are decoded
-    at each use. Other photos are decoded once, also if several views have them. SceneError as in :func:`decode_images`.
+    at each use. Other photos are decoded once, even if several views have the same photo. Raise SceneError as in
+    :func:`decode_images`.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
@@ -181,7 +182,7 @@ def keep_photos(photos: PhotoArrays) -> PhotoArrays:
 
 
 def decode_image(path: Path, size: Size) -> np.ndarray:
-    """Decode an image file of a known ``size`` to ``[h,w,3]`` uint8 sRGB; SceneError if the file cannot be read."""
+    """Decode an image file of known ``size`` to ``[h,w,3]`` uint8 sRGB; raise SceneError if it cannot be read."""
     with read_errors(path):
         data = np.fromfile(path, np.uint8)
     _check_scans(path, data, size)
@@ -234,7 +235,7 @@ def same_shape(size: Size, other: Size) -> bool:
 def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     """Decode the brightness ``[h,w]`` of a mask, times its opacity, as uint8 with white as 255.
 
-    The file may store white as 1, 255 or 65,535. White is taken as the least of these three values that no pixel
+    The file may store white as 1, 255 or 65,535. White is taken as the least of 1, 255 and 65,535 that no pixel
     exceeds. The bytes of the mask and of its ``photo`` together limit the memory, since masks compress to very few
     bytes.
     """
@@ -303,7 +304,7 @@ def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
 def _decoder_bytes(image: Image.Image) -> float:
     """Return how many bytes per pixel a decoder was measured to need besides the decoded pixels.
 
-    These bytes hold the frames of a WebP, or the coefficients of a progressive JPEG.
+    The bytes hold the frames of a WebP, or the coefficients of a progressive JPEG.
     """
     if image.format == "WEBP":
         return _MOVING_WEBP_BYTES if getattr(image, "is_animated", False) else _WEBP_BYTES
@@ -315,7 +316,7 @@ def _decoder_bytes(image: Image.Image) -> float:
 def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
     """Open an image with Pillow, and return the channel that ``choose`` returns as an array; None if it returns None.
 
-    SceneError if the image cannot be decoded.
+    Raise SceneError if the image cannot be decoded.
     """
     size, _ = _read_header(path)  # raises SceneError for a file that is no image or is too large
     try:
@@ -349,8 +350,8 @@ def _unreadable(path: Path) -> SceneError:
 def image_size(path: Path) -> Size:
     """Read (width, height) from the header of a PNG, JPEG, WebP, BMP or PNM file; the orientation tag is ignored.
 
-    SceneError if the file has another format or cannot be read, if the size is impossible, or if the pixels take more
-    memory than the file allows.
+    Raise SceneError if the file has another format or cannot be read, if the size is impossible, or if the pixels take
+    more memory than the file allows.
     """
     (width, height), pixel_bytes = _read_header(path)
     _photo_budget(path).check_memory(pixel_bytes * width * height, f"{width} x {height} pixels")
@@ -360,7 +361,7 @@ def image_size(path: Path) -> Size:
 def _read_header(path: Path) -> tuple[Size, float]:
     """Return the size of an image, and how many bytes of memory a decoder needs for each pixel.
 
-    SceneError if the file is no image, or has far more bytes than its pixels need.
+    Raise SceneError if the file is no image, or has far more bytes than its pixels need.
     """
     num_bytes = check_file(path)
     with read_errors(path), path.open("rb") as file:

@@ -129,7 +129,7 @@ class SceneFiles:
         return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
 
     def describe_choice(self, cameras: Path | None) -> list[str]:
-        """Return a list with a note that ``cameras`` are read, and which others are not; an empty list without others.
+        """Return a list with a note that ``cameras`` are read and no others; empty if there are no other cameras.
 
         Other cameras are those that were tried before, and COLMAP models beside the model that is read.
         """
@@ -190,7 +190,7 @@ def find_scene_files(
 ) -> SceneFiles:
     """Find a scene's files from its path. A kind of files that the caller names is not searched; "none" leaves it out.
 
-    These folders are searched in this order:
+    Folders are searched in this order:
 
     - the given folder;
     - the folder of the ``.ply``, and the folders above it up to the given folder. If the folder of the ``.ply`` is
@@ -207,9 +207,9 @@ def find_scene_files(
     their order. ``NAME.cameras.json``, the cameras of a result, come first, but last if they may belong to another file
     than NAME. Of several COLMAP models in one place, the model with the most images comes first. Cameras inside the
     ``.ply`` precede cameras beside it. If no place has cameras, the only file that holds cameras is taken, whatever its
-    name. Without such a file, cameras of an unsupported program are taken, and their reader names the program. Images
-    inside the cameras' ``.npz`` precede a folder of images, because the networks saw the images inside. A result of
-    gsmerge is taken as the scene only if a folder has nothing else.
+    name. If no file holds cameras, a file of cameras of an unsupported program is taken, and its reader names the
+    program. Images inside the cameras' ``.npz`` precede a folder of images, because the networks saw the images inside.
+    A result of gsmerge is taken as the scene only if a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, if there are several scenes to choose from, or if a named file does not
@@ -299,8 +299,8 @@ def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], pl
 def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
     """Return whether a path belongs to another scene than ``ply``.
 
-    A folder below ``root`` that has Gaussians, but not ``ply``, is another scene. All files in such a folder belong to
-    it.
+    A folder below ``root`` that has Gaussians, but not ``ply``, is another scene. All files in another scene's folder
+    belong to that scene.
     """
     folders = [place for place in (path, *path.parents) if place != root and place.is_relative_to(root)]
     scenes = [_plys_in(place) or other_plys(place / SCENES_PLACE) for place in folders if place.is_dir()]
@@ -308,7 +308,7 @@ def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
 
 
 def can_be_listed(folder: Path, option: str) -> bool:
-    """Return whether a path is a folder; SceneError for an unreadable folder, with a remedy that names ``option``."""
+    """Return whether a path is a folder; raise SceneError, with a remedy by ``option``, if it cannot be read."""
     try:
         os.scandir(folder).close()
     except (FileNotFoundError, NotADirectoryError):
@@ -404,7 +404,7 @@ def _rate_camera_file(ply: Path) -> int:
 
 
 def named_path(path: StrPath | None) -> Path | None:
-    """Return a path that the caller named, None for None and "none"; SceneError if the path does not exist."""
+    """Return a path that the caller named, None for None and "none"; raise SceneError if the path does not exist."""
     if path is None or path == NONE:
         return None
     if not os.path.exists(path):
@@ -527,7 +527,7 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
     """Order files by number if each is a view or a part of one scene; return None if they are several scenes.
 
     Files belong to one scene if their names say so, or if there are as many cameras as files. If the files hold
-    cameras, they are several scenes, since each file has its own frame. SceneError if a part is missing.
+    cameras, they are several scenes, since each file has its own frame. Raise SceneError if a part is missing.
     """
     matches = [_NUMBERED.fullmatch(path.name) for path in plys]
     stems = {match[1].lower() if match else "" for match in matches}  # names without their numbers
@@ -576,7 +576,7 @@ def named_ply(folder: Path) -> Path | None:
 def other_plys(folder: Path) -> list[Path]:
     """List the ``.ply`` files in a folder, not below it, that are neither results nor point clouds.
 
-    If there is no such ``.ply``, list the folder's only file of another format if that file may have Gaussians.
+    In a folder without such a ``.ply``, list the only file of another format if that file may have Gaussians.
     """
     plys = natural_order(folder.glob("[!.]*.ply"))
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]

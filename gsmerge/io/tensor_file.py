@@ -21,8 +21,8 @@ def read_tensors(
 ) -> tuple[dict[str, str], dict[str, np.ndarray]]:
     """Read the metadata of a safetensors file, and its arrays by name unless ``arrays`` is False.
 
-    SceneError if the file is no safetensors file, or becomes shorter while it is read. The error says that ``what`` was
-    expected, and has the ``remedy``.
+    Raise SceneError if the file is no safetensors file, or becomes shorter while it is read. The error says that
+    ``what`` was expected, and has the ``remedy``.
     """
     budget = read_budget(path)
     try:

@@ -138,9 +138,9 @@ def make_camera_file(
     """Check the views of a file, and convert them to a camera file with OpenCV world-to-camera poses.
 
     Intrinsics that are small in all views are taken as divided by the image's size, and are converted to pixels.
-    ``images [c,h,w,3]`` are images inside the file, and ``order`` is the order of rows that the file states. SceneError
-    if there is no camera, a number is infinite or too large, a rotation is not orthonormal, or a focal length is not
-    positive.
+    ``images [c,h,w,3]`` are images inside the file, and ``order`` is the order of rows that the file states. Raise
+    SceneError if there is no camera, a number is infinite or too large, a rotation is not orthonormal, or a focal
+    length is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
@@ -179,7 +179,7 @@ def make_camera_file(
 
 
 def _check_pose(path: StrPath, view: StoredView) -> np.ndarray:
-    """Return the first three rows ``[3,4]`` of a view's pose; SceneError unless the pose is 3x4 or 4x4."""
+    """Return the first three rows ``[3,4]`` of a view's pose; raise SceneError unless the pose is 3x4 or 4x4."""
     pose = np.asarray(view.pose, np.float64)
     if pose.shape not in ((3, 4), (4, 4)):
         raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
@@ -329,8 +329,8 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
     """Convert to cameras of one image ``size`` (width, height) in pixels, by default the size in the file.
 
-    Intrinsics for another size than ``size`` are scaled, each axis by itself. SceneError if a lens is no pinhole, or if
-    no ``size`` is given and the file has no size or several sizes.
+    Intrinsics for another size than ``size`` are scaled, each axis by itself. Raise SceneError if a lens is no pinhole,
+    or if no ``size`` is given and the file has no size or several sizes.
 
     Example:
         >>> gsmerge.to_cameras(gsmerge.read_cameras("demo/transforms.json")).Ks.shape
@@ -363,8 +363,8 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFile, PhotoArrays, list[str]]:
     """Undistort photos, and replace their cameras by pinholes with the same intrinsics; also return notes.
 
-    SceneError if a lens has distortion and there are no photos, or photos of another aspect ratio. SceneError also if
-    most of an undistorted photo would lie outside of the original photo.
+    Raise SceneError if a lens has distortion and there are no photos, or photos of another aspect ratio. Also raise
+    SceneError if most of an undistorted photo would lie outside of the original photo.
     """
     if not camera_file.lenses:
         return camera_file, photos, []
@@ -450,7 +450,7 @@ def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
 
 
 def make_similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
-    """Make the similarity X' = scale (matrix [X; 1]) of a matrix ``[3,4]``; SceneError if that is no similarity."""
+    """Make the similarity X' = scale (matrix [X; 1]) of a matrix ``[3,4]``; raise SceneError for other maps."""
     R = matrix[:3, :3]
     is_similarity = is_orthonormal(R) and determinant(R) >= 0 and 0 < scale < MAX_NUMBER
     if not is_similarity or not np.all(np.abs(matrix) < MAX_NUMBER):

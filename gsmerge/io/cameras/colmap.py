@@ -43,7 +43,7 @@ _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     """Read the views of a COLMAP model in the order of its images, from files with the ``suffix`` .bin or .txt.
 
-    SceneError if the model is damaged, has a camera model that is not read, or lacks the camera of an image.
+    Raise SceneError if the model is damaged, has a camera model that is not read, or lacks the camera of an image.
     """
     folder = source.path
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
@@ -83,12 +83,12 @@ def count_images(folder: Path) -> int:
 
 
 def _read_numbers(file: BinaryIO, form: str) -> tuple[Any, ...]:
-    """Read the next numbers of a file, by their format for ``struct``; struct.error if the file ends too early."""
+    """Read the next numbers of a file by their ``struct`` format; raise struct.error if the file ends too early."""
     return struct.unpack(form, file.read(struct.calcsize(form)))
 
 
 def _read_name(file: BinaryIO) -> str:
-    """Read a name that ends with a zero byte; ValueError if no zero byte follows."""
+    """Read a name that ends with a zero byte; raise ValueError if no zero byte follows."""
     name = b""
     name_part = 64  # bytes of a name that are read at a time
     while b"\0" not in name:
@@ -111,7 +111,7 @@ def _make_pose(numbers: list[float]) -> np.ndarray:
 
 
 def _make_view(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> StoredView:
-    """Make a view of a camera, without a name and a pose; SceneError if the camera model is not supported."""
+    """Make a view of a camera, without a name and a pose; raise SceneError if the camera model is not supported."""
     if model not in _PERSPECTIVE_MODELS | _FISHEYE_MODELS:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
         raise SceneError(path, problem, "undistort the images first")
@@ -190,7 +190,7 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredV
     """Parse the lines of ``images.txt``. Return what :func:`_binary_images` returns.
 
     The line of an image has a pose, and a name that may have spaces. The next line lists the points of the image.
-    Programs that rewrite the file may drop all lines of points, or the empty ones.
+    Programs that rewrite the file may drop all lines of points, or only empty lines.
     """
     images: list[_Image] = []
     after_image = False

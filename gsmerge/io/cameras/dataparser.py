@@ -27,8 +27,8 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     Nerfstudio's ``dataparser_transforms.json`` has the map from the world of the capture into the world of the
     Gaussians: X' = scale (transform [X; 1]). The poses of a ``transforms.json`` with an ``applied_transform`` (and
     ``applied_scale``) are already moved by ``applied_transform``. A second similarity therefore undoes
-    ``applied_transform`` before the map. If nerfstudio's file is missing, offsets of surveys are read. SceneError if
-    nerfstudio's map is not a rotation, a shift and a positive scale.
+    ``applied_transform`` before the map. If nerfstudio's file is missing, offsets of surveys are read. Raise SceneError
+    if nerfstudio's map is not a rotation, a shift and a positive scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
@@ -49,7 +49,7 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
 
 
 def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
-    """Read the offsets that surveys subtract from coordinates, in metres, and return moves of the cameras by them.
+    """Read the offsets in metres that surveys subtract from coordinates, and return moves of the cameras by these.
 
     An offset is three numbers that stand alone in a line or element of a small file. Metashape and CloudCompare write
     offsets into text files, and DJI Terra writes an offset into metadata.xml. Each offset gives two moves of the
@@ -71,7 +71,7 @@ def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
 
 
 def _to_square(values: Any) -> np.ndarray:
-    """Convert the rows of a 3x4 or 4x4 matrix to ``[4,4]`` with the last row 0 0 0 1; ValueError for other matrices."""
+    """Convert the rows of a 3x4 or 4x4 matrix to ``[4,4]`` with the last row 0 0 0 1; raise ValueError for others."""
     matrix = to_array(values)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.all(np.abs(matrix) < MAX_NUMBER):
         raise ValueError(f"found shape {list(matrix.shape)}, or numbers that are not finite")

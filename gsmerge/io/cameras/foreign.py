@@ -1,4 +1,4 @@
-"""List the places of camera files. Also list programs whose cameras are not read, with the export to use instead."""
+"""List the places of camera files, and the programs whose cameras are not read, with the export to use instead."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Read the optimised poses of InstantSplat, which are beside a ``cameras.json`` with the first poses."""
+"""Read the optimised poses of InstantSplat, which are in files beside a ``cameras.json`` with the initial poses."""
 
 from __future__ import annotations
 

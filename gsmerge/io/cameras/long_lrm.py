@@ -25,8 +25,8 @@ def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[Sto
     """Select the views that the model saw, and move them into the Gaussians' world, the frame of their mean pose.
 
     ``input_frame_idx.txt``, in the folder of the Gaussians or in that of the cameras, lists the views that the model
-    saw. Without this file, all views are returned unchanged. SceneError if the file has wrong numbers, or lists a frame
-    that does not exist.
+    saw. Without this file, all views are returned unchanged. Raise SceneError if the file has wrong numbers, or lists a
+    frame that does not exist.
     """
     folder = source.path.parent
     if source.folder is not None and not (folder / FRAMES_FILE).is_file():

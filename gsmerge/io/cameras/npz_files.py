@@ -4,9 +4,9 @@ A user whose model saves no cameras can write ``views.npz`` while the model runs
 arrays of ``views.npz``:
 
 - ``c2w``: poses ``[v,4,4]`` or ``[v,3,4]``, camera to world, OpenCV axes.
-- ``K``: intrinsics ``[v,3,3]`` in pixels of ``images``, or divided by their size. They may be missing.
+- ``K``: intrinsics ``[v,3,3]`` in pixels of ``images``, or divided by their size. ``K`` may be missing.
 - ``images``: ``[v,h,w,3]`` or ``[v,3,h,w]`` as the network saw them, uint8 or float in [0, 1].
-- ``order``: order of the rows of the ``.ply``. It may be missing.
+- ``order``: order of the rows of the ``.ply``. ``order`` may be missing.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ def read_da3(source: CameraSource) -> StoredCameras:
     """Read the cameras of an ``.npz`` of Depth Anything 3, and its images if it has any.
 
     Poses are 3x4 or 4x4, world to camera. Intrinsics that are divided by the size, or are for another size, are scaled
-    to pixels of the images or depth maps. Depth Anything 3 stores intrinsics for another size if the same call exports
-    COLMAP. Files of Lyra 2 (``cameras.npz``), VGGT and AnySplat are also read. Poses of AnySplat are camera to world,
-    its intrinsics are divided by the size, and its arrays are a batch of one. SceneError if the file cannot be read or
-    lacks an array.
+    to pixels of the images or depth maps. Depth Anything 3 stores intrinsics for another size if it exports a COLMAP
+    model in the same call. Files of Lyra 2 (``cameras.npz``), VGGT and AnySplat are also read. Poses of AnySplat are
+    camera to world, its intrinsics are divided by the size, and its arrays are a batch of one. Raise SceneError if the
+    file cannot be read or lacks an array.
     """
     path = source.path
     size_names = () if holds_images(path) else _DEPTHS  # without images, the shape of depth maps gives the size
@@ -81,7 +81,7 @@ def read_da3(source: CameraSource) -> StoredCameras:
 
 
 def read_views_npz(source: CameraSource) -> StoredCameras:
-    """Read the cameras and images of a ``views.npz``; SceneError if an array other than ``K`` is missing."""
+    """Read the cameras and images of a ``views.npz``; raise SceneError if an array other than ``K`` is missing."""
     path = source.path
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
     missing = [name for name in ("c2w", "images") if name not in arrays]
@@ -120,7 +120,7 @@ def _make_views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int])
 def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tuple[str, str]) -> None:
     """Raise SceneError unless two arrays are c poses, 3x4 or 4x4, and intrinsics ``[c,3,3]``, of finite numbers.
 
-    ``names``: names of the two arrays in errors.
+    ``names``: what errors call the two arrays.
     """
     Ks = np.zeros((*poses.shape[:1], 3, 3)) if Ks is None else Ks
     for name, array in zip(names, (poses, Ks), strict=True):
@@ -138,8 +138,8 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tu
 def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
     """Convert images ``[c,h,w,3]`` or ``[c,3,h,w]``, as uint8 or in [0, 1], to ``[c,h,w,3]`` uint8.
 
-    NaN becomes black. SceneError if there are not ``count`` images, one for each pose, or if the array has another
-    shape.
+    NaN becomes black. Raise SceneError if there are not ``count`` images, one for each pose, or if the array has
+    another shape.
     """
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
@@ -192,8 +192,8 @@ def array_names(path: Path) -> frozenset[str]:
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read arrays from an ``.npz`` by name. Names that the file lacks are left out.
 
-    SceneError if the file cannot be read, if an array holds anything but numbers and text, or if the arrays take more
-    memory than the file allows.
+    Raise SceneError if the file cannot be read, if an array holds anything but numbers and text, or if the arrays take
+    more memory than the file allows.
     """
     budget = read_budget(path)
     if not zipfile.is_zipfile(path):
@@ -216,7 +216,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """Read an array of an ``.npz``; SceneError if the array has no numbers or text, or too few bytes for its shape."""
+    """Read an array of an ``.npz``; raise SceneError if it has no numbers or text, or too few bytes for its shape."""
     name, (shape, dtype) = info.filename, _read_header(archive.open(info))
     if dtype.kind not in _KINDS:
         kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]

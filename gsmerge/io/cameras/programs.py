@@ -46,7 +46,7 @@ def join_matrices(source: CameraSource) -> list[Entry]:
     """List WorldMirror's views from the lists of extrinsics and intrinsics, which belong together by ``camera_id``.
 
     ``camera_id`` is a number, or the stem of the image's name. Views whose ``camera_id`` is a number are sorted by it.
-    Other views keep the order of the file. SceneError if one of the lists lacks a view.
+    Other views keep the order of the file. Raise SceneError if one of the lists lacks a view.
     """
     poses, Ks = (_matrices_by_id(source, key) for key in ("extrinsics", "intrinsics"))
     if poses.keys() != Ks.keys():

@@ -94,7 +94,7 @@ def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None
 
 
 def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert intrinsics, size and lens in ``values``, which are those of a view, or those that several views share.
+    """Convert the intrinsics, size and lens in ``values``, which hold one view's values, or values that views share.
 
     The result has the names of ``number_keys``, "K" for a matrix, and "mask". For a lens it also has "model",
     "is_fisheye", "distortion_params" and the coefficients. Names without a value in the file are left out. Errors are
@@ -127,7 +127,7 @@ def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, A
 
 
 def _two_numbers(values: Any) -> tuple[float, float]:
-    """Convert a list of two JSON numbers; ValueError for another count."""
+    """Convert a list of two JSON numbers; raise ValueError for another count."""
     if len(values) != 2:
         raise ValueError(f"expected two numbers, found {len(values)}")
     return to_number(values[0]), to_number(values[1])
@@ -138,7 +138,7 @@ def _with_size(
 ) -> dict[str, Any]:
     """Return the values of a view. If the intrinsics need a size and the file has no size, read that of the image.
 
-    ``size_of`` returns the size of an image. SceneError if the intrinsics or the image are missing.
+    ``size_of`` returns the size of an image. Raise SceneError if the intrinsics or the image are missing.
     """
     keys = layout.number_keys
     if not any(key in values for key in _FOCAL):

@@ -39,7 +39,7 @@ class CameraFormat:
     recognise: Callable[[CameraSource], bool] = lambda _: True  # is called only for files with the ending
 
     def cameras(self, source: CameraSource) -> CameraFile:
-        """Read the cameras of a file; SceneError if the file is damaged or incomplete."""
+        """Read the cameras of a file; raise SceneError if the file is damaged or incomplete."""
         stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
         convention = stored.convention or self.convention
         return make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)

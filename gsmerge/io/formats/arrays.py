@@ -1,4 +1,4 @@
-"""Hold Gaussians in the units of most file formats, convert from and to these units, and read header comments."""
+"""Hold Gaussians in the units of most file formats, convert them from and to these units, and read header comments."""
 
 from __future__ import annotations
 
@@ -95,8 +95,8 @@ class ExpectedScores:
     """PSNR (dB) that new views of a scene are expected to have.
 
     Args:
-        before: When rendered from the input.
-        after: When rendered from the result.
+        before: The PSNR of renders of the input.
+        after: The PSNR of renders of the result.
         low: Lower bound of the expected gain, which nine of ten results exceed.
         high: Upper bound of the expected gain, which one of ten results exceeds.
     """
@@ -118,7 +118,7 @@ def result_comments(scores: ExpectedScores | None, kept: Sequence[str] = ()) -> 
 
 
 def new_views_comment(scores: ExpectedScores) -> str:
-    """Return the header comment of a result on the expected scores of new views."""
+    """Return the header comment of a result that states the expected scores of new views."""
     gain = f"gain {scores.low:.2f} to {scores.high:.2f} dB"
     return f"{NEW_VIEWS_COMMENT}: {scores.before:.2f} to {scores.after:.2f} dB, {gain}"
 
@@ -318,13 +318,13 @@ def check_gaussian_count(budget: ReadBudget, count: int, num_higher: int, packed
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
-    """Convert Gaussians to columns with harmonics up to ``max_degree``; ValueError if a row is not finite.
+    """Convert Gaussians to columns with harmonics up to ``max_degree``; raise ValueError if a row is not finite.
 
     ``first_row``: number of the first Gaussian, for the error.
     """
 
     def check(values: np.ndarray) -> np.ndarray:
-        """Return values unchanged; ValueError if any is not finite as float32."""
+        """Return values unchanged; raise ValueError if any is not finite as float32."""
         with np.errstate(over="ignore"):
             nonfinite = np.argwhere(~np.isfinite(values.astype(np.float32)))  # no format holds larger numbers
         if len(nonfinite):
@@ -332,7 +332,7 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
         return values
 
     def array(values: Array) -> np.ndarray:
-        """Return values as float64; ValueError as in ``check``."""
+        """Return values as float64; raise ValueError as in ``check``."""
         return check(as_array(values).astype(np.float64))
 
     degree = min(max_degree, gaussians.sh_degree)

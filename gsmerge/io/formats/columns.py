@@ -90,8 +90,8 @@ def _find_kind(name: str) -> ColumnKind | None:
 def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
     """Return a note on columns and elements that are not used, though they would change renders; empty without such.
 
-    ``layers``: names of other elements that hold Gaussians. SceneError if a column shows that Gaussians are incomplete
-    without other data, or if a column of Gaussians has an integer type.
+    ``layers``: names of other elements that hold Gaussians. Raise SceneError if a column shows that Gaussians are
+    incomplete without other data, or if a column of Gaussians has an integer type.
     """
     _check_types(path, row_type)
     by_kind: dict[ColumnKind | None, list[str]] = {}

@@ -78,7 +78,7 @@ def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
 
 
 def _num_rest(path: Path, data: PlyData, count: int) -> int:
-    """Count the columns of harmonics above degree 0; SceneError unless they make up degree 0, 1, 2 or 3."""
+    """Count the columns of harmonics above degree 0; raise SceneError unless they make up degree 0, 1, 2 or 3."""
     if "sh" not in data:
         return 0
     names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}  # columns of bytes

@@ -17,7 +17,7 @@ from gsmerge.io.formats.table import PLY, Format
 def read_extra_columns(info: FileInfo) -> np.ndarray:
     """Read the columns of a file that do not belong to Gaussians, as a structured array ``[n]``.
 
-    The array has no fields if all columns belong to Gaussians. SceneError if the file changed or cannot be read.
+    The array has no fields if all columns belong to Gaussians. Raise SceneError if the file changed or cannot be read.
     """
     path = Path(info.path)
     if not info.extra_columns:

@@ -86,7 +86,7 @@ def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
 def glb_bytes(
     gaussians: Gaussians, _: Sequence[str] = (), *, nodes: Sequence[Any] = (), cameras: Sequence[Any] = ()
 ) -> bytes:
-    """Encode a ``.glb`` file without comments; ValueError if there is NaN or inf.
+    """Encode a ``.glb`` file without comments; raise ValueError if there is NaN or inf.
 
     ``nodes`` and ``cameras``: further entries of the lists with these names in the glTF document.
 
@@ -186,7 +186,7 @@ def holds_gaussians(path: Path) -> bool:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read all Gaussians of a ``.glb``, with the axes of a ``.ply``; SceneError if it holds none or is damaged."""
+    """Read all Gaussians of a ``.glb``, with the axes of a ``.ply``; raise SceneError without any or for damage."""
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
     with _damage_errors(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
         document, total = _read_document(file, budget)
@@ -379,6 +379,7 @@ def _read_splats(content: _Content, primitive: dict[str, Any], transform: np.nda
     transform_columns = _transformer(transform, len(harmonics))
 
     def unpack(block: slice) -> Columns:
+        """Return the Gaussians of a block of rows."""
         means_block = means[block]
         # np.stack needs at least one array, so an array of zeros is put before the harmonics and cut off again
         return transform_columns(

@@ -54,7 +54,7 @@ _SIZES = {  # names of types -> bytes of a number
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Open a PLY file, whose rows :func:`open_rows` reads block by block later; SceneError if it holds no Gaussians."""
+    """Open a PLY file for :func:`open_rows`, which reads its rows; raise SceneError if it holds no Gaussians."""
     data, num_left = open_ply(path)
     elements = {element.name: {column.name for column in element.properties} for element in data.elements}
     is_compressed = "chunk" in elements and elements.get("vertex", set()) >= set(arrays.PACKED)
@@ -133,7 +133,7 @@ def is_from_gsmerge(comments: Sequence[str]) -> bool:
 def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
     """Return the rows of the Gaussians with the usual names of columns, and the prefix that the names had.
 
-    SceneError if required columns are missing, or if there is no row.
+    Raise SceneError if required columns are missing, or if there is no row.
     """
     if "vertex" not in data:
         names = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
@@ -179,7 +179,7 @@ def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
-    """Count the columns ``f_rest_*``; SceneError unless they make up all harmonics of a degree."""
+    """Count the columns ``f_rest_*``; raise SceneError unless these are all harmonics up to a degree."""
     names = {name for name in columns if name.startswith("f_rest_")}
     if len(names) not in (0, 9, 24, 45, 72) or names != {f"f_rest_{i}" for i in range(len(names))}:
         numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
@@ -243,7 +243,8 @@ def open_ply(path: Path) -> tuple[PlyData, int]:
     """Open a PLY file; also return the number of bytes after its last element.
 
     Binary vertices that are not compressed stay in the file as a memory map, from which :func:`open_rows` reads later.
-    All other content is read. SceneError if the file is no PLY file, is damaged, or is shorter than its header says.
+    All other content is read. Raise SceneError if the file is no PLY file, is damaged, or is shorter than its header
+    says.
     """
     budget = read_budget(path)
     try:
@@ -322,6 +323,7 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
     with path.open("rb") as file:
 
         def read(block: slice) -> np.ndarray:
+            """Read a block of rows from the file."""
             start, stop, _ = block.indices(len(rows))
             out = np.empty(stop - start, rows.dtype)
             with lock:
@@ -388,7 +390,7 @@ def _list_comments(header: str) -> list[str]:
 
 
 def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
-    """Return the size of a header in bytes, and whether rows are text; SceneError if the file is too short for rows.
+    """Return the size of a header in bytes, and whether rows are text; raise SceneError if the file is too short.
 
     ``start``: the first bytes of the file. The header may have other errors, which plyfile's parser finds later.
     """
@@ -478,7 +480,7 @@ def _truncated(path: Path, expected: str, num_whole: int, reason: str) -> SceneE
 def ply_blocks(
     gaussians: Gaussians, degree: int, comments: Sequence[str], *, normals: bool, extra: np.ndarray | None = None
 ) -> Iterator[bytes | memoryview]:
-    """Yield the header and blocks of rows of a PLY file with harmonics up to ``degree``; ValueError for NaN or inf.
+    """Yield a PLY file's header and blocks of rows, with harmonics up to ``degree``; raise ValueError for NaN or inf.
 
     ``extra``: structured array ``[n]`` of little-endian columns, which are written after those of the Gaussians.
     """
@@ -542,7 +544,7 @@ def file_bytes(count: int, sh_degree: int) -> int:
 
 
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
-    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits.
+    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; raise UsageError if none fits.
 
     The size includes the longest comment on new views, even if the result will have no such comment.
     """

@@ -141,7 +141,7 @@ def read_parts(
 ) -> GaussianFile:
     """Read one or several PLY files as one file, in the given order.
 
-    Errors are those of :func:`read_ply`; SceneError also if the columns of the files differ.
+    Errors are those of :func:`read_ply`; also raise SceneError if the columns of the files differ.
     """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
@@ -165,8 +165,8 @@ def read_gaussians(
 
     Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``. The finest level of a
     ``lod-meta.json`` is read. A ``meta.json``, or its folder, is read as a ``.sog`` without a zip. Files with other
-    endings are read by :func:`read_ply`, which alone needs ``opacity``, ``scales`` and ``colors``. SceneError if the
-    file cannot be read, is damaged, or holds no finite Gaussian. ValueError for an unknown encoding.
+    endings are read by :func:`read_ply`, which alone needs ``opacity``, ``scales`` and ``colors``. Raise SceneError if
+    the file cannot be read, is damaged, or holds no finite Gaussian. Raise ValueError for an unknown encoding.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
@@ -459,7 +459,7 @@ def _choose_encoding(
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
     """Return the encoding of opacities that a part declares; None if no part declares one.
 
-    SceneError if parts have different encodings. For this check, the encoding of a part without a declaration is
+    Raise SceneError if parts have different encodings. For this check, the encoding of a part without a declaration is
     guessed from its values if it has 100.
     """
     start, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
@@ -518,7 +518,7 @@ def _spread_low_degree(shN: np.ndarray) -> None:
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
-    """Make invalid rows transparent, in place, and return their number; SceneError if too few rows are valid."""
+    """Make invalid rows transparent, in place, and return their number; raise SceneError if too few rows are valid."""
     valid = out["valid"]
     invalid = np.flatnonzero(~valid)
     num_valid = len(valid) - len(invalid)

@@ -23,7 +23,7 @@ ROUNDING_GAUSSIANS = 1 << 17  # number of Gaussians from which the mean is estim
 
 
 def format_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
-    """Note what a path's format leaves out, and how far its rounding moves Gaussians; UsageError without a format."""
+    """Note what a path's format leaves out, and how far its rounding moves Gaussians; raise UsageError without one."""
     return limit_notes(path, gaussians.sh_degree, len(gaussians)) + rounding_notes(path, gaussians)
 
 

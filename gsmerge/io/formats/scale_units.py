@@ -29,8 +29,8 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
     """Judge whether the scales of a file are linear, from ``scales [n,3]``, ``means [n,3]`` and ``valid [n]``.
 
     ``scales`` were read as logarithms. The scales are judged linear if the Gaussians are too large for the scene, but
-    would fit the scene with the stored numbers as sizes. In addition, either all Gaussians must be about equally large
-    when scales are read as logarithms, or half of the Gaussians must be nearly as large as the scene.
+    would fit the scene with the stored numbers as sizes. In addition, when scales are read as logarithms, either all
+    Gaussians must be about equally large, or half of the Gaussians must be nearly as large as the scene.
     """
     valid = out["valid"]
     rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)

@@ -71,7 +71,7 @@ class _ZipFiles:
         return self.archive.getinfo(name).compress_size
 
     def read(self, name: str) -> bytes:
-        """Read the file ``name``; ValueError if it is larger than the zip."""
+        """Read the file ``name``; raise ValueError if it is larger than the zip."""
         info = self.archive.getinfo(name)
         if info.file_size > self.size:
             raise ValueError(f"{name} of {info.file_size} bytes")
@@ -86,7 +86,7 @@ class _FolderFiles:
     size: int  # bytes of all files of the ``.sog``
 
     def num_bytes(self, name: str) -> int:
-        """Return the number of bytes of the file ``name``; ValueError if it is outside the folder."""
+        """Return the number of bytes of the file ``name``; raise ValueError if it is outside the folder."""
         path = self.folder / name
         inside = Path(os.path.realpath(path)).parent == Path(os.path.realpath(self.folder))
         if path.name != name or "\\" in name or not inside:
@@ -94,7 +94,7 @@ class _FolderFiles:
         return check_file(path)
 
     def read(self, name: str) -> bytes:
-        """Read the file ``name``; ValueError if it is outside the folder, or larger than the whole ``.sog``."""
+        """Read the file ``name``; raise ValueError if it is outside the folder, or larger than the whole ``.sog``."""
         size = self.num_bytes(name)
         if size > self.size:
             raise ValueError(f"{name} of {size} bytes")
@@ -115,7 +115,7 @@ class SogContent:
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Read the Gaussians of a ``.sog``; SceneError if it is no ``.sog`` of version 2, or is damaged."""
+    """Read the Gaussians of a ``.sog``; raise SceneError if it is no ``.sog`` of version 2, or is damaged."""
     budget = read_budget(path)
     with _damage_errors(path), open_archive(path) as archive:
         content = _read_content(_ZipFiles(archive, budget.file_bytes), budget)
@@ -125,7 +125,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
 def read_unzipped(path: Path) -> SogContent:
     """Read a ``.sog`` without its zip from its ``meta.json`` and the textures beside it.
 
-    SceneError as in :func:`read_rows`.
+    Raise SceneError as in :func:`read_rows`.
     """
     text = read_text(path)  # the size of the files that it names limits the memory of the reader
     with _damage_errors(path):
@@ -135,7 +135,7 @@ def read_unzipped(path: Path) -> SogContent:
 
 
 def read_folder(path: Path) -> arrays.StoredRows:
-    """Read the rows of a ``.sog`` without its zip, by its ``meta.json``; SceneError as in :func:`read_rows`."""
+    """Read the rows of a ``.sog`` without its zip, by its ``meta.json``; raise SceneError as in :func:`read_rows`."""
     content, meta_bytes = read_unzipped(path), check_file(path)
     rows = arrays.to_stored([content.packed], f"unzipped .sog version {VERSION}", content.sizes, content.mode)
     return replace(rows, bytes_beside=content.num_bytes - meta_bytes)
@@ -187,7 +187,7 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
 
 
 def _image_size(data: bytes) -> tuple[int, int]:
-    """Return width and height of a lossless WebP image; ValueError for any other file."""
+    """Return width and height of a lossless WebP image; raise ValueError for any other file."""
     at = 12  # bytes before the first chunk: "RIFF", the size of the file, "WEBP"
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         # A chunk has 4 bytes of name, 4 bytes of size, and content that is padded to an even number of bytes
@@ -218,7 +218,7 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
 
 
 def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> arrays.Packed:
-    """Decode textures and codebooks, and return the Gaussians that they hold; ValueError for damaged content."""
+    """Decode textures and codebooks, and return the Gaussians that they hold; raise ValueError for damaged content."""
 
     def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
         """Decode a texture that ``meta`` names under ``key``, to the first ``channels`` numbers of each Gaussian."""
@@ -235,6 +235,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
     harmonic_codes = np.zeros(CODES) if labels is None else _to_numbers(meta["shN"]["codebook"], CODES)
 
     def unpack(block: slice) -> arrays.Columns:
+        """Return the Gaussians of a block of rows."""
         largest, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
         codes = np.zeros((len(largest), 0, 3), np.uint8) if labels is None else palette[labels[block]]
         return arrays.Columns(
@@ -250,7 +251,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
 
 
 def _to_numbers(values: Any, length: int) -> np.ndarray:
-    """Convert a list of ``meta.json`` to an array ``[length]``; ValueError if it has another length."""
+    """Convert a list of ``meta.json`` to an array ``[length]``; raise ValueError if it has another length."""
     numbers = np.asarray(values, np.float64)
     if numbers.shape != (length,):
         raise ValueError(f"{numbers.shape} numbers instead of {length}")
@@ -269,7 +270,7 @@ def _read_palette(files: _Files, meta: dict[str, Any], count: int, budget: ReadB
 
 
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.sog``, with rows in the order of a space-filling curve; ValueError if there is NaN or inf.
+    """Encode a ``.sog``, with rows in the order of a space-filling curve; raise ValueError if there is NaN or inf.
 
     ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """

@@ -6,7 +6,7 @@ their 5 highest bits (degree 1) or 4 highest bits. Version 3 is one gzip stream,
 4 has an uncompressed header, a table of compressed and uncompressed sizes, and one Zstandard stream for each column.
 
 The README says that axes point right, up and back. However, Niantic's converters, splat-transform and SuperSplat write
-the axes of a ``.ply``: right, down and front. This module writes these axes, too. The extension
+the axes of a ``.ply``: right, down and front. This module writes the axes of a ``.ply``, too. The extension
 ``SPZ_ADOBE_coordinate_system`` may state other axes. The reader then rotates the Gaussians to the axes of a ``.ply``.
 """
 
@@ -86,7 +86,7 @@ class Header:
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Read the Gaussians of a ``.spz``; SceneError if it is damaged."""
+    """Read the Gaussians of a ``.spz``; raise SceneError if it is damaged."""
     check_file(path)
     with read_errors(path), path.open("rb") as file:
         packed = file.read(len(ZSTANDARD_MAGIC))
@@ -121,7 +121,7 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
 
 
 def _stored_axes(path: StrPath, extensions: bytes) -> str:
-    """Return the axes that an extension states, or else those of a ``.ply``; SceneError if this is damaged."""
+    """Return the axes that an extension states, or else those of a ``.ply``; raise SceneError if this is damaged."""
     position = 0  # in ``extensions``
     # Kind of the extension SPZ_ADOBE_coordinate_system, whose content is 1 for the first of AXIS_SYSTEMS, and 0 for
     # unknown axes
@@ -141,7 +141,7 @@ def _stored_axes(path: StrPath, extensions: bytes) -> str:
 
 
 def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int]) -> Header:
-    """Read the header from ``start``, its unpacked bytes; SceneError if it is invalid or states too many Gaussians."""
+    """Parse the unpacked header, ``start``; raise SceneError if it is invalid or states too many Gaussians."""
     path = budget.path
     if len(start) < HEADER.size:
         raise SceneError(path, FOUND_EARLY_END, arrays.EXPORT_AGAIN)
@@ -161,7 +161,7 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
 
 
 def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
-    """Read version 1 to 3; return header, columns ``[n,width]`` uint8, extensions, and number of bytes after them."""
+    """Read version 1 to 3; return header, columns ``[n,width]`` uint8, extensions, and number of bytes at the end."""
     path = budget.path
     stream = zlib.decompressobj(wbits=31)
     try:
@@ -215,8 +215,8 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np
 def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) -> tuple[int, np.ndarray]:
     """Return where the table of version 4 starts, and the start of each stream followed by the end of the last one.
 
-    Both results are positions in the file, in bytes. ``sizes``: bytes of each unpacked column. SceneError if the table
-    has other sizes, or if the file is too short for the table.
+    Both results are positions in the file, in bytes. ``sizes``: bytes of each unpacked column. Raise SceneError if the
+    table has other sizes, or if the file is too short for the table.
     """
     try:
         (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
@@ -301,7 +301,7 @@ def spz_columns(
 ) -> tuple[bytes, tuple[np.ndarray, ...]]:
     """Quantise Gaussians; return the header, and columns ``[n,bytes]`` uint8 in the order of the file.
 
-    ``version``: 2 or 3. ValueError if there is NaN or inf.
+    ``version``: 2 or 3. Raise ValueError if there is NaN or inf.
     """
     means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
     # Means that are not finite raise an error below
@@ -353,7 +353,7 @@ def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
 
 
 def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.spz`` file of version 3; ValueError if there is NaN or inf.
+    """Encode a ``.spz`` file of version 3; raise ValueError if there is NaN or inf.
 
     ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
@@ -361,7 +361,7 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 
 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
-    """Encode a ``.spz`` file in the version of ``contents.options``; ValueError if there is NaN or inf.
+    """Encode a ``.spz`` file in the version of ``contents.options``; raise ValueError if there is NaN or inf.
 
     The file has no extensions, since three 0.187 and mkkellogg's viewer refuse bytes after the columns.
     """

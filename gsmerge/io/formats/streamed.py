@@ -77,8 +77,8 @@ def write_levels(
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of a Streamed SOG.
 
-    Arguments and result are those of :data:`gsmerge.io.formats.table.WriteOutput`. In the result, the path of a coarser
-    level is the ``meta.json`` of its first chunk.
+    ``add`` makes the temporary file of a path; ``index`` is that of ``path``. Return the path of each level, with its
+    temporary files. The path of a coarser level is the ``meta.json`` of its first chunk.
     """
     with TemporaryDirectory(prefix="gsmerge-") as folder:
         arguments: list[object] = []
@@ -134,7 +134,7 @@ class StreamedIndex:
 
 
 def read_index(path: Path) -> StreamedIndex:
-    """Read a ``lod-meta.json``; SceneError if it is damaged or contradicts itself."""
+    """Read a ``lod-meta.json``; raise SceneError if it is damaged or contradicts itself."""
     document = read_json(path)
     try:
         return _check_index(path, document)
@@ -144,7 +144,7 @@ def read_index(path: Path) -> StreamedIndex:
 
 
 def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
-    """Return the content of an index; ValueError, LookupError or TypeError if the index is damaged."""
+    """Return the content of an index; raise ValueError, LookupError or TypeError if the index is damaged."""
     version = document.get("version", VERSION)
     if version != VERSION:
         problem = f"expected Streamed SOG version {VERSION}, found {version}"
@@ -181,7 +181,7 @@ def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int],
 
 
 def _chunk_path(index: Path, name: Any) -> Path:
-    """Return the path of the chunk ``name`` of an index; ValueError if this is outside the index's folder."""
+    """Return the path of the chunk ``name`` of an index; raise ValueError if this is outside the index's folder."""
     chunk = PurePosixPath(str(name))
     is_outside = chunk.is_absolute() or ".." in chunk.parts or "\\" in str(name) or "\0" in str(name)
     if is_outside or chunk.name != sog.META:
@@ -190,7 +190,7 @@ def _chunk_path(index: Path, name: Any) -> Path:
 
 
 def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the level and the content of each run of the tree, leaf by leaf; ValueError for an invalid node."""
+    """Yield the level and the content of each run of the tree, leaf by leaf; raise ValueError for an invalid node."""
     nodes = [tree]
     while nodes:
         node = nodes.pop()
@@ -206,7 +206,7 @@ def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _count_by_chunk(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
-    """Return the number of Gaussians in each chunk of a level; ValueError if the level's runs overlap or have gaps.
+    """Return the number of Gaussians in each chunk of a level; raise ValueError if its runs overlap or have gaps.
 
     ``runs``: the index of the chunk, the first row, and the number of rows of each run.
     """
@@ -222,7 +222,7 @@ def _count_by_chunk(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]
 def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) -> arrays.StoredRows:
     """Read the Gaussians of one level; level 0, the finest, includes the environment.
 
-    ``index``: result of :func:`read_index` for the path; None: read the index. SceneError if the index or a chunk
+    ``index``: result of :func:`read_index` for the path; None: read the index. Raise SceneError if the index or a chunk
     cannot be read, or if a chunk contradicts the index.
     """
     index = index or read_index(path)
@@ -243,12 +243,12 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
 
 
 def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> GaussianFile:
-    """Read one level of detail of a ``lod-meta.json``; 0 is the finest. SceneError as in :func:`read_gaussians`."""
+    """Read one level of detail of a ``lod-meta.json``; 0 is the finest. Raise errors as :func:`read_gaussians`."""
     return convert_files([path], [read_rows(path, level, index)], "auto")
 
 
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
-    """Read chunks; SceneError if they take more memory than a single file with their number of bytes may take.
+    """Read chunks; raise SceneError if they take more memory than a single file with their number of bytes may take.
 
     ``chunks``: path of each chunk -> the number of Gaussians that the index states for it, or None.
     """

@@ -186,9 +186,10 @@ SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FI
 
 
 def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
-    """Return how many Gaussians fit into an output of at most ``max_bytes``; UsageError if none fits.
+    """Return how many Gaussians fit into an output of at most ``max_bytes``; raise UsageError if none fits.
 
-    The number is exact for a ``.ply``. It is approximate for other formats, since their size depends on the content.
+    The number is exact for a ``.ply``. The number is approximate for other formats, since their size depends on the
+    values of Gaussians.
     """
     if format_.count is not None:
         return format_.count(max_bytes, sh_degree)
@@ -203,8 +204,8 @@ def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
 def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
     """Estimate the number of Gaussians in all files, and the largest number of columns ``f_rest_*`` in any file.
 
-    The numbers of a ``.ply`` are read from its header. Those of other formats are estimated from the file's size. A
-    file counts as empty if it cannot be read, or if it is too short for the rows in its header.
+    The numbers of a ``.ply`` are read from its header. The numbers of other formats are estimated from the file's size.
+    A file counts as empty if it cannot be read, or if it is too short for the rows in its header.
     """
     counts = [
         ply.header_counts(path, check_size=True) if find_format(path).read is ply.read_rows else _count_by_size(path)
@@ -236,7 +237,7 @@ def may_hold_gaussians(path: Path) -> bool:
 
 
 def output_format(path: StrPath, *, alone: bool = False) -> Format:
-    """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
+    """Return the format in which to write a path; raise UsageError for an unknown ending or a missing package.
 
     ``alone``: refuse pages, and formats with an index and files beside it.
     """

@@ -34,7 +34,11 @@ _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  #
 
 
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write the files of a tileset; arguments and result are those of :data:`gsmerge.io.formats.table.WriteOutput`."""
+    """Write the files of a tileset.
+
+    ``add`` makes the temporary file of a path; ``index`` is that of ``path``. Return ``path``, with a list of all
+    temporary files.
+    """
     tile = path.with_name(TILESET.beside)
     # The bounds are percentiles of the means, since bounds with a few far Gaussians would make the scene look small
     percentiles = 1, 99
@@ -61,7 +65,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a tileset with one tile; SceneError for any other tileset."""
+    """Read the Gaussians of a tileset with one tile; raise SceneError for any other tileset."""
     document = read_json(path)
     try:
         root = document["root"]

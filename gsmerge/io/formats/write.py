@@ -18,7 +18,7 @@ from gsmerge.values.arguments import check_arguments
 def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
     """Note if the format of a path leaves out harmonics, or if public readers of the format refuse ``count`` Gaussians.
 
-    UsageError if no format has the ending of the path.
+    Raise UsageError if no format has the ending of the path.
     """
     format_, notes = output_format(path), list[str]()
     if sh_degree > format_.max_degree:
@@ -38,7 +38,8 @@ def level_output(output: Path, level: int) -> Path:
 def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write each level of detail of ``contents`` to a separate file.
 
-    Arguments and result are those of :data:`gsmerge.io.formats.table.WriteOutput`.
+    ``add`` makes the temporary file of a path; ``temporary`` is that of ``path``. Return the path of each level, with a
+    list of its only temporary file.
     """
     written, format_ = {path: [temporary]}, output_format(path, alone=True)
     for level in range(1, len(contents.levels)):
@@ -128,7 +129,7 @@ def write_ply(
         gaussians: Gaussians with finite values.
         overwrite: Replace an existing file.
         sh_degree: Drop harmonics above this degree. None: keep all.
-        comments: Lines for the header, such as :func:`gsmerge.io.kept_comments` of another file.
+        comments: Lines for the header, such as those that :func:`gsmerge.io.kept_comments` returns for another file.
         normals: Write three columns of zeros, 12 bytes per Gaussian. No renderer uses normals, but a few readers, such
             as SIBR's, expect the three columns.
 
