@@ -26,7 +26,7 @@ def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
 
 
 def new_member(name: str) -> zipfile.ZipInfo:
-    """Make a member to write, with the date 1980 and the system Unix, so that equal content gives equal archives."""
+    """Make a member to write, with the date 1980 and the system Unix, so that equal members give equal archives."""
     member = zipfile.ZipInfo(name)
     member.create_system = 3
     return member

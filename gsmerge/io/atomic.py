@@ -264,7 +264,7 @@ def _machine_hash() -> str:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove a folder's temporary files whose process has ended; those of other machines are removed after a week."""
+    """Remove a folder's temporary files whose process has ended; files of other machines are removed after a week."""
     with suppress(OSError), os.scandir(folder) as entries:  # another process may remove files, or rights may be missing
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)

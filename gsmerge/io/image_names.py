@@ -29,7 +29,7 @@ PathT = TypeVar("PathT", str, Path)
 
 
 def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
-    """Find the image file of each name, in the order of ``names``; see :func:`read_images` for source and errors."""
+    """Find the image file of each name, in the order of ``names``; :func:`read_images` describes source and errors."""
     if isinstance(source, str | os.PathLike):
         root = Path(source)
         if not root.is_dir():
@@ -84,8 +84,8 @@ def _find_matches(by_ending: dict[str, list[Path]], name: str) -> list[Path]:
 def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixels: PixelCount) -> list[Path | None]:
     """Propose one of ``files`` below a folder for each name; None if no file matches the name.
 
-    Of several files that match a name, a file whose whole path is in the name is preferred. Next comes a file outside
-    of hidden folders, and then the file with the most ``pixels``.
+    Of several files that match a name, a file whose whole path is in the name is preferred. A file outside of hidden
+    folders is the second choice, and the file with the most ``pixels`` the third choice.
     """
     by_ending = _files_by_ending(root, files)
 

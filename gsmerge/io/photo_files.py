@@ -86,7 +86,7 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
     ``source`` is a folder, which is searched with its sub-folders, or a list of image files. ``names`` are the names in
     a camera file, with or without folders and extension. If no name matches but there are as many images as names, the
     images of a folder are used in natural order ("2" before "10"), and images of a list in the order of the list. Raise
-    Raise SceneError if an image is missing or cannot be read, or if images differ in size.
+    SceneError if an image is missing or cannot be read, or if images differ in size.
     """
     return as_floats(decode_images(match_images(source, names)))
 
@@ -215,7 +215,7 @@ def photo_array(images: np.ndarray | None) -> np.ndarray:
 
 
 def part_size(size: Size, part: Part) -> Size:
-    """Return the (width, height) of a part of a photo; ``size`` is that of the whole photo."""
+    """Return the (width, height) of a part of a photo; ``size`` is the whole photo's."""
     left, top, right, bottom = (round(side * share) for side, share in zip(size * 2, part, strict=True))
     return max(1, right - left), max(1, bottom - top)
 

@@ -188,7 +188,7 @@ def find_scene_files(
     protect: StrPath | None = None,
     within: StrPath | None = None,
 ) -> SceneFiles:
-    """Find a scene's files from its path. A kind of files that the caller names is not searched; "none" leaves it out.
+    """Find a scene's files from its path. Files that the caller names, or leaves out by "none", are not searched.
 
     Folders are searched in this order:
 
@@ -209,7 +209,7 @@ def find_scene_files(
     ``.ply`` precede cameras beside it. If no place has cameras, the only file that holds cameras is taken, whatever its
     name. If no file holds cameras, a file of cameras of an unsupported program is taken, and its reader names the
     program. Images inside the cameras' ``.npz`` precede a folder of images, because the networks saw the images inside.
-    A result of gsmerge is taken as the scene only if a folder has nothing else.
+    A result of gsmerge is taken as the scene only if a folder has no other scene.
 
     Raises:
         SceneError: If there is no ``.ply``, if there are several scenes to choose from, or if a named file does not
@@ -257,8 +257,8 @@ def find_scene_files(
 def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, list[Path], bool]:
     """Return a scene's cameras or None, a list of further cameras, and whether the further ones are in folders below.
 
-    Cameras have the order of :func:`find_scene_files`. Folders below the scene are searched only if there are no
-    cameras beside the scene.
+    The cameras are in the order that :func:`find_scene_files` describes. Folders below the scene are searched only if
+    there are no cameras beside the scene.
     """
     of_result = result_cameras(ply)
     if of_result is not None and _rate_camera_file(ply) == 2:

@@ -28,7 +28,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # turns OpenGL's camera axes (y up, z ba
 CENTRED_PX = 1e-3
 PATCH_SIDE = 14  # pixels; sides of vision transformers' inputs are multiples of this
 _WHOLE_PX = 1e-3  # a side counts as whole if it differs from a whole number by less than these pixels
-MAX_NORMALISED_FOCAL = 10.0  # longest focal length in sides of the image; a longer one is in pixels
+MAX_NORMALISED_FOCAL = 10.0  # longest focal length in sides of the image; a longer focal length is in pixels
 
 # Orders of the Gaussians' rows that a camera file may state
 ORDERS: tuple[str, ...] = get_args(Order)

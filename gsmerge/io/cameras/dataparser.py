@@ -49,7 +49,7 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
 
 
 def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
-    """Read the offsets in metres that surveys subtract from coordinates, and return moves of the cameras by these.
+    """Read the offsets in metres that surveys subtract from coordinates; return moves of the cameras by each offset.
 
     An offset is three numbers that stand alone in a line or element of a small file. Metashape and CloudCompare write
     offsets into text files, and DJI Terra writes an offset into metadata.xml. Each offset gives two moves of the

@@ -11,7 +11,7 @@ from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.formats.table import PLY, find_format
 
 SHARP = "SHARP"  # ``source`` of this camera
-_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first versions do not write the last
+_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first versions do not write image_size
 
 
 def read_sharp(source: CameraSource) -> StoredCameras | None:

@@ -15,7 +15,7 @@ def take_optimised_poses(source: CameraSource, views: list[StoredView]) -> list[
     """Replace the poses of views by the optimised poses of InstantSplat's last iteration.
 
     Views stay unchanged if InstantSplat wrote no optimised poses, or if the optimisation started from other poses than
-    the poses of the file.
+    those of the file.
     """
     paths = (source.path.parent / "pose").glob("ours_*/pose_optimized.npy")
     last_path = max(paths, key=lambda path: natural_key(path.parent.name), default=None)

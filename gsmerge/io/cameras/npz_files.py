@@ -160,8 +160,8 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
     """Scale intrinsics that are divided by the image size, or are for another size, to ``width`` and ``height``.
 
-    The networks put the principal point in the middle of the image. Twice the principal point is thus the size for
-    which intrinsics are.
+    The networks put the principal point in the middle of the image. Twice the principal point is thus the image size to
+    which intrinsics belong.
     """
     size = np.array([width, height])
     least_centre = 1e-9  # smaller principal points are raised to this, since a later line divides by them

@@ -47,7 +47,7 @@ def _is_camera_folder(folder: Path) -> bool:
 
 
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find the only file of any name in a folder that can be read as cameras; None without one, or if several can be.
+    """Find the only file of any name in a folder that can be read as cameras; None if no file or several can.
 
     Files of intrinsics beside poses, and cameras that gsmerge wrote for viewers, are left out.
     """

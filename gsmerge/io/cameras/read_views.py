@@ -136,7 +136,7 @@ def _two_numbers(values: Any) -> tuple[float, float]:
 def _with_size(
     path: Path, name: str, layout: ViewLayout, values: dict[str, Any], size_of: Callable[[Path], Size]
 ) -> dict[str, Any]:
-    """Return the values of a view. If the intrinsics need a size and the file has no size, read that of the image.
+    """Return the values of a view. If the intrinsics need a size and the file has no size, read the image's.
 
     ``size_of`` returns the size of an image. Raise SceneError if the intrinsics or the image are missing.
     """

@@ -16,7 +16,7 @@ from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, convert_value, to_array
 
-Key = str | tuple[str, ...]  # a key, or several names of one; the first name with a value is read
+Key = str | tuple[str, ...]  # a key, or several names of a key; the first name with a value is read
 
 
 class Entry(NamedTuple):
@@ -117,7 +117,7 @@ class PinholeKeys:
 
 @dataclass(frozen=True)
 class ViewLayout:
-    """Where a file has its list of views, and under which keys a view has its values.
+    """A description of where a file lists its views, and of the keys under which a view has its values.
 
     A value of null counts as missing. If a view lacks a value other than its name and pose, the value is taken from the
     object that has the list of views.

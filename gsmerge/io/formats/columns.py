@@ -32,7 +32,7 @@ COLUMN_KINDS = (
     ColumnKind(
         "when each Gaussian appears",
         r"trbf_.*|(scale|scaling)_?t(_\d+)?|t_scale|(log_)?(life_?(time|span)|duration).*|(opacity|cov|sigma)_t(_\d+)?",
-        remedy=_MOMENT,  # Gaussians of all times together are the scene at no time
+        remedy=_MOMENT,  # Gaussians of all times together show no moment of the scene
     ),
     ColumnKind(
         "Mip-Splatting's filter of all scales",
@@ -88,7 +88,7 @@ def _find_kind(name: str) -> ColumnKind | None:
 
 
 def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
-    """Return a note on columns and elements that are not used, though they would change renders; empty without such.
+    """Return a note on columns and elements that are not used, but would change renders; empty if there are none.
 
     ``layers``: names of other elements that hold Gaussians. Raise SceneError if a column shows that Gaussians are
     incomplete without other data, or if a column of Gaussians has an integer type.

@@ -186,7 +186,7 @@ def holds_gaussians(path: Path) -> bool:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read all Gaussians of a ``.glb``, with the axes of a ``.ply``; raise SceneError without any or for damage."""
+    """Read all Gaussians of a ``.glb``, with the axes of a ``.ply``; raise SceneError for none, or for damage."""
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
     with _damage_errors(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
         document, total = _read_document(file, budget)
@@ -239,7 +239,7 @@ class _Content:
     file: IO[bytes]
     document: dict[str, Any]
     start: int  # of the binary chunk, in bytes from the start of the file
-    end: int  # of the same, in bytes from the start of the file
+    end: int  # of the binary chunk, too
     num_read: int = 0  # bytes read so far, at most the size of the chunk
 
     def read_view(self, view_id: int) -> bytes:

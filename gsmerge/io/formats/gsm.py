@@ -30,8 +30,8 @@ from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 from gsmerge.values.arrays import as_array
 from gsmerge.version import __version__
 
-SCHEMA = 3  # version of the whole file; gsmerge 0.3.0 and earlier wrote lower ones
-HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; gsmerge 0.1 wrote the second
+SCHEMA = 3  # version of the whole file; gsmerge 0.3.0 and earlier wrote lower versions
+HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; gsmerge 0.1 wrote gsmerge-encoded
 SCENE, FEATURES = "scene", "features"  # kinds of files
 REMEDY = "run extend again with all batches"
 # Entry of the header -> its type

@@ -151,7 +151,7 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
             remedy = "export it again, since it is compressed but lacks its element 'chunk'"
         elif len(missing) < len(arrays.REQUIRED_COLUMNS) // 2:
             remedy = "export it again with them"
-        if arrays.SCALES[0] in missing:  # without any scale, a third one is expected, too
+        if arrays.SCALES[0] in missing:  # without any scale, the third scale is expected, too
             missing = [name for name in arrays.REQUIRED_COLUMNS if name in {*missing, arrays.SCALES[2]} - columns]
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:

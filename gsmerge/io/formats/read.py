@@ -274,7 +274,7 @@ def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[s
 def _judge_scales(
     paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray], choice: ScaleChoice
 ) -> ScaleJudgement:
-    """Judge whether stored scales are linear or logarithms; ``out`` was filled as if they were logarithms.
+    """Judge whether stored scales are linear or logarithms; ``out`` was filled as for logarithms.
 
     Only the scales of a PLY file may be linear. Scales in a file of gsmerge are logarithms, unless the caller states
     something else.
@@ -460,7 +460,7 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
     """Return the encoding of opacities that a part declares; None if no part declares one.
 
     Raise SceneError if parts have different encodings. For this check, the encoding of a part without a declaration is
-    guessed from its values if it has 100.
+    guessed from its values if it has 100 values.
     """
     start, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
     min_values = 100  # least number of values for a guess
@@ -536,7 +536,7 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     """Return the valid rows that are no Gaussians, but only pad the file.
 
     A row at the origin pads the file if it is not rotated, round and grey, as a row of zeros is. VolSplat pads with
-    many equal rows at the origin. If all valid rows are so, up to 15 count as Gaussians, and more raise SceneError.
+    many equal rows at the origin. If all valid rows pad, up to 15 count as Gaussians, and more raise SceneError.
     """
     rows = np.flatnonzero((out["means"][:, 0] == 0) & out["valid"])
     rows = rows[(out["means"][rows] == 0).all(1)]

@@ -121,7 +121,7 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
 
 
 def _stored_axes(path: StrPath, extensions: bytes) -> str:
-    """Return the axes that an extension states, or else those of a ``.ply``; raise SceneError if this is damaged."""
+    """Return the axes of an extension, or else those of a ``.ply``; raise SceneError if the extension is damaged."""
     position = 0  # in ``extensions``
     # Kind of the extension SPZ_ADOBE_coordinate_system, whose content is 1 for the first of AXIS_SYSTEMS, and 0 for
     # unknown axes

@@ -108,7 +108,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
 def _name_by_content(path: Path) -> None:
     """Append a hash of the content to the name of each chunk's folder, also in the index ``path``.
 
-    With such names, caches never mix chunks of two results.
+    With these hashes, caches never mix chunks of two results.
     """
     document = read_json(path)
     for number, name in enumerate(document["filenames"]):
@@ -248,7 +248,7 @@ def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> Ga
 
 
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
-    """Read chunks; raise SceneError if they take more memory than a single file with their number of bytes may take.
+    """Read chunks; raise SceneError if the chunks take more memory than one file of as many bytes may take.
 
     ``chunks``: path of each chunk -> the number of Gaussians that the index states for it, or None.
     """

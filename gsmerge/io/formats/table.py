@@ -65,7 +65,7 @@ class Format:
     max_degree: int  # largest degree of harmonics that is written; -1: the format is only read
     # Returns the content of one file if the content also depends on cameras and options; None: ``encode`` returns it
     encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
-    first_view: bool = False  # True: viewers look from its first camera, so one is placed if there is none
+    first_view: bool = False  # True: viewers start at the first camera of a file, which always gets one
     beside: str = ""  # name of a file that is written beside an output; "": none
     # Name of a file beside the output that gives viewers their first camera. {stem} is the output's name without its
     # ending. "": there is no such file
