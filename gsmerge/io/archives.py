@@ -9,13 +9,14 @@ from contextlib import contextmanager
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
 
-# With other methods, zipfile may unpack more bytes of a member than the directory states
+# With methods other than stored and deflated, zipfile may unpack more bytes of a member than the archive's directory
+# states
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 @contextmanager
 def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
-    """Open a zip archive; SceneError if a member is packed with a method other than "stored" or "deflated"."""
+    """Open a zip archive; raise SceneError if a member is packed with a method other than "stored" or "deflated"."""
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
             if info.compress_type not in _METHODS:
@@ -25,13 +26,13 @@ def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
 
 
 def new_member(name: str) -> zipfile.ZipInfo:
-    """Make a member to write. Its date is 1980 and its system Unix, so that archives have the same bytes everywhere."""
+    """Make a member to write, with the date 1980 and the system Unix, so that equal members give equal archives."""
     member = zipfile.ZipInfo(name)
     member.create_system = 3
     return member
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """Read only as many bytes of a member as the directory states, where ``ZipFile.read`` might unpack more."""
+    """Read a member, but only the bytes that the archive's directory states; ``ZipFile.read`` might unpack more."""
     with archive.open(info) as file:
         return file.read(info.file_size)

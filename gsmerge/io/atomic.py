@@ -1,12 +1,12 @@
 """Write one or several files completely or not at all.
 
 Each file is first written under a temporary name in its folder. When all files are on the disk, all are renamed. The
-temporary name contains the process id and a hash of the machine. A later process can thus remove the files of a killed
-process.
+temporary name contains the process id and a hash of the machine, by which a later process recognises and removes the
+temporary files of a killed process.
 
-A file that replaces another file takes its mode, and its owner and group where the system allows that. A new file has
-the rights that the umask leaves. A new file with the content of other files, such as photos, gets only rights that
-these files have as well.
+A file that replaces an old file takes the old file's mode, and its owner and group where the system allows that. A new
+file has the rights that the umask leaves. A new file with the content of input files, such as photos, gets only rights
+that all the input files have as well.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import walk_files
 from gsmerge.types import StrPath
 
-# Errors of the disk while a file is written. Other OSErrors come from what the caller does
+# Numbers of OSErrors that the disk causes while a file is written. OSErrors with other numbers come from the caller
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 # Problem and remedy in the error for an output that exists
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
@@ -48,9 +48,9 @@ _written: set[str] = set()  # the temporary files of this process
 def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = 0o666) -> Iterator[Path]:
     """Yield an empty temporary file beside ``path``, and rename it to ``path`` when the block succeeds.
 
-    Missing folders are made. If ``path`` is a link, the file to which it points is replaced. If ``path`` is already a
-    temporary file, made by a block around this block, it is yielded unchanged. SceneError if the file cannot be
-    written, or if it exists and ``overwrite`` is False.
+    Missing folders are made. If ``path`` is a link, the file to which it points is replaced. If ``path`` is already the
+    temporary file of an enclosing block, ``path`` is yielded unchanged. Raise SceneError if the file cannot be written,
+    or if it exists and ``overwrite`` is False.
     """
     with atomic_outputs(overwrite=overwrite, mode=mode) as add:
         yield add(Path(path))
@@ -58,15 +58,16 @@ def atomic_output(path: StrPath, *, overwrite: bool = False, mode: int = 0o666) 
 
 @contextmanager
 def atomic_outputs(*, overwrite: bool = False, mode: int = 0o666) -> Iterator[AddOutput]:
-    """Write several files and rename all of them at the end. If the block fails, no file remains.
+    """Write several files under temporary names, and rename all files at the end. If the block fails, no file remains.
 
     Yields a function that adds a file and returns its temporary file, as in :func:`atomic_output`. If the process is
     killed or the disk fails between two renames, each file is complete, either old or new. Files in deeper folders are
-    renamed first, and are on the disk under their names before files of the next folder are renamed. Therefore an index
-    in a folder above never names a missing file.
+    renamed first, and are on the disk under their names before files of the next folder are renamed. An index thus
+    never names a missing file in a folder below its own.
 
-    ``mode``: the most rights that new files get. For outputs with the content of other files, :func:`common_mode` gives
-    this mode. If the same call replaces other files, new files get only rights that these files have as well.
+    ``mode``: the most rights that new files get. For outputs with the content of input files, :func:`common_mode`
+    computes ``mode``. If one call replaces some files and makes others, the new files get only rights that the replaced
+    files have as well.
     """
     outputs = _Outputs(overwrite, [mode])
     try:
@@ -83,7 +84,7 @@ def atomic_outputs(*, overwrite: bool = False, mode: int = 0o666) -> Iterator[Ad
 
 @dataclass(frozen=True)
 class _Outputs:
-    """The files of one call of :func:`atomic_outputs`."""
+    """The files that one call of :func:`atomic_outputs` writes."""
 
     overwrite: bool
     modes: list[int]  # a new file has only rights that all of these modes have
@@ -137,7 +138,7 @@ class _Outputs:
         return SceneError(path, f"could not be written ({error.strerror})", remedy)
 
     def remove_rest(self) -> None:
-        """Remove temporary files that were not renamed, and new folders that are empty."""
+        """Remove the temporary files that were not renamed, and the folders that this call made if they are empty."""
         for temporary in self.paths:
             with suppress(OSError):
                 os.unlink(temporary)
@@ -161,7 +162,7 @@ def _make_folder(folder: Path) -> Iterator[Path]:
 
 
 def common_mode(paths: Iterable[Path]) -> int:
-    """Return the mode with the rights that all files have in common. The owner can always read and write.
+    """Return the mode with the rights that all files have in common. By this mode the owner can always read and write.
 
     A folder in ``paths`` stands for all files in it and below it. Missing files do not count.
     """
@@ -172,7 +173,8 @@ def common_mode(paths: Iterable[Path]) -> int:
 def _copy_rights(source: Path, path: str) -> None:
     """Give a file the mode of ``source``, and the group and owner of ``source`` if the system allows that.
 
-    If the file keeps another group, this group gets only the rights that ``source`` gives to everyone.
+    If the file cannot get the group of ``source``, its own group gets only the rights that ``source`` gives to
+    everyone.
     """
     status = os.stat(source)
     with suppress(OSError):
@@ -187,7 +189,7 @@ def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
     """Rename each temporary file to its final name, folder by folder.
 
     Without ``overwrite``, all renamed files are removed again if another process has meanwhile made a file with one of
-    the names.
+    the final names.
     """
     renamed = list[Path]()
     try:
@@ -203,9 +205,9 @@ def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
 
 
 def _rename_to_new(temporary: str, target: Path) -> None:
-    """Give a file a new name; FileExistsError if a file has this name, even if another process makes it meanwhile.
+    """Rename a file; raise FileExistsError if a file has the new name, even if another process makes it meanwhile.
 
-    The temporary name may stay as a second name, until :meth:`_Outputs.remove_rest` removes it.
+    The temporary name may stay as a second name of the file, until :meth:`_Outputs.remove_rest` removes it.
     """
     try:
         (os.rename if sys.platform == "win32" else os.link)(temporary, target)  # both fail if the name exists
@@ -218,13 +220,13 @@ def _rename_to_new(temporary: str, target: Path) -> None:
 
 
 def _flush_names(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk, if the system can wait for that."""
+    """Wait until the names of a folder's files are on the disk, if the system can wait for that."""
     with suppress(OSError):
         _flush(folder)
 
 
 def _flush(path: str | Path) -> None:
-    """Wait until the content of a file, or the names in a folder, are on the disk."""
+    """Wait until the content of a file, or the names of a folder's files, are on the disk."""
     if sys.platform == "win32" and not os.access(path, os.W_OK):
         return  # the file is a link to a read-only file, and Windows flushes only writable files
     descriptor = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
@@ -238,7 +240,7 @@ def _flush(path: str | Path) -> None:
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a temporary path beside ``path`` that has its suffix, a hash of the machine and the process id."""
+    """Return a temporary path beside ``path``, with the same suffix, a hash of the machine and the process id."""
     max_suffix = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
     suffix = path.suffix if len(os.fsencode(path.suffix)) <= max_suffix else ""
     return path.with_name(f".gsmerge-{_machine_hash()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
@@ -246,10 +248,10 @@ def temporary_path(path: Path) -> Path:
 
 @cache
 def _machine_hash() -> str:
-    """Return a hash of the machine and the container. Within both, process ids are unique.
+    """Return a hash of the machine and the container, since process ids are unique only within one container.
 
-    Different containers often have equal host names and equal ids of name spaces. Therefore Linux's random boot id is
-    hashed as well.
+    Different containers often have equal host names and equal ids of name spaces. The random boot id of Linux is
+    therefore hashed, too.
     """
     try:
         names = f"{Path(_BOOT).read_text(encoding='ascii')} {os.readlink('/proc/self/ns/pid')}"
@@ -262,7 +264,7 @@ def _machine_hash() -> str:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove temporary files in a folder if their process has ended, and files of other machines after a week."""
+    """Remove a folder's temporary files whose process has ended; files of other machines are removed after a week."""
     with suppress(OSError), os.scandir(folder) as entries:  # another process may remove files, or rights may be missing
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)
@@ -276,8 +278,8 @@ _remove_stale_once = cache(remove_stale)  # once per folder and process, since l
 def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
     """Return whether a temporary file is abandoned, because the process that wrote it has ended.
 
-    Processes of other machines are not visible. On Windows ``os.kill`` would end a process instead of asking for it. In
-    both cases, a file is abandoned if it is old.
+    Processes of other machines are not visible, and on Windows ``os.kill`` would end a process. Files of other
+    machines, and all files on Windows, count as abandoned if they are a week old.
     """
     if machine != _machine_hash() or sys.platform == "win32":
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS
@@ -293,7 +295,7 @@ def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
 
 
 def _check_writable(path: Path, overwrite: bool) -> None:
-    """Raise SceneError if an output cannot be written, or if it exists and ``overwrite`` is False."""
+    """Raise SceneError if an output cannot be written, or if the output exists and ``overwrite`` is False."""
     try:
         status = os.stat(path)
     except FileNotFoundError:

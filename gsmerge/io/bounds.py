@@ -1,7 +1,8 @@
 """Limit the memory and time for reading a file, so that a small damaged file cannot fill the memory.
 
-A reader may take 64 MB of memory and 20 bytes more for each byte of the file. Its loops may take 5 s, and 2 s more for
-each MB. A reader checks its :class:`ReadBudget` before it allocates memory or runs a loop whose size the file states.
+A reader may take 64 MB of memory and 20 bytes more for each byte of the file. The loops of a reader may take 5 seconds,
+and 2 seconds more for each MB. A reader checks its :class:`ReadBudget` before it allocates memory or runs a loop whose
+size the file states.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class ReadBudget:
     Args:
         path: The file.
         file_bytes: Size of the file, with all files that are read together with it.
-        memory_per_byte: Bytes of memory for each byte of the file, besides 64 MB for any file.
+        memory_per_byte: Bytes of memory that reading may take for each byte of the file, besides 64 MB for any file.
         remedy: Remedy in the error for a file that needs more memory.
     """
 
@@ -56,7 +57,7 @@ class ReadBudget:
         return _FREE_MEMORY + self.memory_per_byte * self.file_bytes
 
     def check_memory(self, num_bytes: float, what: str) -> None:
-        """Raise SceneError if ``what`` needs ``num_bytes`` of memory, and the file allows fewer."""
+        """Raise SceneError if ``num_bytes`` of memory, which ``what`` needs, are more than the file allows."""
         if not num_bytes <= self.memory:
             problem = f"expected at most {self.memory / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
             raise SceneError(self.path, f"{problem}, found {what} of {num_bytes / 1e6:,.0f} MB", self.remedy)
@@ -73,12 +74,12 @@ class ReadBudget:
 
 
 def read_budget(path: Path) -> ReadBudget:
-    """Return the budget of a file; SceneError as in :func:`check_file`."""
+    """Return the budget of a file; raise SceneError as in :func:`check_file`."""
     return ReadBudget(path, check_file(path))
 
 
 def parse_json(text: str, budget: ReadBudget) -> Any:
-    """Parse JSON; SceneError if its objects would take more memory than the budget, ValueError for other text."""
+    """Parse JSON; raise SceneError if its objects take more memory than the budget, ValueError if it is no JSON."""
     objects = sum(size * text.count(character) for character, size in _JSON_BYTES.items())
     budget.check_memory(sys.getsizeof(text) + objects, "JSON")
     try:
@@ -99,7 +100,7 @@ def read_errors(path: StrPath) -> Iterator[None]:
 
 
 def check_file(path: Path) -> int:
-    """Return the size of a file in bytes; SceneError if the file is missing, or of a kind that is not read."""
+    """Return the size of a file in bytes; raise SceneError if the file is missing, or of a kind that is not read."""
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
@@ -117,7 +118,7 @@ def check_file(path: Path) -> int:
 
 
 def walk_files(folder: Path) -> list[Path]:
-    """List all files in and below a folder, but not behind links to folders; SceneError for too many files."""
+    """List all files in and below a folder, but not in linked folders; raise SceneError for more than ``MAX_FILES``."""
     files: list[Path] = []
     for num_folders, (base, _, names) in enumerate(os.walk(folder), 1):
         files += [Path(base) / name for name in names]
@@ -128,20 +129,20 @@ def walk_files(folder: Path) -> list[Path]:
 
 
 def read_text(path: Path) -> str:
-    """Read a UTF-8 text file; SceneError if the file is too large or no text."""
+    """Read a UTF-8 text file; raise SceneError if the file is too large or no text."""
     with _text_file(path, MAX_TEXT_BYTES) as file:
         return file.read()
 
 
 def read_lines(path: Path, limit: int = MAX_TEXT_BYTES) -> Iterator[str]:
-    """Yield the lines of a UTF-8 text file with their line ends, one at a time; SceneError as in :func:`read_text`."""
+    """Yield the lines of a UTF-8 text file, with line ends, one at a time; raise SceneError as :func:`read_text`."""
     with _text_file(path, limit) as file:
         yield from file
 
 
 @contextmanager
 def _text_file(path: Path, limit: int) -> Iterator[TextIO]:
-    """Open a UTF-8 text file; SceneError as in :func:`read_text`."""
+    """Open a UTF-8 text file; raise SceneError as in :func:`read_text`."""
     size = check_file(path)
     if size > limit:
         raise SceneError(path, f"expected a text file of at most {limit >> 20} MiB, found {size >> 20} MiB")
@@ -153,7 +154,7 @@ def _text_file(path: Path, limit: int) -> Iterator[TextIO]:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file of at most 32 MiB; SceneError if the file cannot be read or is no JSON."""
+    """Read a JSON file of at most 32 MiB; raise SceneError if the file cannot be read or is no JSON."""
     text = read_text(path)
     try:
         return parse_json(text, read_budget(path))
@@ -171,7 +172,7 @@ def check_image_size(path: StrPath, width: int, height: int) -> None:
 
 
 def check_whole(value: Any, name: str, least: int, most: int = 2**53) -> int:
-    """Return ``value`` if it is a whole number from ``least`` to ``most``; ValueError for any other value.
+    """Return ``value`` if it is a whole number from ``least`` to ``most``; raise ValueError for any other value.
 
     The error begins with ``name``. By default ``most`` is 2^53, since every JSON reader stores whole numbers up to 2^53
     exactly.

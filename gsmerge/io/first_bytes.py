@@ -79,7 +79,7 @@ OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("TIFF", (".tif", ".tiff"), r"II[*+]\0|MM\0[*+]"),
 )
 CONVERT = "convert it to .jpg or .png"
-# If several rows match a file, the first of them says what it is
+# If several rows match a file, the first of these rows says what the file is
 OTHER_CONTENTS = (
     OtherContent("a Git LFS pointer", r"version https://git-lfs\.github\.com/spec/", "fetch it with: git lfs pull"),
     OtherContent(
@@ -111,7 +111,7 @@ OTHER_CONTENTS = (
 
 
 def read_start(path: Path, count: int = 1 << 12) -> bytes:
-    """Read the first bytes of a file, which show its kind; empty if the file cannot be read."""
+    """Return the first bytes of a file, which show its kind; no bytes if the file cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         return file.read(count)
     return b""
@@ -134,7 +134,8 @@ def refuse_picture(path: Path) -> None:
 def check_first_bytes(path: Path, size: int) -> None:
     """Raise SceneError, with a remedy, if the ending or the first bytes of a file show content that is not read.
 
-    ``size``: bytes of the file. A file that cannot be opened is not refused here, since its reader reports that.
+    ``size``: bytes of the file. A file that cannot be opened is not refused here, since the reader of the file reports
+    the error.
     """
     ending = path.suffix.lower()
     if size == 0 and ending in NO_TEXT:
@@ -151,6 +152,6 @@ def check_first_bytes(path: Path, size: int) -> None:
         if match:
             quote = (match.groupdict().get("quote") or b"").decode("utf-8", "replace").strip()
             shown = f" ({' '.join(quote.split())!r:.60})" if quote else ""
-            # Archives and glTF may have a scene inside
+            # An archive or a glTF may have a scene inside
             expected = "scene" if row.remedy in (_UNPACK, _GLB) else f"{ending} file".strip()
             raise SceneError(path, f"expected a {expected}, found {row.what}{shown}", row.remedy)

@@ -1,4 +1,4 @@
-"""Find image files by the names of views, in a folder and its sub-folders. Names may lack the extension."""
+"""Find image files in a folder and its sub-folders by the names of views, which may lack the extension."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmerge.types import StrPath
 
 OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of formats not read
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
-# Last bytes of the videos that gsmerge writes, which tell them from other videos. Players skip them as an unknown part
+# Last bytes of the videos that gsmerge writes, which no other video has. Players skip these bytes as an unknown part
 CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
 _CUT_FILM = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
 HOLD_PHOTOS = (".npz", ".gsm")  # endings of files that may have photos inside
@@ -29,7 +29,7 @@ PathT = TypeVar("PathT", str, Path)
 
 
 def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
-    """Find the image file of each name, in the order of ``names``; see :func:`read_images` for source and errors."""
+    """Find the image file of each name, in the order of ``names``; :func:`read_images` describes source and errors."""
     if isinstance(source, str | os.PathLike):
         root = Path(source)
         if not root.is_dir():
@@ -73,9 +73,9 @@ def _path_endings(path: PurePath) -> list[str]:
 
 
 def _find_matches(by_ending: dict[str, list[Path]], name: str) -> list[Path]:
-    """List the files that match a name best: all files with the longest ending of the name that any file has.
+    """List the files that match a name best: the files whose paths share the longest ending with the name.
 
-    The list is empty if no file matches.
+    The list is empty if no file matches the name.
     """
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
     return next((by_ending[ending] for ending in _path_endings(PurePosixPath(*parts)) if ending in by_ending), [])
@@ -84,8 +84,8 @@ def _find_matches(by_ending: dict[str, list[Path]], name: str) -> list[Path]:
 def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixels: PixelCount) -> list[Path | None]:
     """Propose one of ``files`` below a folder for each name; None if no file matches the name.
 
-    Of several files that match, a file whose whole path is in the name comes first, then a file outside of hidden
-    folders, then the file with most ``pixels``.
+    Of several files that match a name, a file whose whole path is in the name is preferred. A file outside of hidden
+    folders is the second choice, and the file with the most ``pixels`` the third choice.
     """
     by_ending = _files_by_ending(root, files)
 
@@ -105,7 +105,7 @@ def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixe
 
 
 def _find_only(root: Path, by_ending: dict[str, list[Path]], name: str, option: str = "--images") -> Path | None:
-    """Return the only file that matches a name; None if no file does, SceneError if several do."""
+    """Return the only file that matches a name; None if no file matches, SceneError if several files match."""
     matches = _find_matches(by_ending, name)
     if len(matches) > 1:
         first, second = (os.path.relpath(path, root) for path in matches[:2])
@@ -119,12 +119,13 @@ def match_masks(
 ) -> tuple[list[Path | None], list[str]]:
     """Find the mask of every view by the name of its photo, with or without extension; None for a view without a mask.
 
-    Also returns a list of notes. A note names masks that belong to no view, or says that no view has a mask. SceneError
-    if a view has two masks, or if the user ``named`` the folder and no view has a mask; the error names the ``option``.
+    Also return a list of notes. A note names masks that belong to no view, or says that no view has a mask. Raise
+    SceneError if a view has two masks, or if the user ``named`` the folder and no view has a mask; the error names the
+    ``option``.
     """
 
     def is_of_neighbour(mask: Path, photo: Path) -> bool:
-        """Return whether a mask lies in a sub-folder that has the name of another folder of photos than the photo's."""
+        """Return whether the sub-folder of a mask has the name of a folder beside the folder of the photo."""
         neighbour = photo.parent.parent / mask.parent.name
         return mask.parent != folder and neighbour != photo.parent and neighbour.is_dir()
 
@@ -146,7 +147,7 @@ def match_masks(
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List all images in and below a folder in natural order ("2" before "10"); SceneError for too many files."""
+    """List all images in and below a folder in natural order ("2" before "10"); raise SceneError for too many files."""
     images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
     return natural_order(images)
 
@@ -166,12 +167,13 @@ def check_photo_folder(path: Path) -> None:
 def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
     """Return a note on pictures or videos that cannot be read, in the sub-folders ``places`` or in the folder itself.
 
-    The note is on the first of these folders that has such files. The list is empty if none has any.
+    The note describes the first of the folders with unreadable pictures or videos. The list is empty if no folder has
+    any.
     """
     for place in (*(folder / name for name in places), folder):
         with suppress(OSError):
             files = (path for path in place.iterdir() if path.is_file())
-            # A GIF is no photo, but a video
+            # A GIF counts as a video, which is no photo
             unread = _describe_unread_files([path for path in files if path.suffix.lower() != ".gif"])
             if unread is not None:
                 content, remedy = unread
@@ -189,7 +191,7 @@ def _describe_unread_files(files: Sequence[Path]) -> tuple[str, str] | None:
 
 
 def is_clip(video: Path) -> bool:
-    """Return whether gsmerge wrote a video, which its last bytes show."""
+    """Return whether the last bytes of a video show that gsmerge wrote the video."""
     end = CLIP_ENDS.get(video.suffix.lower(), b"")
     with suppress(OSError), video.open("rb") as file:
         file.seek(-len(end), os.SEEK_END)
@@ -204,16 +206,16 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def natural_order(paths: Iterable[PathT]) -> list[PathT]:
-    """Sort paths so that "view 2" comes before "view 10". "view 2" and "view 02" are sorted as text."""
+    """Sort paths so that "view 2" comes before "view 10"; equal numbers, such as 2 and 02, are sorted as text."""
     return sorted(sorted(paths), key=lambda path: natural_key(os.fspath(path).replace(os.sep, "/")))
 
 
 def find_image(folder: Path, name: str, cameras: Path, *, option: str = "--images", remedy: str = "") -> Path | None:
     """Find the image that a file of ``cameras`` names, with or without extension; None if there is none.
 
-    SceneError for an image outside the folder, since a camera file from elsewhere could name any picture of this
-    machine. The error has the ``remedy``, or by default says to name the folder with the ``option``. Links to files
-    inside the folder are followed.
+    Raise SceneError for an image outside the folder, since a camera file from elsewhere could name any picture of this
+    machine. The remedy of the error is ``remedy``, or by default to name the folder with ``option``. Links inside the
+    folder are followed.
     """
     path = os.path.normpath(os.path.join(folder, name))
     candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]

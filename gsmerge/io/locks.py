@@ -1,4 +1,4 @@
-"""Lock files between processes. A lock file exists only while a process has the lock."""
+"""Lock files so that one process at a time writes. A lock file exists only while a process has the lock."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gsmerge.errors import SceneError
 def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
     """Lock a file for the block against other processes, and yield whether this process has the lock.
 
-    If another process has the lock, the call waits for it, or yields False without ``wait``. SceneError if the lock
-    file cannot be made.
+    If another process has the lock, the call waits until the lock is free, or yields False if ``wait`` is False. Raise
+    SceneError if the lock file cannot be made.
     """
     from filelock import FileLock, Timeout  # most commands need no lock
 
@@ -29,7 +29,8 @@ def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
     try:
         yield True
     finally:
-        # The file is removed before the release, so that a waiting process notices that its file is no longer the lock
-        with suppress(OSError):  # Windows cannot remove an open file; there the release removes the file
+        # The lock file is removed before the release, so that a waiting process notices that its file is no longer the
+        # lock file
+        with suppress(OSError):  # an open file on Windows, which the release removes
             path.unlink()
         lock.release()

@@ -33,7 +33,7 @@ class PointsOnly:
 _TRAIN_OR_NAME = "train Gaussians on it, or name the .ply of a model, and this file with --cameras"
 # What a folder of photos contains, and the remedy
 _PHOTOS = "photos", "make Gaussians from the photos first, with a model such as Depth Anything 3 or AnySplat"
-# If several rows match a folder, the first of them says what it is
+# If several rows match a folder, the first of these rows says what the folder contains
 POINTS_ONLY = (
     PointsOnly(
         "Depth Anything 3",
@@ -59,7 +59,7 @@ POINTS_ONLY = (
 
 
 def no_gaussians(folder: Path) -> SceneError:
-    """Make the error for a folder without a scene. It says what the folder contains, and what to do."""
+    """Make the error for a folder without a scene. The error says what the folder contains, and what to do."""
     try:
         os.scandir(folder).close()
     except OSError as error:
@@ -70,7 +70,7 @@ def no_gaussians(folder: Path) -> SceneError:
 
 
 def find_remedy(folder: Path) -> str:
-    """Say what a folder without scenes, or one of its sub-folders, contains, and what to do; empty if not known."""
+    """Say what a folder without scenes, or one of its sub-folders, contains, and what to do; "" if not known."""
     with suppress(OSError):
         subfolders = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
         searched = (folder, *islice(subfolders, MAX_SEARCHED_FOLDERS))
@@ -82,7 +82,7 @@ def find_remedy(folder: Path) -> str:
 
 
 def _describe_content(folder: Path) -> tuple[str, str] | None:
-    """Describe what a folder without a scene contains, and return a remedy with it; None if nothing in it is known."""
+    """Describe what a folder without a scene contains, and add a remedy; None if nothing in the folder is known."""
     files = (
         path
         for path in sorted(folder.glob("[!.]*"))
@@ -107,7 +107,7 @@ def _describe_content(folder: Path) -> tuple[str, str] | None:
 
 
 def check_scene_file(path: Path) -> None:
-    """Raise SceneError, with a remedy, for a file of an ending like ``.npz`` or ``.glb`` that holds no Gaussians."""
+    """Raise SceneError, with a remedy, for a file without Gaussians whose ending, like ``.npz``, allows Gaussians."""
     suffix = path.suffix.lower()
     if suffix not in SEVERAL_USES or check_file(path) == 0 or may_hold_gaussians(path):
         return

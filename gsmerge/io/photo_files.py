@@ -30,7 +30,7 @@ _FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads;
 _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
 # Relative difference up to which two ratios of width and height are equal. A network that rounds a side of 350 pixels
-# to a multiple of 14 changes it by up to 7 pixels, which is this share
+# to a multiple of 14 changes the side by up to 7 pixels, which are 2 %
 ASPECT_TOLERANCE = 0.02
 # First and last bytes of a PNG file
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
@@ -38,13 +38,13 @@ _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # start of a file, and of each of its s
 _PHOTO_MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
 _COPIES = 2, 3  # copies of all pixels in memory: while OpenCV decodes, and at most while Pillow decodes and converts
 _PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # bytes of a pixel by Pillow's mode; 4 in all other modes
-# Bytes of memory for each pixel while a decoder works, besides the decoded pixel
+# Bytes of memory for each pixel that a decoder needs besides the decoded pixel
 _COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10
-# First bytes of a file -> the plugin of Pillow that opens it
+# First bytes of an image file -> the plugin of Pillow that opens the file
 _PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp"}
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 # Most bytes of a scene's decoded photos: for any files, and in addition for each byte of the files. Even strongly
-# compressed photos have more than the 0.03 bytes per pixel that this needs
+# compressed photos have more than 3 / 100 bytes per pixel, so that their 3 bytes in memory are allowed
 _FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100
 _SMALLER = "reduce its size: a mask to that of its photo, a photo to about that of its view"
 _BAND = 256  # rows of a mask that are converted at once
@@ -61,7 +61,7 @@ _AT_ONCE = 128 << 20  # most bytes of decoded photos in memory; if they need mor
 
 @dataclass(frozen=True, eq=False)
 class PhotoReader:
-    """c photos of one size ``(width, height)``, which are decoded at each use and not stored in memory."""
+    """A list of c photos of one size, which are decoded at each use and not stored in memory."""
 
     count: int
     size: Size
@@ -85,7 +85,7 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 
     ``source`` is a folder, which is searched with its sub-folders, or a list of image files. ``names`` are the names in
     a camera file, with or without folders and extension. If no name matches but there are as many images as names, the
-    images of a folder are used in natural order ("2" before "10"), and images of a list in the order of the list.
+    images of a folder are used in natural order ("2" before "10"), and images of a list in the order of the list. Raise
     SceneError if an image is missing or cannot be read, or if images differ in size.
     """
     return as_floats(decode_images(match_images(source, names)))
@@ -94,8 +94,8 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 def decode_images(paths: Sequence[Path]) -> PhotoArrays:
     """Decode image files of one size to ``[h,w,3]`` uint8 each. Large images are decoded at each use.
 
-    A file that is several times in ``paths`` is decoded once. SceneError if an image cannot be read, if two images
-    differ in size, or if all together take more memory than the bytes of their files allow.
+    A file that is several times in ``paths`` is decoded once. Raise SceneError if an image cannot be read, if two
+    images differ in size, or if all images together take more memory than the bytes of their files allow.
     """
     files = list(dict.fromkeys(paths))
     sizes = {path: image_size(path) for path in files}
@@ -121,7 +121,8 @@ def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size
     """Decode the photo of each view, turn it upright, and resize a ``part`` of it to ``[h,w,3]`` uint8 of one ``size``.
 
     ``turns`` are those of :func:`orientation_turn`. A view without a file gets a black photo. Large photos are decoded
-    at each use. Other photos are decoded once, also if several views have them. SceneError as in :func:`decode_images`.
+    at each use. Other photos are decoded once, even if several views have the same photo. Raise SceneError as in
+    :func:`decode_images`.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
@@ -147,8 +148,8 @@ def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size
 def decode_small(path: Path, side: int) -> np.ndarray:
     """Decode a small version of a photo to ``[h,w,3]`` float32 sRGB in [0, 1].
 
-    The longer side has ``side`` to twice ``side`` pixels; a photo that is smaller keeps its size. The orientation tag
-    is ignored. JPEG files are decoded at a reduced size, which is fast.
+    The longer side then has ``side`` to twice ``side`` pixels. A photo with a longer side below ``side`` keeps its
+    size. The orientation tag is ignored. JPEG files are decoded at a reduced size, which is fast.
     """
     width, height = image_size(path)
     divisor = next(divisor for divisor in reversed(_REDUCTIONS) if max(width, height) >= divisor * side or divisor == 1)
@@ -166,9 +167,9 @@ def decode_small(path: Path, side: int) -> np.ndarray:
 def change_photos(
     photos: PhotoArrays, change: Callable[[int, np.ndarray], np.ndarray], size: Size | None = None
 ) -> PhotoArrays:
-    """Apply ``change(index, photo)`` to every photo. Photos of a reader are changed at each use.
+    """Apply ``change(index, photo)`` to every photo. Photos of a :class:`PhotoReader` are changed at each use.
 
-    ``size``: size of the changed photos, if it differs from that of the photos.
+    ``size``: size of the changed photos; None if ``change`` keeps the size.
     """
     if isinstance(photos, PhotoReader):
         return PhotoReader(len(photos), size or photos.size, lambda index: change(index, photos[index]))
@@ -176,12 +177,12 @@ def change_photos(
 
 
 def keep_photos(photos: PhotoArrays) -> PhotoArrays:
-    """Decode all photos of a reader into memory, for callers that use each photo more than once."""
+    """Decode all photos of a :class:`PhotoReader` into memory, for callers that use each photo more than once."""
     return parallel_map(photos.read, range(len(photos))) if isinstance(photos, PhotoReader) else photos
 
 
 def decode_image(path: Path, size: Size) -> np.ndarray:
-    """Decode an image file whose ``size`` is known to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
+    """Decode an image file of known ``size`` to ``[h,w,3]`` uint8 sRGB; raise SceneError if it cannot be read."""
     with read_errors(path):
         data = np.fromfile(path, np.uint8)
     _check_scans(path, data, size)
@@ -214,7 +215,7 @@ def photo_array(images: np.ndarray | None) -> np.ndarray:
 
 
 def part_size(size: Size, part: Part) -> Size:
-    """Return the size in pixels of a part of a photo whose size is ``size``."""
+    """Return the (width, height) of a part of a photo; ``size`` is the whole photo's."""
     left, top, right, bottom = (round(side * share) for side, share in zip(size * 2, part, strict=True))
     return max(1, right - left), max(1, bottom - top)
 
@@ -234,8 +235,9 @@ def same_shape(size: Size, other: Size) -> bool:
 def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     """Decode the brightness ``[h,w]`` of a mask, times its opacity, as uint8 with white as 255.
 
-    The file may store white as 1, 255 or 65,535. White is the least of these values that no pixel exceeds. The bytes of
-    the mask and of its ``photo`` together limit the memory, since masks compress to very few bytes.
+    The file may store white as 1, 255 or 65,535. White is taken as the least of 1, 255 and 65,535 that no pixel
+    exceeds. The bytes of the mask and of its ``photo`` together limit the memory, since masks compress to very few
+    bytes.
     """
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 
@@ -275,7 +277,7 @@ def decode_alpha(path: Path) -> np.ndarray | None:
         return None
 
     def alpha(image: Image.Image) -> Image.Image | None:
-        """Return the opacities; None if the image has none."""
+        """Return the opacities of an image; None if the image has no opacities."""
         if "A" not in image.getbands() and "transparency" not in image.info:
             return None
         _check_channels(_photo_budget(path), image)
@@ -287,7 +289,7 @@ def decode_alpha(path: Path) -> np.ndarray | None:
 
 
 def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
-    """Return the budget of a photo or mask that is decoded alone; bytes of the files ``beside`` it count as well."""
+    """Return the budget of a photo or mask that is decoded alone, by its bytes and those of the files ``beside`` it."""
     return ReadBudget(path, sum(map(check_file, (path, *beside))), _PHOTO_MEMORY_PER_BYTE, _SMALLER)
 
 
@@ -300,21 +302,21 @@ def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
 
 
 def _decoder_bytes(image: Image.Image) -> float:
-    """Return how many bytes per pixel a decoder needs besides its output, as measured.
+    """Return how many bytes per pixel a decoder was measured to need besides the decoded pixels.
 
-    These bytes hold the frames of a WebP, or the coefficients of a progressive JPEG.
+    The bytes hold the frames of a WebP, or the coefficients of a progressive JPEG.
     """
     if image.format == "WEBP":
         return _MOVING_WEBP_BYTES if getattr(image, "is_animated", False) else _WEBP_BYTES
-    # Channels of a JPEG may be sampled less densely than the pixels
+    # A channel of a JPEG may have fewer samples than the image has pixels
     densities = [across * down for _, across, down, _ in getattr(image, "layer", ())]
     return _COEFFICIENT_BYTES * sum(densities) / max(densities, default=1)
 
 
 def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
-    """Open an image with Pillow, and return as an array what ``choose`` returns for it; None if this is None.
+    """Open an image with Pillow, and return the channel that ``choose`` returns as an array; None if it returns None.
 
-    SceneError if the image cannot be decoded.
+    Raise SceneError if the image cannot be decoded.
     """
     size, _ = _read_header(path)  # raises SceneError for a file that is no image or is too large
     try:
@@ -340,16 +342,16 @@ def _undecodable(path: Path, size: Size) -> SceneError:
 
 
 def _unreadable(path: Path) -> SceneError:
-    """Make the error for a file that is no image; raise a SceneError that names the format if it is a known one."""
+    """Make the error for a file that is no image; raise a SceneError for a picture of a known format."""
     refuse_picture(path)
     return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
 
 
 def image_size(path: Path) -> Size:
-    """Read (width, height) from the header of a PNG, JPEG, WebP, BMP or PNM file; its orientation is ignored.
+    """Read (width, height) from the header of a PNG, JPEG, WebP, BMP or PNM file; the orientation tag is ignored.
 
-    SceneError if the file has another format or cannot be read, if the size is impossible, or if the pixels take more
-    memory than the file allows.
+    Raise SceneError if the file has another format or cannot be read, if the size is impossible, or if the pixels take
+    more memory than the file allows.
     """
     (width, height), pixel_bytes = _read_header(path)
     _photo_budget(path).check_memory(pixel_bytes * width * height, f"{width} x {height} pixels")
@@ -357,9 +359,9 @@ def image_size(path: Path) -> Size:
 
 
 def _read_header(path: Path) -> tuple[Size, float]:
-    """Read the size of an image, and how many bytes of memory a decoder needs for each pixel.
+    """Return the size of an image, and how many bytes of memory a decoder needs for each pixel.
 
-    SceneError if the file is no image, or has far more bytes than pixels.
+    Raise SceneError if the file is no image, or has far more bytes than its pixels need.
     """
     num_bytes = check_file(path)
     with read_errors(path), path.open("rb") as file:
@@ -384,7 +386,7 @@ def orientation_turn(path: Path) -> int:
 
 
 def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
-    """Return the size in the header of an image, and how many bytes of memory a decoder needs for each pixel."""
+    """Read an image's header; return the size, and how many bytes of memory a decoder needs for each pixel."""
     start, work_bytes = file.read(24), 0.0
     file.seek(0)
     try:
@@ -407,9 +409,9 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
 
 
 def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
-    """Open an image in one of Pillow's ``formats``, with the errors of ``Image.open``.
+    """Open an image in one of Pillow's ``formats``, as ``Image.open`` does, with the same errors.
 
-    Only the plugin for the image's format is imported. Pillow would import the plugins of all formats.
+    Only the plugin for the image's format is imported, where ``Image.open`` would import the plugins of all formats.
     """
     start = file.read(max(map(len, _PLUGINS)))
     plugin = next((plugin for first, plugin in _PLUGINS.items() if start.startswith(first)), None)
@@ -448,9 +450,10 @@ def _decode(path: Path, data: np.ndarray, size: Size, divisor: int = 1) -> np.nd
 
 
 def _png_pixels(data: np.ndarray) -> np.ndarray | None:
-    """Return a PNG file ``[b]`` uint8 with only the chunks that determine its pixels; None if these are damaged.
+    """Return a PNG file ``[b]`` uint8 with only the chunks that determine its pixels; None if such a chunk is damaged.
 
-    Other chunks may have texts of many MB, and the decoder would print messages about damaged colour profiles.
+    The other chunks are left out, since texts may have many MB, and decoders print messages about damaged colour
+    profiles.
     """
     view, start, pixels = np.ascontiguousarray(data).data, len(PNG), bytearray(PNG)
     while start + 12 <= len(view):
@@ -510,7 +513,7 @@ class PhotoTransform:
 
 
 def limit_size(size: Size, side: int) -> Size:
-    """Shrink a size in proportion until its longer side has ``side`` pixels; return a smaller size unchanged."""
+    """Shrink a size in proportion until the longer side has ``side`` pixels; a size below that stays unchanged."""
     if max(size) <= side:
         return size
     scale = side / max(size)

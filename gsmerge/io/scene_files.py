@@ -45,9 +45,10 @@ from gsmerge.types import StrPath
 _check_scene_file = LazyFunction("gsmerge.io.no_gaussians", "check_scene_file")
 _no_gaussians = LazyFunction("gsmerge.io.no_gaussians", "no_gaussians")
 _holds_views = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
-# Places of a scene's .ply. The first file that exists and is no result is read, or else the folder's only .ply
+# Places of a scene's .ply in a folder. The first place with a scene is read, or else the folder's only .ply
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
-# Places where INRIA and gsplat write trained scenes. Of several scenes, the scene after the most steps is read
+# Places where INRIA and gsplat write trained scenes. Of several trained scenes, the scene after the most steps of
+# training is read
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # folder where DepthSplat and its relatives write NAME.ply; the photos are in images/NAME
 IMAGE_PLACES = (
@@ -64,7 +65,7 @@ _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.
 _USUAL_END = re.compile(
     r"/(?:(?:exports/)?gs_ply/\d+|(?:point_cloud/iteration_\d+/)?point_cloud|ply/point_cloud_\d+|scene|gaussians)$"
 )
-# A file whose name has such a word before its number holds one view or one part of a scene
+# Words before the number in a file's name, which say that the file holds one view or one part of a scene
 _PARTS = {"view", "chunk", "part", "block", "tile"}
 _LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, see :func:`level_output`
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
@@ -78,7 +79,7 @@ class SceneFiles:
     """The files of a scene.
 
     ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if the cameras are in it. ``images`` may be an ``.npz``
-    with images in it. For a ``.gsm`` both are the ``.gsm`` itself.
+    with images in it. A ``.gsm`` may hold Gaussians, cameras and images at once.
     """
 
     ply: Path
@@ -91,8 +92,8 @@ class SceneFiles:
     num_copies: int = 0  # number of other files in the folder with the same bytes as ``ply``
     named: frozenset[str] = frozenset()  # names of the fields that the caller set, so that they are not searched
     photo_option: str = "--images"  # option with which the user names the folder of ``images``
-    # Photos, cameras and masks that the scene lacks, and that lie in the folder above it: the option for each, and its
-    # path. They are named in a note, but never read
+    # Photos, cameras and masks that the scene lacks, and that lie in the folder above it: the option and the path of
+    # each. A note names these paths, but they are never read
     above: tuple[tuple[str, Path], ...] = ()
     others: tuple[Path, ...] = ()  # further cameras, which are tried in turn if ``cameras`` do not fit
     below: bool = False  # True: ``others`` are in folders below, and are read only if photos show that they fit
@@ -116,20 +117,21 @@ class SceneFiles:
 
     @property
     def choices(self) -> list[SceneFiles]:
-        """Return the scene's files once for each of the cameras to try, in the order in which they are tried.
+        """Return a copy of the scene's files for each camera file to try, in the order of the tries.
 
-        Cameras in folders below are tried only if all lie in one folder, since several folders may be other scenes.
+        Cameras in folders below the scene are tried only if one folder has them all, since several folders may be
+        scenes.
         """
         if self.below and len({Path(os.path.relpath(path, self.root)).parts[0] for path in self.others}) > 1:
             return [self]
-        # Images inside the file of ``cameras`` belong to these cameras
+        # Images inside the file of ``cameras`` belong only to the cameras of that file
         images = None if self.images == self.cameras else self.images
         return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
 
     def describe_choice(self, cameras: Path | None) -> list[str]:
-        """Return a list with a note that ``cameras`` are read and not others; empty if there were no others.
+        """Return a list with a note that ``cameras`` are read and no others; empty if there are no other cameras.
 
-        The others are cameras that were tried before, and COLMAP models beside the model that is read.
+        Other cameras are those that were tried before, and COLMAP models beside the model that is read.
         """
         if cameras is None or not self.others:
             return []
@@ -153,7 +155,7 @@ class SceneFiles:
 
     @property
     def base(self) -> Path:
-        """Path from which the names of results are made: the file, or ``scene.ply`` in the folder of several parts."""
+        """Path from which the names of results are made: the file, or ``scene.ply`` beside several parts."""
         return self.ply.with_name("scene.ply") if self.parts else self.ply
 
     @property
@@ -186,32 +188,32 @@ def find_scene_files(
     protect: StrPath | None = None,
     within: StrPath | None = None,
 ) -> SceneFiles:
-    """Find a scene's files from its path. Files that the caller names are not searched, and "none" leaves files out.
+    """Find a scene's files from its path. Files that the caller names, or leaves out by "none", are not searched.
 
-    These folders are searched in this order:
+    Folders are searched in this order:
 
     - the given folder;
     - the folder of the ``.ply``, and the folders above it up to the given folder. If the folder of the ``.ply`` is
-      ``gs_ply/``, ``ply/`` or ``gaussians/``, also the folder above it. If it is ``point_cloud/iteration_n/``, also the
-      folder two above it;
+      ``gs_ply/``, ``ply/`` or ``gaussians/``, also the folder above it. If the ``.ply`` is in
+      ``point_cloud/iteration_n/``, also the folder that has ``point_cloud/``;
     - for cameras and photos, the folder of the file to which the ``.ply`` links;
     - for cameras and photos, the folders above the ``.ply`` up to ``within``;
-    - for cameras, if none of these folders has any, the folders below the first of them.
+    - for cameras, if no folder above this line has cameras, the folders below the given folder.
 
     A folder that has Gaussians of its own is a scene, and no file in it belongs to another scene. Masks are searched
-    beside the photos that are read, and in the first two of these groups of folders.
+    beside the photos that are read, and in the folders of the first two list items.
 
     In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
-    their order. The cameras of a result, ``NAME.cameras.json``, come first, but last if they may belong to another
-    file. Of several COLMAP models in one place, the model with the most images comes first. Cameras inside the ``.ply``
-    precede cameras beside it. If no place has cameras, the only file that holds cameras is taken, whatever its name.
-    Without such a file, cameras of an unsupported program are taken, and their reader names the program. Images inside
-    the cameras' ``.npz`` precede a folder of images, because the networks saw the images inside. A result of gsmerge is
-    taken as the scene only if a folder has nothing else.
+    their order. ``NAME.cameras.json``, the cameras of a result, come first, but last if they may belong to another file
+    than NAME. Of several COLMAP models in one place, the model with the most images comes first. Cameras inside the
+    ``.ply`` precede cameras beside it. If no place has cameras, the only file that holds cameras is taken, whatever its
+    name. If no file holds cameras, a file of cameras of an unsupported program is taken, and its reader names the
+    program. Images inside the cameras' ``.npz`` precede a folder of images, because the networks saw the images inside.
+    A result of gsmerge is taken as the scene only if a folder has no other scene.
 
     Raises:
-        SceneError: If there is no ``.ply``, if there are several to choose from, or if a named file does not exist.
-            Numbered files of views or parts are one scene, see ``docs/reference/formats.md``.
+        SceneError: If there is no ``.ply``, if there are several scenes to choose from, or if a named file does not
+            exist. Numbered files of views or parts are one scene, see ``docs/reference/formats.md``.
     """
     path, given = Path(path), {"cameras": cameras, "images": images, "masks": masks}
     if images is not None and images != NONE:
@@ -253,10 +255,10 @@ def find_scene_files(
 
 
 def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, list[Path], bool]:
-    """Return the cameras of a scene or None, a list of further cameras, and whether these are in folders below.
+    """Return a scene's cameras or None, a list of further cameras, and whether the further ones are in folders below.
 
-    The order of cameras is that of :func:`find_scene_files`. Folders below the scene are searched only if there are no
-    cameras beside it.
+    The cameras are in the order that :func:`find_scene_files` describes. Folders below the scene are searched only if
+    there are no cameras beside the scene.
     """
     of_result = result_cameras(ply)
     if of_result is not None and _rate_camera_file(ply) == 2:
@@ -283,7 +285,7 @@ def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> 
 
 
 def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], ply: Path) -> Path | None:
-    """Find the first of the ``places`` in ``roots`` that has pictures, but none of another scene; None without any."""
+    """Find the first of the ``places`` in ``roots`` that has pictures, but no pictures of another scene; or None."""
     folders = [(root, f) for root in roots for place in places if can_be_listed(f := root / place, option)]
     # If a folder has several scenes, each may have its own folder of pictures, with the name of the scene
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
@@ -297,7 +299,8 @@ def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], pl
 def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
     """Return whether a path belongs to another scene than ``ply``.
 
-    A folder below ``root`` that has Gaussians, but not ``ply``, is another scene, with all files in it.
+    A folder below ``root`` that has Gaussians, but not ``ply``, is another scene. All files in another scene's folder
+    belong to that scene.
     """
     folders = [place for place in (path, *path.parents) if place != root and place.is_relative_to(root)]
     scenes = [_plys_in(place) or other_plys(place / SCENES_PLACE) for place in folders if place.is_dir()]
@@ -305,7 +308,7 @@ def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
 
 
 def can_be_listed(folder: Path, option: str) -> bool:
-    """Return whether a path is a folder; SceneError for an unreadable folder, with a remedy that names ``option``."""
+    """Return whether a path is a folder; raise SceneError, with a remedy by ``option``, if it cannot be read."""
     try:
         os.scandir(folder).close()
     except (FileNotFoundError, NotADirectoryError):
@@ -319,10 +322,11 @@ def can_be_listed(folder: Path, option: str) -> bool:
 def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Path], ...]:
     """Search the folder above a scene's own folders ``roots`` for the photos, cameras and masks that the scene lacks.
 
-    Files of a neighbouring scene do not count. Masks count only if they have the names of the scene's photos. Returns
-    the paths, each with its option.
+    Files of a neighbouring scene do not count. Masks count only if they have the names of the scene's photos. Return
+    each path that was found, after its option.
     """
-    # Of the roots that contain the scene, the least is the uppermost: a path sorts before the paths inside it
+    # The least of the roots that contain the scene is the uppermost, since a folder's path sorts before the paths
+    # inside
     folder = min(filter(Path(os.path.realpath(files.ply)).is_relative_to, roots), default=roots[0]).parent
     places = dict[str, Path | None]()
     with suppress(SceneError, OSError):
@@ -340,7 +344,7 @@ def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Pa
 
 
 def _search_roots(path: Path, ply: Path, within: StrPath | None) -> tuple[list[Path], list[Path]]:
-    """List a scene's own folders, and folders that other scenes may share with it; see :func:`find_scene_files`."""
+    """Return a scene's own folders, and folders that other scenes may share; :func:`find_scene_files` lists both."""
     given_folder = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
     program_folders = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
@@ -349,7 +353,8 @@ def _search_roots(path: Path, ply: Path, within: StrPath | None) -> tuple[list[P
     own = [Path(os.path.realpath(given_folder)), folder, *program_folders]
     own += _list_between(folder, Path(os.path.realpath(path)))
     above = _list_between(folder, Path(os.path.realpath(within or folder)))
-    # A folder above that has a scene with a usual name is not shared, since its files belong to that scene
+    # A folder that has a scene with a usual name is not shared with the scenes below, since its files belong to that
+    # scene
     shared = [Path(os.path.realpath(ply)).parent, *(place for place in above if named_ply(place) is None)]
     return list(dict.fromkeys(own)), [place for place in dict.fromkeys(shared) if place not in own]
 
@@ -362,12 +367,12 @@ def _check_folders(**folders: Path | None) -> None:
 
 
 def _list_between(folder: Path, top: Path) -> list[Path]:
-    """List the folders above a folder up to ``top``, the nearest first; empty if ``top`` is not above it."""
+    """List the folders above a folder up to ``top``, the nearest first; empty if ``top`` is not above ``folder``."""
     return [above for above in folder.parents if above.is_relative_to(top)] if folder.is_relative_to(top) else []
 
 
 def scene_title(ply: Path) -> str:
-    """Return a scene's name for a page, from its file, or from its folder if its program names all files alike."""
+    """Return a scene's name for a page: that of the file, or of the folder if a program names all its files alike."""
     path = ply.absolute().with_name(ply.stem.removesuffix(".compact")).as_posix()
     return Path(_USUAL_END.sub("", path)).name or ply.stem
 
@@ -388,8 +393,9 @@ def result_cameras(ply: Path) -> Path | None:
 def _rate_camera_file(ply: Path) -> int:
     """Rate how surely ``NAME.cameras.json`` has the cameras of the file called NAME: 2 is sure, 0 is no.
 
-    A ``.ply`` gets one point if gsmerge wrote it, and one if no file of another format has its name. A result gets
-    both. A file of another format gets both as well, since its header does not say what it is.
+    A ``.ply`` gets one point if gsmerge wrote it, and one point if no file of another format has the same name. A
+    result gets both points. A file of another format than ``.ply`` gets both points, too, since its header does not say
+    what it is.
     """
     if find_format(ply).ending != ".ply" or header_content(ply) == "result":
         return 2
@@ -398,7 +404,7 @@ def _rate_camera_file(ply: Path) -> int:
 
 
 def named_path(path: StrPath | None) -> Path | None:
-    """Return a path that the caller named, None for None and "none"; SceneError if the path does not exist."""
+    """Return a path that the caller named, None for None and "none"; raise SceneError if the path does not exist."""
     if path is None or path == NONE:
         return None
     if not os.path.exists(path):
@@ -410,9 +416,9 @@ def named_path(path: StrPath | None) -> Path | None:
 
 
 def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
-    """Find the file of a folder's only scene, or the files of all its parts in order.
+    """Find the file of a folder's only scene, or the files of all parts of that scene, in order.
 
-    If all files have the same bytes, only the first is returned. Errors are those of :func:`find_scene_files`.
+    If all files have the same bytes, only the first file is returned. Errors are those of :func:`find_scene_files`.
     """
     plys = list_plys(folder)
     if not plys:
@@ -427,7 +433,7 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
 
 
 def _are_copies(plys: Sequence[Path]) -> bool:
-    """Return whether numbered files have the same bytes. Flash3D writes such a file for each view that it renders."""
+    """Return whether files are numbered and have the same bytes. Flash3D writes a copy for each rendered view."""
     with suppress(OSError):
         return _are_numbered(plys) and all(filecmp.cmp(plys[0], path, shallow=False) for path in plys[1:])
     return False
@@ -455,14 +461,14 @@ def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
 def list_plys(folder: Path) -> list[Path]:
     """List the files that may be a folder's scene.
 
-    These are the files of the first kind that the folder has:
+    Of the following kinds, all files of the first kind that the folder has are listed:
 
-    1. the file with a usual name, or else all others in the folder;
+    1. the ``.ply`` with a usual name, or else all other scenes in the folder;
     2. files in ``gaussians/``;
-    3. files in folders below;
+    3. scenes in folders below;
     4. results of gsmerge;
     5. the ``meta.json`` of a ``.sog``;
-    6. a file with a usual name but without Gaussians, so that its reader reports what it lacks.
+    6. a file with a usual name but without Gaussians, so that the reader reports what the file lacks.
     """
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
     below = [] if plys else [place for place, names in _walk_down(folder, links=False) if names is None]
@@ -477,16 +483,16 @@ def list_plys(folder: Path) -> list[Path]:
 
 
 def _plys_in(folder: Path) -> list[Path]:
-    """List the files in a folder that may be its scene: the file with a usual name, or else all others."""
+    """List the files in a folder that may be its scene: the file with a usual name, or else all other scenes."""
     named = named_ply(folder)
     return other_plys(folder) if named is None else [named]
 
 
 def list_folders(folder: Path) -> list[tuple[Path, list[str]]]:
-    """List a folder and the folders below it, each with the names of its files. The nearest come first.
+    """List a folder and the folders below it, each with the names of its files. The nearest folders come first.
 
-    The depth is limited. Folders of masks and of held-out views, and folders with too many entries, are left out. So
-    are scenes, which are folders with Gaussians of their own, and all folders below scenes.
+    The depth is limited. Folders of masks and of held-out views, and folders with too many entries, are left out.
+    Scenes, which are folders with Gaussians of their own, and all folders below scenes are left out, too.
     """
     return [(place, names) for place, names in _walk_down(folder, links=True) if names is not None]
 
@@ -494,8 +500,8 @@ def list_folders(folder: Path) -> list[tuple[Path, list[str]]]:
 def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | None]]:
     """List folders as :func:`list_folders` does, and also scenes, which have None in place of the names of files.
 
-    With ``links``, links to folders are followed, and folders with too many entries are left out. Without, too many
-    entries give an empty list.
+    With ``links``, links to folders are followed, and folders with too many entries are left out. Without ``links``,
+    the list is empty if there are too many entries.
     """
     folders, places, num_entries = list[tuple[Path, list[str] | None]](), [(folder, 0)], 0
     max_depth = 3  # most levels of folders that are searched below a folder without a scene
@@ -520,8 +526,8 @@ def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | Non
 def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
     """Order files by number if each is a view or a part of one scene; return None if they are several scenes.
 
-    Files belong to one scene if their names say so, or if there are as many cameras as files. Files that hold cameras
-    are several scenes, since each has its own frame. SceneError if a part is missing.
+    Files belong to one scene if their names say so, or if there are as many cameras as files. If the files hold
+    cameras, they are several scenes, since each file has its own frame. Raise SceneError if a part is missing.
     """
     matches = [_NUMBERED.fullmatch(path.name) for path in plys]
     stems = {match[1].lower() if match else "" for match in matches}  # names without their numbers
@@ -548,7 +554,7 @@ def _has_own_camera(path: Path) -> bool:
 
 
 def _has_camera_for_each(plys: Sequence[Path], cameras: Path | None) -> bool:
-    """Return whether all files have equally many Gaussians, and ``cameras`` has a camera for each file."""
+    """Return whether all files have the same number of Gaussians, and ``cameras`` has a camera for each file."""
     if cameras is None or len({header_counts(path) for path in plys}) > 1:
         return False
     with suppress(SceneError):
@@ -557,7 +563,7 @@ def _has_camera_for_each(plys: Sequence[Path], cameras: Path | None) -> bool:
 
 
 def named_ply(folder: Path) -> Path | None:
-    """Find the scene with a usual name in a folder, or else the scene trained with the most steps; None without any."""
+    """Find the scene with a usual name in a folder, or else the scene trained with the most steps; or None."""
     for place in PLY_PLACES:
         if (folder / place).is_file() and _is_scene(folder / place):
             return folder / place
@@ -570,7 +576,7 @@ def named_ply(folder: Path) -> Path | None:
 def other_plys(folder: Path) -> list[Path]:
     """List the ``.ply`` files in a folder, not below it, that are neither results nor point clouds.
 
-    If there are none, list the only file of another format that may have Gaussians.
+    In a folder without such a ``.ply``, list the only file of another format if that file may have Gaussians.
     """
     plys = natural_order(folder.glob("[!.]*.ply"))
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]

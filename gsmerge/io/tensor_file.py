@@ -1,4 +1,4 @@
-"""Read safetensors files into memory. Mapping would be unsafe, since a mapped file that shrinks ends the process."""
+"""Read safetensors files into memory. Files are not mapped, since a mapped file that shrinks ends the process."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def read_tensors(
 ) -> tuple[dict[str, str], dict[str, np.ndarray]]:
     """Read the metadata of a safetensors file, and its arrays by name unless ``arrays`` is False.
 
-    SceneError if the file has another format, or becomes shorter while it is read. The error says that ``what`` was
-    expected, and has the ``remedy``.
+    Raise SceneError if the file is no safetensors file, or becomes shorter while it is read. The error says that
+    ``what`` was expected, and has the ``remedy``.
     """
     budget = read_budget(path)
     try:

@@ -18,8 +18,8 @@ from gsmerge.io.bounds import read_budget, read_text
 def read_xml(path: Path, attributes: Collection[str]) -> Element:
     """Read an XML file. Its elements keep only ``attributes``, and names keep the prefixes of their namespaces.
 
-    SceneError if the file is no XML or too large, or if it has a document type, whose entities could make a short text
-    endless.
+    Raise SceneError if the file is no XML or too large. Also raise SceneError if the file has a document type, since
+    entities in a document type could make a short text endless.
     """
     text, builder, parser = read_text(path), TreeBuilder(), expat.ParserCreate()
     budget = read_budget(path)

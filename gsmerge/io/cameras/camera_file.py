@@ -20,7 +20,7 @@ from gsmerge.types import Cameras, StrPath
 from gsmerge.values.arguments import check_arguments
 
 # Largest number in poses and intrinsics, largest side of an image, and smallest focal length, in pixels. Real cameras
-# keep these limits, and numbers beyond them would overflow in later steps
+# keep these three limits, and numbers beyond the limits would overflow in later steps
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # turns OpenGL's camera axes (y up, z backward) to OpenCV's (y down, z forward)
 
@@ -28,7 +28,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # turns OpenGL's camera axes (y up, z ba
 CENTRED_PX = 1e-3
 PATCH_SIDE = 14  # pixels; sides of vision transformers' inputs are multiples of this
 _WHOLE_PX = 1e-3  # a side counts as whole if it differs from a whole number by less than these pixels
-MAX_NORMALISED_FOCAL = 10.0  # longest focal length in sides of the image; a longer one is in pixels
+MAX_NORMALISED_FOCAL = 10.0  # longest focal length in sides of the image; a longer focal length is in pixels
 
 # Orders of the Gaussians' rows that a camera file may state
 ORDERS: tuple[str, ...] = get_args(Order)
@@ -44,9 +44,9 @@ COEFFICIENTS = {  # names of the coefficients of each model of lens, in order
     "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
-# Smallest share of an undistorted photo's pixels that lie within the photo; with a smaller share, the coefficients are
-# wrong. A lens with k1 = 1 / r^2, where r is half of the image's diagonal, is stronger than any real lens. Even of its
-# undistorted photo, a third lies within
+# If a smaller share of an undistorted photo's pixels lies within the original photo, the coefficients of the lens are
+# wrong. A lens with k1 = 1 / r^2, where r is half of the image's diagonal, is stronger than any real lens, and even
+# with this lens a third of the pixels lies within the photo
 _MIN_INSIDE = 0.25
 
 
@@ -81,10 +81,10 @@ class CameraFile:
     lenses: tuple[Lens | None, ...] = ()  # of each camera, None for a pinhole; empty if all are pinholes
     masks: Mapping[str, str] = field(default_factory=dict)  # name of an image -> name of its mask
     has_intrinsics: bool = True  # False: the file has only poses, and `Ks` are placeholders
-    # Size of the photos, and the transform from this size to that of the cameras. None before the photos are known
+    # Size of the photos, and the transform from the photos' size to the cameras' size. None before the photos are known
     photo_map: tuple[Size, PhotoTransform] | None = None
-    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each Gaussian, -1 for none. None unless the cameras were estimated
-    # from the order of the Gaussians' rows
+    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each Gaussian, -1 for a Gaussian without a pixel. None unless the
+    # cameras were estimated from the order of the Gaussians' rows
     pixel_ids: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -97,7 +97,7 @@ class CameraFile:
 def drop_repeats(file: CameraFile) -> CameraFile:
     """Drop views that have the name, pose and intrinsics of an earlier view.
 
-    If the file has images or pixel ids, all views are kept, since these belong to views by their numbers.
+    If the file has images or pixel ids, all views are kept, since images and pixel ids refer to the numbers of views.
     """
     keys = [
         (name, viewmat.tobytes(), K.tobytes())
@@ -114,7 +114,8 @@ class StoredView(NamedTuple):
 
     name: str  # of its image
     pose: np.ndarray  # 3x4 or 4x4, in the file's convention
-    # ``[3,3]`` intrinsics in pixels, or divided by the image's size, or None. All views of a file have the same kind
+    # ``[3,3]`` intrinsics in pixels, or divided by the image's size, or None. All views of a file have the same kind of
+    # K
     K: np.ndarray | None
     size: tuple[int, int] = (0, 0)  # (width, height), pixels; 0 where unknown
     lens: Lens | None = None  # None for a pinhole
@@ -136,8 +137,8 @@ def make_camera_file(
 ) -> CameraFile:
     """Check the views of a file, and convert them to a camera file with OpenCV world-to-camera poses.
 
-    Intrinsics that are divided by the image's size are converted to pixels. They are recognised by being small in all
-    views. ``images [c,h,w,3]`` are images inside the file, and ``order`` is the order of rows that it states.
+    Intrinsics that are small in all views are taken as divided by the image's size, and are converted to pixels.
+    ``images [c,h,w,3]`` are images inside the file, and ``order`` is the order of rows that the file states. Raise
     SceneError if there is no camera, a number is infinite or too large, a rotation is not orthonormal, or a focal
     length is not positive.
     """
@@ -178,7 +179,7 @@ def make_camera_file(
 
 
 def _check_pose(path: StrPath, view: StoredView) -> np.ndarray:
-    """Return the first three rows ``[3,4]`` of a view's pose; SceneError unless the pose is 3x4 or 4x4."""
+    """Return the first three rows ``[3,4]`` of a view's pose; raise SceneError unless the pose is 3x4 or 4x4."""
     pose = np.asarray(view.pose, np.float64)
     if pose.shape not in ((3, 4), (4, 4)):
         raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
@@ -198,7 +199,7 @@ def _check_lens(path: StrPath, view: StoredView) -> None:
 
 
 def check_camera_count(path: StrPath, count: int) -> None:
-    """Raise SceneError if a file has too many cameras. Readers call it before they allocate memory for each camera."""
+    """Raise SceneError if a file has too many cameras. Readers call this before they allocate memory for cameras."""
     if count > MAX_VIEWS:
         raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found more")
 
@@ -210,13 +211,13 @@ def missing_intrinsics(path: StrPath) -> SceneError:
 
 
 def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """Convert intrinsics that are divided by the image size to pixels; return them with the sizes.
+    """Convert intrinsics that are divided by the image size to pixels; return intrinsics and sizes.
 
     An unknown size becomes 1 x 1. Intrinsics in pixels are returned unchanged.
     """
     is_relative = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
     is_relative &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
-    # In a picture of a few pixels, a focal length in pixels is as small as a relative one
+    # In a picture of a few pixels, a focal length in pixels is as small as a focal length that is divided by the size
     if not is_relative.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
         return Ks, sizes
     sizes = [size if min(size) > 0 else (1, 1) for size in sizes]
@@ -279,7 +280,7 @@ def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
 
 
 def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFile:
-    """Return the cameras that the file has if its poses are stored in another convention."""
+    """Return the cameras that the file would have if its poses were stored in ``convention``."""
     stored = from_viewmats(camera_file.viewmats, camera_file.convention)
     return replace(camera_file, viewmats=to_viewmats(stored, convention), convention=convention)
 
@@ -305,11 +306,11 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> CameraFile:
-    """Give cameras without a size the size that is twice their principal point, if the photos have another size.
+    """Give cameras without a size twice their principal point as the size, if the photos have another size.
 
     ``size`` is (width, height) of the photos. Cameras stay unchanged if twice the principal point has another aspect
-    ratio than the photos, or nearly the same size. Sides with a fraction are rounded to multiples of ``PATCH_SIDE``,
-    since the inputs of networks have such sides.
+    ratio than the photos, or nearly the same size. Sides with a fraction are rounded to multiples of ``PATCH_SIDE``, as
+    the sides of networks' inputs are.
     """
     if size is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file
@@ -328,8 +329,8 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
     """Convert to cameras of one image ``size`` (width, height) in pixels, by default the size in the file.
 
-    Intrinsics for another size are scaled, each axis by itself. SceneError if a lens is no pinhole, or if no ``size``
-    is given and the file has no size or several sizes.
+    Intrinsics for another size than ``size`` are scaled, each axis by itself. Raise SceneError if a lens is no pinhole,
+    or if no ``size`` is given and the file has no size or several sizes.
 
     Example:
         >>> gsmerge.to_cameras(gsmerge.read_cameras("demo/transforms.json")).Ks.shape
@@ -360,10 +361,10 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 
 
 def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFile, PhotoArrays, list[str]]:
-    """Undistort photos, and replace their cameras by pinholes with the same intrinsics; return both, with a note.
+    """Undistort photos, and replace their cameras by pinholes with the same intrinsics; also return notes.
 
-    SceneError if a lens has distortion and there are no photos, or photos of another aspect ratio. SceneError also if
-    most of an undistorted photo would lie outside of the photo.
+    Raise SceneError if a lens has distortion and there are no photos, or photos of another aspect ratio. Also raise
+    SceneError if most of an undistorted photo would lie outside of the original photo.
     """
     if not camera_file.lenses:
         return camera_file, photos, []
@@ -391,7 +392,7 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
 
 
 def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
-    """Return the share of an undistorted photo's pixels that lie within the photo, measured on a coarse grid."""
+    """Return the share of an undistorted photo's pixels that lie within the original photo, by a coarse grid."""
     grid = 32  # pixels of each side of the grid
     grid_K = K * np.array([grid / size[0], grid / size[1], 1.0])[:, None]
     maps = _rectify_maps(grid_K, lens, (grid, grid))
@@ -429,7 +430,8 @@ def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np
 def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: float) -> list[dict[str, Any]]:
     """List for each view its name, its rotation in degrees, and its shift as a share of ``depth``.
 
-    ``start`` and ``end`` are viewmats ``[v,4,4]`` before and after. ``depth`` is the scene's depth in their unit.
+    ``start`` and ``end`` are viewmats ``[v,4,4]`` before and after the moves. ``depth`` is the scene's depth in the
+    unit of the viewmats.
     """
     degrees, distances = pose_changes(start, end)
     shifts = distances / depth if depth > 0 else distances
@@ -440,7 +442,7 @@ def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: 
 
 
 def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
-    """Describe in words the mean and the largest rotation and shift of :func:`list_moves`."""
+    """Describe in words the mean and the largest rotation and shift of ``moves`` from :func:`list_moves`."""
     angles, shifts = [move["degrees"] for move in moves], [move["shift"] for move in moves]
     mean = f"{np.mean(angles):.2g} degrees and {100 * np.mean(shifts):.3g} % of the depth"
     largest = f"{max(angles):.2g} degrees and {100 * max(shifts):.3g} % of the depth"
@@ -448,7 +450,7 @@ def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
 
 
 def make_similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
-    """Make the similarity X' = scale (matrix [X; 1]) of a matrix ``[3,4]``; SceneError if the map is no similarity."""
+    """Make the similarity X' = scale (matrix [X; 1]) of a matrix ``[3,4]``; raise SceneError for other maps."""
     R = matrix[:3, :3]
     is_similarity = is_orthonormal(R) and determinant(R) >= 0 and 0 < scale < MAX_NUMBER
     if not is_similarity or not np.all(np.abs(matrix) < MAX_NUMBER):

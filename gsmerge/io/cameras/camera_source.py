@@ -29,7 +29,7 @@ class CameraSource:
 
     @cached_property
     def json(self) -> Any:
-        """Parsed content of a JSON file."""
+        """Parsed content of the file, which is JSON."""
         return read_json(self.path)
 
     @property
@@ -50,7 +50,7 @@ class CameraSource:
 
 
 def check_objects(path: Path, entries: Sequence[Any], place: str = "the file") -> None:
-    """Raise SceneError if an entry of a JSON list is no object; the error has the number of the first such entry."""
+    """Raise SceneError, with the number of the first wrong entry, if an entry of a JSON list is no object."""
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
             found = "a list" if isinstance(entry, list) else json.dumps(entry)
@@ -58,7 +58,7 @@ def check_objects(path: Path, entries: Sequence[Any], place: str = "the file") -
 
 
 class StoredCameras(NamedTuple):
-    """Cameras as a file stores them, before their conversion."""
+    """Cameras as a file stores them, before they are converted to a :class:`CameraFile`."""
 
     views: list[StoredView]
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
@@ -76,7 +76,7 @@ def number_errors(path: Path, expected: str) -> Iterator[None]:
 
 
 def to_number(value: Any) -> float:
-    """Convert a JSON number; TypeError for true, false and null, ValueError for text that is no number."""
+    """Convert a JSON number; raise TypeError for true, false and null, ValueError for text that is no number."""
     if isinstance(value, bool):
         raise TypeError(f"found {str(value).lower()}")
     return float(value)
@@ -91,7 +91,7 @@ def to_array(values: Any) -> np.ndarray:
 
 
 def convert_value(function: Callable[[Any], Any], key: str, value: Any) -> Any:
-    """Convert the value of a key by ``function``; ValueError, which begins with the key, if the value is wrong."""
+    """Convert the value of a key by ``function``. For a wrong value, raise a ValueError that begins with the key."""
     try:
         return function(value)
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:

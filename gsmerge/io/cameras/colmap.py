@@ -19,8 +19,8 @@ from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.first_bytes import read_start
 
-# Camera model -> its number of parameters, in the order of COLMAP's ids. The first parameters are one or two focal
-# lengths and the principal point
+# Camera model -> number of its parameters, in the order of COLMAP's ids. The first parameters of every model are one or
+# two focal lengths and the principal point
 _NUM_PARAMS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
@@ -43,7 +43,7 @@ _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     """Read the views of a COLMAP model in the order of its images, from files with the ``suffix`` .bin or .txt.
 
-    SceneError if the model is damaged, has a camera model that is not read, or lacks the camera of an image.
+    Raise SceneError if the model is damaged, has a camera model that is not read, or lacks the camera of an image.
     """
     folder = source.path
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
@@ -68,9 +68,9 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
 
 
 def count_images(folder: Path) -> int:
-    """Count the images of a COLMAP model; 0 if it is damaged.
+    """Return the number of images of a COLMAP model; 0 if the model is damaged.
 
-    The count stands in the header. In a text file without a header, the images are counted.
+    The number stands in the file's header. In a text file without a header, the images are counted.
     """
     with suppress(OSError, ValueError, struct.error, SceneError):
         if (folder / "images.bin").is_file():
@@ -83,12 +83,12 @@ def count_images(folder: Path) -> int:
 
 
 def _read_numbers(file: BinaryIO, form: str) -> tuple[Any, ...]:
-    """Read the next numbers of a file by their ``struct`` format; struct.error if the file ends before."""
+    """Read the next numbers of a file by their ``struct`` format; raise struct.error if the file ends too early."""
     return struct.unpack(form, file.read(struct.calcsize(form)))
 
 
 def _read_name(file: BinaryIO) -> str:
-    """Read a name that ends with a zero byte; ValueError if no zero byte follows."""
+    """Read a name that ends with a zero byte; raise ValueError if no zero byte follows."""
     name = b""
     name_part = 64  # bytes of a name that are read at a time
     while b"\0" not in name:
@@ -111,7 +111,7 @@ def _make_pose(numbers: list[float]) -> np.ndarray:
 
 
 def _make_view(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> StoredView:
-    """Make a view of a camera, yet without a name and a pose; SceneError if the camera model is not supported."""
+    """Make a view of a camera, without a name and a pose; raise SceneError if the camera model is not supported."""
     if model not in _PERSPECTIVE_MODELS | _FISHEYE_MODELS:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
         raise SceneError(path, problem, "undistort the images first")
@@ -126,7 +126,8 @@ def _size_for_intrinsics(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int
     """Return the image size to which intrinsics belong: the stored size, or the size of WorldMirror 1's input.
 
     WorldMirror 1 stores the size of the photos, but intrinsics for its input. Twice the principal point is then the
-    size of the input. It has whole numbers, is clearly smaller than the photos, and has their aspect ratio.
+    size of the input, if this size has whole numbers, is clearly smaller than the photos, and has the photos' aspect
+    ratio.
     """
     sides = 2 * K[:2, 2]
     ratio_x, ratio_y = sides / np.maximum(size, 1)
@@ -188,8 +189,8 @@ def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
 def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredView]) -> list[_Image]:
     """Parse the lines of ``images.txt``. Return what :func:`_binary_images` returns.
 
-    The line of an image has a pose, and a name that may have spaces. A line of points follows. Programs that rewrite
-    the file may drop all lines of points, or the empty lines.
+    The line of an image has a pose, and a name that may have spaces. The next line lists the points of the image.
+    Programs that rewrite the file may drop all lines of points, or only empty lines.
     """
     images: list[_Image] = []
     after_image = False
@@ -207,7 +208,7 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredV
 
 
 def _lists_points(line: str, cameras: Mapping[int, StoredView]) -> bool:
-    """Return whether the line after an image lists its points, each as x, y and an id, and is no other image.
+    """Return whether the line after an image lists points, each as x, y and an id, and is no other image.
 
     The line of an image has ten words: its id, a quaternion, a translation, the id of a camera, and a name.
     """

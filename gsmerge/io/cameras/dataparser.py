@@ -17,18 +17,18 @@ from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number
 from gsmerge.kernels.matrices import invert, matmul
 
 DATAPARSER = "dataparser_transforms.json"  # name of nerfstudio's file with its map
-# An offset: three numbers that stand alone in a line, an element or brackets
+# Pattern of an offset: three numbers that stand alone in a line, an element or brackets
 _OFFSET = re.compile(r"(?:^|[>:=(])\s*N[\s,;]+N[\s,;]+N\s*(?:$|[<)])".replace("N", r"([-+]?\d+\.?\d*)"), re.MULTILINE)
 
 
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
-    """Return the similarities by which nerfstudio or a survey may have moved the cameras. The caller tries them.
+    """Return the similarities by which nerfstudio or a survey may have moved the cameras. The caller tries each one.
 
-    Nerfstudio's ``dataparser_transforms.json`` has the map from the world of the capture into that of the Gaussians:
-    X' = scale (transform [X; 1]). The poses of a ``transforms.json`` with an ``applied_transform`` (and
-    ``applied_scale``) have been moved by it already, so a second candidate undoes this first. If nerfstudio's file is
-    missing, offsets of surveys are read. SceneError if nerfstudio's map is not a rotation, a shift and a positive
-    scale.
+    Nerfstudio's ``dataparser_transforms.json`` has the map from the world of the capture into the world of the
+    Gaussians: X' = scale (transform [X; 1]). The poses of a ``transforms.json`` with an ``applied_transform`` (and
+    ``applied_scale``) are already moved by ``applied_transform``. A second similarity therefore undoes
+    ``applied_transform`` before the map. If nerfstudio's file is missing, offsets of surveys are read. Raise SceneError
+    if nerfstudio's map is not a rotation, a shift and a positive scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
@@ -49,11 +49,11 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
 
 
 def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
-    """Read the offsets that surveys subtract from coordinates, in metres, and return moves of the cameras by them.
+    """Read the offsets in metres that surveys subtract from coordinates; return moves of the cameras by each offset.
 
     An offset is three numbers that stand alone in a line or element of a small file. Metashape and CloudCompare write
-    offsets into text files, and DJI Terra into metadata.xml. Either the cameras or the Gaussians may lack the offset.
-    Therefore each offset gives two moves, in opposite directions.
+    offsets into text files, and DJI Terra writes an offset into metadata.xml. Each offset gives two moves of the
+    cameras, in opposite directions, since the offset may be missing from the cameras or from the Gaussians.
     """
     endings, max_files = (".txt", ".xml", ".xyz"), 8  # of files that may have an offset, and how many of these are read
     paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in endings})
@@ -71,7 +71,7 @@ def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
 
 
 def _to_square(values: Any) -> np.ndarray:
-    """Convert the rows of a 3x4 or 4x4 matrix to ``[4,4]`` with the last row 0 0 0 1; ValueError for other matrices."""
+    """Convert the rows of a 3x4 or 4x4 matrix to ``[4,4]`` with the last row 0 0 0 1; raise ValueError for others."""
     matrix = to_array(values)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.all(np.abs(matrix) < MAX_NUMBER):
         raise ValueError(f"found shape {list(matrix.shape)}, or numbers that are not finite")

@@ -11,14 +11,14 @@ from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.formats.table import PLY, find_format
 
 SHARP = "SHARP"  # ``source`` of this camera
-_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first versions do not write the last
+_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first versions do not write image_size
 
 
 def read_sharp(source: CameraSource) -> StoredCameras | None:
-    """Read the camera of SHARP in a ``.ply``; None if it has no such camera.
+    """Read the camera that SHARP writes into a ``.ply``; None if the ``.ply`` has no such camera.
 
     The size of the view is that of the grid of Gaussians. The grid is square, because SHARP stretches photos of any
-    shape to a square. SceneError if the numbers of the camera are damaged.
+    shape to a square. Raise SceneError if the numbers of the camera are damaged.
     """
     if find_format(source.path).read is not PLY.read:
         return None

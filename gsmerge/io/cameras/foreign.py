@@ -1,4 +1,4 @@
-"""List the places of camera files. Also list programs whose cameras are not read, with the export to use instead."""
+"""List the places of camera files, and the programs whose cameras are not read, with the export to use instead."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ _REALITY = "RealityScan or RealityCapture", "export its registration as COLMAP, 
 _OPENMVS = "{}InterfaceCOLMAP of OpenMVS make a COLMAP model of it"
 _ODM = "ODM", "name its opensfm/reconstruction.json"
 _OPENMVG = "OpenMVG", "openMVG_main_openMVG2Colmap makes a COLMAP model of it"
-# Cameras in earlier places are preferred. Of several COLMAP models that match a pattern, the model with the most images
-# is preferred. A model in the folder itself comes last, because Depth Anything 3 writes a model for photos of full size
-# there
+# Places of cameras in a folder. Cameras in earlier places are preferred. Of several COLMAP models that match a pattern,
+# the model with the most images is preferred. A COLMAP model in the searched folder itself comes last, because Depth
+# Anything 3 writes a model for photos of full size to that place
 CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
     "cameras.json", "camera_params.json", "sparse/*", "sparse", "colmap/sparse/*", "colmap",
@@ -46,7 +46,7 @@ CAMERA_PLACES = (
     "camera_poses.txt", "keyframes/corrected_cameras", "keyframes/cameras", "reconstruction.json",
     "opensfm/reconstruction.json", "cameras.xml", "[0-9]*", ".",
 )  # fmt: skip
-# If several rows match a file, the first of them names its program
+# If several rows match a file, the first of these rows names the file's program
 PROGRAMS = (
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
     Foreign("*.psx *.psz", "Metashape", "File > Export > Export Cameras writes the .xml that is read"),
@@ -94,7 +94,7 @@ PROGRAMS = (
 
 
 def check_program(place: Path) -> None:
-    """Raise SceneError, with the export to use instead, for a file of :data:`PROGRAMS`, or a folder that has one."""
+    """Raise SceneError, with the export to use instead, for a file of :data:`PROGRAMS` or a folder with one."""
     if (path := find_unread(place)) is not None:
         foreign = next(foreign for foreign in PROGRAMS if _is_file_of(path, foreign))
         problem = f"expected cameras of a supported format, found those of {foreign.program}"

@@ -1,4 +1,4 @@
-"""Read the optimised poses of InstantSplat, which are beside a ``cameras.json`` with the first poses."""
+"""Read the optimised poses of InstantSplat, which are in files beside a ``cameras.json`` with the initial poses."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from gsmerge.kernels.matrices import invert
 def take_optimised_poses(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
     """Replace the poses of views by the optimised poses of InstantSplat's last iteration.
 
-    Views stay unchanged if InstantSplat wrote no such poses, or if its optimisation started from poses other than those
-    of the file.
+    Views stay unchanged if InstantSplat wrote no optimised poses, or if the optimisation started from other poses than
+    those of the file.
     """
     paths = (source.path.parent / "pose").glob("ours_*/pose_optimized.npy")
     last_path = max(paths, key=lambda path: natural_key(path.parent.name), default=None)

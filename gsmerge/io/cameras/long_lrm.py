@@ -1,4 +1,4 @@
-"""Move Long-LRM's cameras into the world of its Gaussians, with the list of frames that it writes beside them."""
+"""Move Long-LRM's cameras into the world of its Gaussians, by the list of frames that Long-LRM writes."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def is_long_lrm(source: CameraSource) -> bool:
 def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
     """Select the views that the model saw, and move them into the Gaussians' world, the frame of their mean pose.
 
-    ``input_frame_idx.txt`` lists these views. It is in the folder of the Gaussians, or in that of the cameras. Without
-    this file, all views are returned unchanged. SceneError if the file has wrong numbers, or lists a frame that does
-    not exist.
+    ``input_frame_idx.txt``, in the folder of the Gaussians or in that of the cameras, lists the views that the model
+    saw. Without this file, all views are returned unchanged. Raise SceneError if the file has wrong numbers, or lists a
+    frame that does not exist.
     """
     folder = source.path.parent
     if source.folder is not None and not (folder / FRAMES_FILE).is_file():
@@ -41,7 +41,7 @@ def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[Sto
 
 
 def _frame_ids(path: Path, count: int) -> list[int]:
-    """Read the numbers of the frames that the model saw, below ``count``; empty if the file is missing."""
+    """Read the numbers, below ``count``, of the frames that the model saw; no numbers if the file is missing."""
     words = read_text(path).replace(",", " ").split(maxsplit=MAX_VIEWS) if path.is_file() else []
     if len(words) > MAX_VIEWS:
         raise SceneError(path, f"expected at most {MAX_VIEWS} numbers, found more")

@@ -40,7 +40,7 @@ def list_metashape_cameras(source: CameraSource) -> list[Entry]:
 
 
 def _sensor_values(sensor: Element) -> dict[str, Any]:
-    """Return size, intrinsics and lens of a sensor, from its adjusted calibration if there is one."""
+    """Return a sensor's size, intrinsics and lens by key, such as "fx"; an adjusted calibration is preferred."""
     calibrations = sensor.findall("calibration")
     if not calibrations:
         raise ValueError("no calibration")
@@ -59,7 +59,7 @@ def _sensor_values(sensor: Element) -> dict[str, Any]:
 
 
 def _largest_component(path: Path) -> tuple[Element, list[Element]]:
-    """Parse a file. Return its root, and the cameras with poses in the component that has most of them."""
+    """Parse a file. Return the root element, and the largest set of cameras with poses that one component has."""
     root = read_xml(path, _ATTRIBUTES)
     cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
     check_camera_count(path, len(cameras))

@@ -1,11 +1,12 @@
 """Read cameras from ``.npz`` files: ``results.npz`` of Depth Anything 3, and ``views.npz`` of any model.
 
-A user whose model saves no cameras can write ``views.npz`` while it runs (``examples/04_dump_views.py``). Its arrays:
+A user whose model saves no cameras can write ``views.npz`` while the model runs (``examples/04_dump_views.py``). The
+arrays of ``views.npz``:
 
 - ``c2w``: poses ``[v,4,4]`` or ``[v,3,4]``, camera to world, OpenCV axes.
-- ``K``: intrinsics ``[v,3,3]`` in pixels of ``images``, or divided by their size. They may be missing.
+- ``K``: intrinsics ``[v,3,3]`` in pixels of ``images``, or divided by their size. ``K`` may be missing.
 - ``images``: ``[v,h,w,3]`` or ``[v,3,h,w]`` as the network saw them, uint8 or float in [0, 1].
-- ``order``: order of the rows of the ``.ply``. It may be missing.
+- ``order``: order of the rows of the ``.ply``. ``order`` may be missing.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.photo_files import PhotoArrays
 from gsmerge.runtime.threads import quiet_warnings
 
-# Names of arrays in the files of several programs. Names in files of Lyra 2 end with one of three words
+# Names of arrays in the files of several programs. Names in files of Lyra 2 end with one of the words of ``_LYRA``
 _LYRA = ("recon_sampled", "da3", "da3_pred")
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
@@ -46,11 +47,11 @@ def is_da3(path: Path) -> bool:
 def read_da3(source: CameraSource) -> StoredCameras:
     """Read the cameras of an ``.npz`` of Depth Anything 3, and its images if it has any.
 
-    Poses are 3x4 or 4x4, world to camera. Intrinsics are in pixels. If they are divided by the size, or are for another
-    size, they are scaled to the images or depth maps. A COLMAP export in the same call of the model leaves intrinsics
-    for another size. Files of Lyra 2 (``cameras.npz``), VGGT and AnySplat are also read. Poses of AnySplat are camera
-    to world, its intrinsics are divided by the size, and its arrays are a batch of one. SceneError if the file cannot
-    be read or lacks an array.
+    Poses are 3x4 or 4x4, world to camera. Intrinsics that are divided by the size, or are for another size, are scaled
+    to pixels of the images or depth maps. Depth Anything 3 stores intrinsics for another size if it exports a COLMAP
+    model in the same call. Files of Lyra 2 (``cameras.npz``), VGGT and AnySplat are also read. Poses of AnySplat are
+    camera to world, its intrinsics are divided by the size, and its arrays are a batch of one. Raise SceneError if the
+    file cannot be read or lacks an array.
     """
     path = source.path
     size_names = () if holds_images(path) else _DEPTHS  # without images, the shape of depth maps gives the size
@@ -80,7 +81,7 @@ def read_da3(source: CameraSource) -> StoredCameras:
 
 
 def read_views_npz(source: CameraSource) -> StoredCameras:
-    """Read the cameras and images of a ``views.npz``; SceneError if an array other than ``K`` is missing."""
+    """Read the cameras and images of a ``views.npz``; raise SceneError if an array other than ``K`` is missing."""
     path = source.path
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
     missing = [name for name in ("c2w", "images") if name not in arrays]
@@ -96,18 +97,18 @@ def read_views_npz(source: CameraSource) -> StoredCameras:
 
 
 def holds_images(path: Path) -> bool:
-    """Return whether an ``.npz`` holds images; False if the file cannot be read."""
+    """Return whether a file is an ``.npz`` with images; False for a file that cannot be read."""
     return not array_names(path).isdisjoint(_IMAGES)
 
 
 def holds_poses(path: Path) -> bool:
-    """Return whether an ``.npz`` holds poses and intrinsics; False if the file cannot be read."""
+    """Return whether a file is an ``.npz`` with poses and intrinsics; False for a file that cannot be read."""
     names = array_names(path)
     return {"c2w", "K"} <= names or not (names.isdisjoint(_EXTRINSICS) or names.isdisjoint(_INTRINSICS))
 
 
 def _missing_arrays(path: Path, missing: list[str], arrays: dict[str, np.ndarray]) -> SceneError:
-    """Make the error for an ``.npz`` that has the ``arrays``, but lacks those with the names ``missing``."""
+    """Make the error for an ``.npz`` that has the ``arrays``, but lacks the arrays ``missing``."""
     return SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
 
 
@@ -119,7 +120,7 @@ def _make_views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int])
 def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tuple[str, str]) -> None:
     """Raise SceneError unless two arrays are c poses, 3x4 or 4x4, and intrinsics ``[c,3,3]``, of finite numbers.
 
-    ``names``: names of the two arrays in errors.
+    ``names``: what errors call the two arrays.
     """
     Ks = np.zeros((*poses.shape[:1], 3, 3)) if Ks is None else Ks
     for name, array in zip(names, (poses, Ks), strict=True):
@@ -137,7 +138,8 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tu
 def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
     """Convert images ``[c,h,w,3]`` or ``[c,3,h,w]``, as uint8 or in [0, 1], to ``[c,h,w,3]`` uint8.
 
-    NaN becomes black. SceneError if there are not ``count`` images, one for each pose, or if they have another shape.
+    NaN becomes black. Raise SceneError if there are not ``count`` images, one for each pose, or if the array has
+    another shape.
     """
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
@@ -156,17 +158,17 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Scale intrinsics to an image size, if they are divided by the size or are for another size.
+    """Scale intrinsics that are divided by the image size, or are for another size, to ``width`` and ``height``.
 
-    The networks assume that the principal point is in the middle. Twice this point is thus the size for which the
-    intrinsics are.
+    The networks put the principal point in the middle of the image. Twice the principal point is thus the image size to
+    which intrinsics belong.
     """
     size = np.array([width, height])
-    least_centre = 1e-9  # smaller principal points are raised to this, since they divide below
+    least_centre = 1e-9  # smaller principal points are raised to this, since a later line divides by them
     ratios = 2 * np.maximum(Ks[:, :2, 2], least_centre) / size  # size of the intrinsics, divided by that of the images
     is_normalised = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 0, 2] < 2) & (width > 10)
-    # If the ratios of both axes are equal, but are not 1, the intrinsics are for another size. If they differ from each
-    # other, the principal point is not in the middle
+    # If the ratios of both axes are equal, but are not 1, the intrinsics are for another size. If the two ratios
+    # differ, the principal point is not in the middle
     max_axis_difference, min_size_difference = 0.03, 0.1  # relative
     are_equal = np.abs(ratios[:, 0] / ratios[:, 1] - 1) < max_axis_difference
     is_for_other_size = ~is_normalised & are_equal & (np.abs(ratios[:, 0] - 1) > min_size_difference)
@@ -190,8 +192,8 @@ def array_names(path: Path) -> frozenset[str]:
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read arrays from an ``.npz`` by name. Names that the file lacks are left out.
 
-    SceneError if the file cannot be read, if an array holds anything but numbers and text, or if the arrays take more
-    memory than the file allows.
+    Raise SceneError if the file cannot be read, if an array holds anything but numbers and text, or if the arrays take
+    more memory than the file allows.
     """
     budget = read_budget(path)
     if not zipfile.is_zipfile(path):
@@ -214,7 +216,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """Read an array of an ``.npz``; SceneError if it has no numbers or text, or too few bytes for its shape."""
+    """Read an array of an ``.npz``; raise SceneError if it has no numbers or text, or too few bytes for its shape."""
     name, (shape, dtype) = info.filename, _read_header(archive.open(info))
     if dtype.kind not in _KINDS:
         kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
@@ -236,7 +238,7 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def read_matrices(path: Path) -> np.ndarray | None:
-    """Read matrices ``[c,4,4]`` from a ``.npy``; None if it holds another array, or numbers that are not finite."""
+    """Read matrices ``[c,4,4]`` from a ``.npy``; None if the file holds another array, NaN or inf."""
     with suppress(Exception):  # a damaged file may make the library raise any error
         size, (shape, dtype) = check_file(path), _read_header(path.open("rb"))
         if dtype.kind == "f" and shape[1:] == (4, 4) and 0 < math.prod(shape) * dtype.itemsize <= size:

@@ -1,4 +1,4 @@
-"""Read text files of DA3-Streaming and VGGT-Long, which have a pose in each line, and the intrinsics beside them."""
+"""Read text files of DA3-Streaming and VGGT-Long with a pose in each line, and files of intrinsics beside them."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def lists_poses(path: Path) -> bool:
 
 
 def read_poses(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a text file. Each of its lines has the 12 or 16 numbers of a pose, row by row.
+    """Read the cameras of a text file, each line of which has the 12 or 16 numbers of a pose, row by row.
 
     The file :data:`INTRINSICS` beside it may have one line of intrinsics for all views, or a line for each view. The
-    size of the views is unknown. SceneError if a line has another count of numbers.
+    size of the views is unknown. Raise SceneError if a line has another count of numbers than stated here.
     """
     path, intrinsics = source.path, source.path.parent / INTRINSICS
     poses = _parse(path, read_lines(path), _POSE_COLUMNS)
@@ -47,7 +47,7 @@ def read_poses(source: CameraSource) -> StoredCameras:
 def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[np.ndarray]:
     """Parse lines of numbers, and skip empty lines. ``lengths`` are the possible counts of numbers in a line.
 
-    SceneError, which says the number of the line, if a line is wrong.
+    If a line is wrong, SceneError says the line's number.
     """
     rows: list[np.ndarray] = []
     for number, line in enumerate(lines, 1):
@@ -65,5 +65,5 @@ def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[n
 
 
 def _words(line: str) -> list[str]:
-    """Split a line into words. If it has more words than a pose has numbers, the last word is the rest of the line."""
+    """Split a line into as many words as a pose has numbers; if more follow, they are one last word."""
     return line.split(maxsplit=_POSE_COLUMNS[-1])

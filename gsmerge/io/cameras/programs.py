@@ -43,10 +43,10 @@ def list_keyframes(source: CameraSource) -> list[Entry]:
 
 
 def join_matrices(source: CameraSource) -> list[Entry]:
-    """List WorldMirror's views from the lists of extrinsics and intrinsics, in which a view has the same ``camera_id``.
+    """List WorldMirror's views from the lists of extrinsics and intrinsics, which belong together by ``camera_id``.
 
-    ``camera_id`` is a number, or the stem of the image's name. Views with numbers are sorted by the numbers. Views with
-    names keep the order of the file. SceneError if one of the lists lacks a view.
+    ``camera_id`` is a number, or the stem of the image's name. Views whose ``camera_id`` is a number are sorted by it.
+    Other views keep the order of the file. Raise SceneError if one of the lists lacks a view.
     """
     poses, Ks = (_matrices_by_id(source, key) for key in ("extrinsics", "intrinsics"))
     if poses.keys() != Ks.keys():
@@ -58,7 +58,7 @@ def join_matrices(source: CameraSource) -> list[Entry]:
 
 
 def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
-    """Return the matrices of the list ``key`` by their ``camera_id``. If ids are equal, the last matrix is taken."""
+    """Return the matrices of the list ``key`` by their ``camera_id``. Of matrices with equal ids, the last is taken."""
     entries: Sequence[Mapping[str, Any]] = source.object[key]
     if not isinstance(entries, list):
         raise SceneError(source.path, f"expected {key!r} to be a list, found something else")
@@ -68,7 +68,7 @@ def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
 
 
 def set_centred_size(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
-    """Set the size of all views to twice their principal point, if this is whole and equal in all views."""
+    """Set the size of all views to twice their principal point, if that size is whole and equal in all views."""
     sides = 2 * np.array([view.K for view in views])[:, :2, 2].reshape(-1, 2) if views else np.zeros((0, 2))
     first_size = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
     are_centred = len(sides) > 0 and bool((np.abs(sides - first_size) <= CENTRED_PX).all())

@@ -1,4 +1,4 @@
-"""Read cameras from a path: find their file in a folder, and recognise its format."""
+"""Read cameras from a path: find the file of the cameras in a folder, and recognise the file's format."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def list_cameras(folder: Path) -> Iterator[Path]:
 
 
 def _is_camera_folder(folder: Path) -> bool:
-    """Return whether a folder is one set of cameras in several files, such as a COLMAP model."""
+    """Return whether a folder has one set of cameras in several files, such as a COLMAP model."""
     return any(row.recognise(CameraSource(folder)) for row in CAMERA_FORMATS if not row.ending)
 
 
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find the only file in a folder that can be read as cameras, whatever its name; None if there are several or none.
+    """Find the only file of any name in a folder that can be read as cameras; None if no file or several can.
 
-    Intrinsics beside poses, and cameras that gsmerge wrote for viewers, are not searched.
+    Files of intrinsics beside poses, and cameras that gsmerge wrote for viewers, are left out.
     """
     candidates = [
         path
@@ -106,10 +106,10 @@ def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
 
 
 def _resolve(path: Path) -> Path:
-    """Return the camera file to which a path leads, or the folder of the cameras if their format has several files.
+    """Return the camera file to which a path leads, or the folder of the cameras if they are in several files.
 
     A folder leads to the camera file in it. A file of a COLMAP model or of Polycam's keyframes leads to its folder.
-    SceneError if there are no cameras.
+    Raise SceneError if there are no cameras.
     """
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")

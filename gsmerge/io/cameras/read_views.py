@@ -78,7 +78,7 @@ def _alternatives(key: Key) -> tuple[str, ...]:
 
 
 def _find_value(values: Mapping[str, Any], key: Key) -> Any:
-    """Return the value of a key, under the first of its names that has a value; None if no name has a value."""
+    """Return the value of a key under the first of the key's names that has a value; None if no name has a value."""
     return next((values[name] for name in _alternatives(key) if values.get(name) is not None), None)
 
 
@@ -94,10 +94,10 @@ def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None
 
 
 def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert intrinsics, size and lens from the ``values`` of a view, or from values that several views share.
+    """Convert the intrinsics, size and lens in ``values``, which hold one view's values, or values that views share.
 
     The result has the names of ``number_keys``, "K" for a matrix, and "mask". For a lens it also has "model",
-    "is_fisheye", "distortion_params" and the coefficients. Names are left out if the file has no value. Errors are
+    "is_fisheye", "distortion_params" and the coefficients. Names without a value in the file are left out. Errors are
     those of :func:`convert_value`.
     """
     keys = layout.number_keys | ({name: name for name in _COEFFICIENTS} if layout.lens else {})
@@ -127,7 +127,7 @@ def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, A
 
 
 def _two_numbers(values: Any) -> tuple[float, float]:
-    """Convert a list of two JSON numbers; ValueError for another count."""
+    """Convert a list of two JSON numbers; raise ValueError for another count."""
     if len(values) != 2:
         raise ValueError(f"expected two numbers, found {len(values)}")
     return to_number(values[0]), to_number(values[1])
@@ -136,9 +136,9 @@ def _two_numbers(values: Any) -> tuple[float, float]:
 def _with_size(
     path: Path, name: str, layout: ViewLayout, values: dict[str, Any], size_of: Callable[[Path], Size]
 ) -> dict[str, Any]:
-    """Return the values of a view. If the intrinsics need a size and the file has none, read it from the view's image.
+    """Return the values of a view. If the intrinsics need a size and the file has no size, read the image's.
 
-    ``size_of`` returns the size of an image. SceneError if the intrinsics or the image are missing.
+    ``size_of`` returns the size of an image. Raise SceneError if the intrinsics or the image are missing.
     """
     keys = layout.number_keys
     if not any(key in values for key in _FOCAL):
@@ -177,7 +177,7 @@ def _intrinsics(path: Path, name: str, layout: ViewLayout, values: Mapping[str, 
 
 
 def _focal(values: Mapping[str, float], axis: str, side: float) -> float:
-    """Return the focal length along an axis, or compute it from the angle of view; 0 if the file has neither.
+    """Return the focal length along an axis, or compute it from the angle of view; 0 if the file has no such values.
 
     ``side``: pixels of the image along the axis.
     """
@@ -195,7 +195,7 @@ _CUT_PANORAMAS = "cut pinhole pictures out of the 360-degree panoramas first, as
 
 
 def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
-    """Return the lens of a view; None for a pinhole, SceneError for a camera model that is not supported."""
+    """Return the lens of a view; None for a pinhole, and SceneError for a camera model that is not supported."""
     model = values.get("model", "PINHOLE")
     params = {key: values.get(key, 0.0) for key in _COEFFICIENTS}
     if not any(params.values()):

@@ -39,7 +39,7 @@ class CameraFormat:
     recognise: Callable[[CameraSource], bool] = lambda _: True  # is called only for files with the ending
 
     def cameras(self, source: CameraSource) -> CameraFile:
-        """Read the cameras of a file; SceneError if the file is damaged or incomplete."""
+        """Read the cameras of a file; raise SceneError if the file is damaged or incomplete."""
         stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
         convention = stored.convention or self.convention
         return make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
@@ -62,7 +62,7 @@ def is_keyframes(folder: Path) -> bool:
 
 
 def _has_views_with(source: CameraSource, key: str) -> bool:
-    """Return whether a JSON file has a list ``views`` of objects, and at least one of these has the ``key``."""
+    """Return whether a JSON file has a list ``views`` of objects, and at least one of the objects has the ``key``."""
     views = source.object.get("views")
     return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any(key in v for v in views)
 
@@ -141,7 +141,7 @@ SHARP_PLY = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
     "pixels of the photo", lambda file: read_sharp(file) is not None,
 )  # fmt: skip
-# A file is read by the first of these rows that has the file's ending and recognises the file
+# A camera file is read by the first row that has the file's ending and recognises the file
 CAMERA_FORMATS = (
     CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(_READ_COLMAP, suffix=".bin"),
                  W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".bin")),

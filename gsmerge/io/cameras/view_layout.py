@@ -1,6 +1,6 @@
 """Classes that declare how a file stores its views, by the keys of their poses, intrinsics, sizes and lenses.
 
-The table of camera formats holds such declarations, and ``read_views.py`` reads files by them.
+The table of camera formats holds one :class:`ViewLayout` per format, by which ``read_views.py`` reads files.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, convert_value, to_array
 
-Key = str | tuple[str, ...]  # a key, or several names of one; the first name with a value is read
+Key = str | tuple[str, ...]  # a key, or several names of a key; the first name with a value is read
 
 
 class Entry(NamedTuple):
@@ -34,7 +34,7 @@ class Matrix:
 
     Args:
         key: The key.
-        shape: Shape of the matrix if a file may list its numbers without rows. None if files list its rows.
+        shape: Shape of the matrix if files may list its numbers without rows. None if files list the matrix row by row.
     """
 
     key: str
@@ -50,7 +50,7 @@ class Matrix:
         return np.asarray(convert_value(self._to_matrix, self.key, values[self.key]))
 
     def _to_matrix(self, value: Any) -> np.ndarray:
-        """Convert the value that the file stores to the matrix."""
+        """Make the matrix from the lists of numbers that the file stores."""
         array = to_array(value)
         return array if self.shape is None else array.reshape(self.shape)
 
@@ -61,7 +61,7 @@ def rotation_of_matrix(numbers: np.ndarray) -> np.ndarray:
 
 
 def rotation_of_vector(numbers: np.ndarray) -> np.ndarray:
-    """Return the rotation ``[3,3]`` about a vector ``[3]``, by its length as the angle in radians."""
+    """Return the rotation ``[3,3]`` about a vector ``[3]`` by an angle in radians that is the vector's length."""
     motion = np.concatenate([numbers.reshape(1, 3), np.zeros((1, 3))], 1)
     return motion_matrices(motion)[0, :3, :3]
 
@@ -73,7 +73,7 @@ class RotationAndShift:
     Args:
         rotation: Key of the rotation.
         shift: Key of the last column, which is the camera's centre if poses are camera-to-world.
-        to_matrix: Function that makes the rotation ``[3,3]`` from the numbers under its key. It is
+        to_matrix: Function that makes the rotation ``[3,3]`` from the numbers under ``rotation``:
             :func:`rotation_of_matrix`, :func:`rotation_of_vector`, or for quaternions wxyz
             :func:`gsmerge.geometry.transforms.quat_to_rotmat`.
     """
@@ -96,13 +96,13 @@ class RotationAndShift:
 
 @dataclass(frozen=True)
 class PinholeKeys:
-    """Intrinsics with a key for each number. If a view has no value for an optional key, a default is taken.
+    """Intrinsics with a key for each number. If a view lacks the value of an optional key, the default is taken.
 
     Args:
-        fx: Key of the horizontal focal length; by default it equals the vertical one.
-        fy: Key of the vertical focal length; by default it equals the horizontal one.
-        cx: Key of the principal point's x; by default the point is in the middle of the image.
-        cy: Key of the principal point's y; by default the point is in the middle of the image.
+        fx: Key of the horizontal focal length, which by default equals the vertical focal length.
+        fy: Key of the vertical focal length, which by default equals the horizontal focal length.
+        cx: Key of the principal point's x, by default the middle of the image.
+        cy: Key of the principal point's y, by default the middle of the image.
         angle_x: Key of the horizontal field of view in radians, for views without ``fx``; "" if there is none.
         angle_y: Key of the vertical field of view in radians, for views without ``fy``; "" if there is none.
     """
@@ -117,7 +117,7 @@ class PinholeKeys:
 
 @dataclass(frozen=True)
 class ViewLayout:
-    """Where a file has its list of views, and under which keys a view has its values.
+    """A description of where a file lists its views, and of the keys under which a view has its values.
 
     A value of null counts as missing. If a view lacks a value other than its name and pose, the value is taken from the
     object that has the list of views.
@@ -128,13 +128,14 @@ class ViewLayout:
         views: Key of the list of views, "" if the whole file is the list, or a function that lists the views.
         name: Key of the image's name. Views without a name are called "view 0", "view 1" and so on.
         size: Keys of width and height in pixels, or the key of a list [height, width]; "" if the file has no size.
-        unit: Unit of the intrinsics: a pixel, the image's width and height, or its larger side. If all intrinsics in
-            "pixels" are small, they are taken as shares of width and height, see :func:`make_camera_file`.
+        unit: Unit of the intrinsics: a pixel, the image's width and height, or the image's larger side. If all
+            intrinsics in "pixels" are small, they are taken as shares of width and height, see
+            :func:`make_camera_file`.
         origin: Point from which the principal point is measured: the upper left corner or the middle of the image.
         lens: Key of the camera model, "" if all views are pinholes. The keys of the coefficients are k1, k2 and so on.
-        models: The program's name of a camera model -> COLMAP's name. Names that are equal are left out.
+        models: The program's name of a camera model -> COLMAP's name, if the two names differ.
         optional: Keys that a view may lack. A size that is missing is read from the view's image. If no view of the
-            file has a focal length, it is estimated later.
+            file has a focal length, focal lengths are estimated later.
         mask: Key of the name of the image's mask; "" if there is none.
         finish: Function that completes the views from other content of the file or folder; None if none is needed.
     """

@@ -38,11 +38,11 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     """Return the text of cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers.
 
     :func:`gsmerge.read_cameras` reads this file. Viewers assume that the principal point is in the middle. A principal
-    point that is not there is written as ``cx`` and ``cy``, which viewers ignore.
+    point elsewhere is written as ``cx`` and ``cy``, which viewers ignore.
     """
 
     def principal_point(K: np.ndarray) -> dict[str, float]:
-        """Return the entries of a principal point; empty if the point is in the middle."""
+        """Return the entries ``cx`` and ``cy`` of a principal point; no entries if it is in the middle of the image."""
         centred = np.allclose(2 * K[:2, 2], (cameras.width, cameras.height), rtol=0, atol=CENTRED_PX)
         return {} if centred else {"cx": float(K[0, 2]), "cy": float(K[1, 2])}
 
@@ -59,7 +59,7 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
 
 
 def order_views(cameras: Cameras) -> list[int]:
-    """Order views by their distance from the median centre and the mean direction; return their numbers."""
+    """Return the numbers of the views, ordered by their distance from the median centre and the mean direction."""
     if len(cameras) == 0:
         return []
     centres, forward = camera_centres(cameras.viewmats), cameras.viewmats[:, 2, :3]
@@ -81,10 +81,10 @@ def is_own_settings(path: Path) -> bool:
 def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
     """Return the text of a ``settings.json``, version 2, which tells SuperSplat's viewer where to look from.
 
-    The camera is the first of :func:`order_views`. Its target lies at the median depth of the ``means [n,3]`` in front
-    of it. The viewer turns the scene by half a turn about z, and takes the field of view for that of the longer side.
-    The settings have a camera track with two keys, both at this camera, because without a track the viewer would move
-    its camera.
+    The camera is the first of :func:`order_views`. The target of the camera lies at the median depth of the ``means
+    [n,3]`` in front of the camera. The viewer turns the scene by half a turn about z, and takes the field of view as
+    that of the image's longer side. The settings have a camera track with two keys, both at this camera, because
+    without a track the viewer would move its camera.
     """
     view = order_views(cameras)[0]
     forward, centre = cameras.viewmats[view, 2, :3].astype(np.float64), cameras.centres[view].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Hold Gaussians in the units of most file formats, convert from and to these units, and read header comments."""
+"""Hold Gaussians in the units of most file formats, convert them from and to these units, and read header comments."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def sh_degree(num_higher: int) -> int:
 def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
     """Return the header comments that copies of a file keep: how to render the Gaussians, and which axis is vertical.
 
-    If several comments state the mode or the axis, the last one counts.
+    If several comments state the mode of rendering or the axis, the last such comment counts.
     """
     mode = render_mode(comments)
     vertical = [line for line in comments if states_vertical_axis(line)]
@@ -72,7 +72,7 @@ def states_vertical_axis(comment: object) -> bool:
 def upward_axis(comments: Sequence[object]) -> str | None:
     """Return the axis that a header comment states as vertical, such as "z" or "-z"; None without such a comment.
 
-    Also None for "y", which programs write for the usual axis -y.
+    Also return None for "y", which programs write for the usual axis -y.
     """
     axes = [str(comment).split()[-1].lower().removeprefix("+") for comment in comments if states_vertical_axis(comment)]
     return axes[-1] if axes and axes[-1] != "y" else None
@@ -95,8 +95,8 @@ class ExpectedScores:
     """PSNR (dB) that new views of a scene are expected to have.
 
     Args:
-        before: When rendered from the input.
-        after: When rendered from the result.
+        before: The PSNR of renders of the input.
+        after: The PSNR of renders of the result.
         low: Lower bound of the expected gain, which nine of ten results exceed.
         high: Upper bound of the expected gain, which one of ten results exceeds.
     """
@@ -118,7 +118,7 @@ def result_comments(scores: ExpectedScores | None, kept: Sequence[str] = ()) -> 
 
 
 def new_views_comment(scores: ExpectedScores) -> str:
-    """Return the header comment of a result on the expected scores of new views."""
+    """Return the header comment of a result that states the expected scores of new views."""
     gain = f"gain {scores.low:.2f} to {scores.high:.2f} dB"
     return f"{NEW_VIEWS_COMMENT}: {scores.before:.2f} to {scores.after:.2f} dB, {gain}"
 
@@ -147,9 +147,9 @@ def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
 def lie_in_unit_range(values: np.ndarray) -> bool:
     """Return whether stored values are opacities or colours in [0, 1], rather than logits or harmonics.
 
-    Rounding and damage may put a few opacities or colours outside. Logits and harmonics are about as frequent beyond 0
-    and 1 as near to them. Therefore the answer is yes if hardly any value lies outside, and more values lie inside,
-    close to 0 or 1, than outside.
+    Rounding and damage may put a few opacities or colours outside of [0, 1]. Logits and harmonics are about as frequent
+    beyond 0 and 1 as near to 0 and 1. Therefore the answer is yes if hardly any value lies outside of [0, 1], and more
+    values lie inside, close to 0 or 1, than outside.
     """
     excess = np.abs(values[np.isfinite(values)] - 0.5) - 0.5  # distance outside [0, 1]; negative inside
     num_outside = int(np.count_nonzero(excess > 0))
@@ -161,14 +161,14 @@ def lie_in_unit_range(values: np.ndarray) -> bool:
 def are_logarithms(scales: np.ndarray) -> bool:
     """Return whether stored scales are logarithms.
 
-    Logarithms of scales are often negative. Scales themselves are negative only by damage.
+    Logarithms of scales are often negative. Scales that are no logarithms are negative only by damage.
     """
     return bool(np.count_nonzero(scales < 0) > MAX_STRAY * scales.size)
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Columns of n Gaussians as files store them.
+    """Columns of n Gaussians in the units of most file formats.
 
     The fields are ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]`` in [0, 1],
     ``sh0 [n,3]`` and ``harmonics [n,k-1,3]``.
@@ -190,7 +190,7 @@ class Columns:
         return sh0_to_rgb(self.sh0)
 
     def along_curve(self) -> Columns:
-        """Return the rows in the order of a space-filling curve, which keeps neighbours in space close in the file."""
+        """Return the rows in the order of a space-filling curve, in which neighbours in space stay close."""
         return self.take(np.argsort(morton_codes(self.means), kind="stable"))
 
     def take(self, rows: np.ndarray) -> Columns:
@@ -213,9 +213,9 @@ def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
 
 @dataclass(frozen=True)
 class Packed:
-    """The ``count`` Gaussians of a file with packed columns; the thread-safe ``unpack`` returns a block of them.
+    """The ``count`` Gaussians of a file with packed columns; the thread-safe ``unpack`` returns a block of Gaussians.
 
-    Gaussians are unpacked in blocks, since all of them at a time would take several times the memory of the result.
+    Gaussians are unpacked in blocks, since all unpacked Gaussians together take several times the memory of the result.
     """
 
     count: int
@@ -225,7 +225,7 @@ class Packed:
 
 @dataclass(frozen=True)
 class PackedRows:
-    """Packed Gaussians with the columns of a PLY file; an index with a slice unpacks these rows."""
+    """Packed Gaussians with the columns of a PLY file; ``rows[start:stop]`` unpacks the rows of the slice."""
 
     parts: Sequence[Packed]
     dtype: np.dtype[np.void]
@@ -262,7 +262,7 @@ def _to_table(columns: Columns) -> np.ndarray:
 class StoredRows:
     """The Gaussians of a file before their units are converted, and facts about the file.
 
-    After ``adapt``, ``rows`` have at least the columns ``REQUIRED_COLUMNS`` of a PLY file.
+    After the function ``adapt``, ``rows`` have at least the columns ``REQUIRED_COLUMNS`` of a PLY file.
     """
 
     rows: np.ndarray | PackedRows
@@ -278,7 +278,7 @@ class StoredRows:
 
 
 def pack_rows(parts: Sequence[Packed]) -> PackedRows:
-    """Give packed Gaussians the columns of a PLY file; missing harmonics of a part become zeros."""
+    """Give packed Gaussians the columns of a PLY file; harmonics that a part lacks become zeros."""
     num_rest = 3 * max(part.num_higher for part in parts)
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS)
     return PackedRows(parts, np.dtype([(name, np.float32) for name in names]))
@@ -318,13 +318,13 @@ def check_gaussian_count(budget: ReadBudget, count: int, num_higher: int, packed
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
-    """Convert Gaussians to columns with harmonics up to ``max_degree``; ValueError if a row is not finite.
+    """Convert Gaussians to columns with harmonics up to ``max_degree``; raise ValueError if a row is not finite.
 
     ``first_row``: number of the first Gaussian, for the error.
     """
 
     def check(values: np.ndarray) -> np.ndarray:
-        """Return values unchanged; ValueError if any is not finite as float32."""
+        """Return values unchanged; raise ValueError if any is not finite as float32."""
         with np.errstate(over="ignore"):
             nonfinite = np.argwhere(~np.isfinite(values.astype(np.float32)))  # no format holds larger numbers
         if len(nonfinite):
@@ -332,14 +332,14 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
         return values
 
     def array(values: Array) -> np.ndarray:
-        """Return values as float64; ValueError as in ``check``."""
+        """Return values as float64; raise ValueError as in ``check``."""
         return check(as_array(values).astype(np.float64))
 
     degree = min(max_degree, gaussians.sh_degree)
     quats = array(gaussians.quats)
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     quats = np.where(length == 0, (1.0, 0.0, 0.0, 0.0), quats) / np.where(length == 0, 1, length)
-    # Scales of 0 get the least logarithm. Negative scales become NaN, which is refused below
+    # Scales of 0 get the least logarithm. Negative scales become NaN, which ``check`` refuses
     log_scales = np.clip(log(array(gaussians.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
     return Columns(
         means=array(gaussians.means),
@@ -369,7 +369,7 @@ def rotator(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Column
     """
     if np.array_equal(rotation, np.eye(3)):
         return lambda columns: columns
-    # A matrix that mirrors maps an ellipsoid as its negative does, which is a rotation
+    # A matrix that mirrors maps an ellipsoid to the same ellipsoid as the negative matrix, which is a rotation
     sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())  # of the determinant
     quat = rotmat_to_quat(sign * rotation[None])[0]
     rotate_harmonics = _harmonics_rotator(rotation, num_higher)
@@ -384,7 +384,7 @@ def rotator(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Column
 def _harmonics_rotator(rotation: np.ndarray, num_higher: int) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that rotates ``harmonics [n,num_higher,3]`` by a matrix ``[3,3]``."""
     matrix = harmonics_rotation(num_higher, rotation) if num_higher else np.zeros((0, 0))
-    # Rounding errors of whole numbers are removed, so that the matrix of half a turn is exactly diagonal
+    # Entries that are whole numbers up to rounding are rounded, so that the matrix of half a turn is exactly diagonal
     matrix = np.where(np.abs(matrix - np.round(matrix)) < _EXACT, np.round(matrix), matrix)
     signs = np.diagonal(matrix)[:, None]
     if np.array_equal(matrix, np.diag(np.diagonal(matrix))):
@@ -409,7 +409,8 @@ def from_smallest_three(largest: np.ndarray, smallest: np.ndarray) -> np.ndarray
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split unit quaternions ``[n,4]`` into the index ``[n]`` of the largest component and the other three ``[n,3]``.
 
-    Signs are chosen so that the largest component is positive. Files leave it out, since it follows from the others.
+    Signs are chosen so that the largest component is positive. Files leave the largest component out, since it follows
+    from the other three components.
     """
     largest, rows = np.abs(quats).argmax(1), np.arange(len(quats))
     quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]

@@ -34,12 +34,12 @@ _UNITS = (
 
 
 def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUnits, str] | None:
-    """Judge a sample of stored colours ``[n,3]``; return units of RGB and a clause that says why; None for harmonics.
+    """Judge a sample of stored colours ``[n,3]``; return units of RGB and a clause with the reason; None for harmonics.
 
-    ``plain [n,3]`` are the bytes of the columns red, green and blue if the file has these, too. Many harmonics are far
-    below zero, since they stand for colours darker than grey. No value of RGB is below black or above white.
+    ``plain [n,3]`` are the bytes of the columns red, green and blue if the file has these columns, too. Many harmonics
+    are far below zero, since they stand for colours darker than grey. No value of RGB is below black or above white.
     """
-    # RGB of a scene covers more than this part of the range from black to white. Harmonics of a scene with little
+    # RGB of a scene covers more than this part of the range from black to white, while harmonics of a scene with little
     # contrast cover less
     min_spread = 0.5
     for units in _UNITS if len(stored) >= MIN_JUDGED else ():
@@ -61,5 +61,5 @@ def find_units(stored: np.ndarray) -> ColorUnits | None:
 
 
 def choose_units(stored: np.ndarray) -> ColorUnits:
-    """Return the most likely units of colours ``[n,3]`` that are known to be RGB."""
+    """Return the most likely units of colours ``[n,3]`` of which the caller says that they are RGB."""
     return next((units for units in _UNITS if arrays.lie_in_unit_range(units.rgb(stored))), _UNITS[0])

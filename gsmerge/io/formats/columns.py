@@ -1,4 +1,4 @@
-"""Recognise columns of a PLY file that are not those of Gaussians: ignore them, note them, or refuse the file."""
+"""Recognise columns of a PLY file that do not belong to Gaussians, and ignore them, note them, or refuse the file."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ class ColumnKind:
     remedy: str = ""  # in the error of files with these columns; empty: a note names the columns
 
 
-# A column belongs to the first kind whose pattern matches its name. A note lists other columns of floats as unknown
+# A column belongs to the first kind whose pattern matches its name. Columns of floats that belong to no kind are noted
+# as unknown
 COLUMN_KINDS = (
     ColumnKind(
         "when each Gaussian appears",
         r"trbf_.*|(scale|scaling)_?t(_\d+)?|t_scale|(log_)?(life_?(time|span)|duration).*|(opacity|cov|sigma)_t(_\d+)?",
-        remedy=_MOMENT,  # Gaussians of all times together are the scene at no time
+        remedy=_MOMENT,  # Gaussians of all times together show no moment of the scene
     ),
     ColumnKind(
         "Mip-Splatting's filter of all scales",
@@ -87,10 +88,10 @@ def _find_kind(name: str) -> ColumnKind | None:
 
 
 def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
-    """Note columns and elements that are not used, though they would change renders; empty if there are none.
+    """Return a note on columns and elements that are not used, but would change renders; empty if there are none.
 
-    ``layers``: names of other elements that hold Gaussians. SceneError if a column shows that Gaussians are incomplete
-    without other data, or if a column of Gaussians has an integer type.
+    ``layers``: names of other elements that hold Gaussians. Raise SceneError if a column shows that Gaussians are
+    incomplete without other data, or if a column of Gaussians has an integer type.
     """
     _check_types(path, row_type)
     by_kind: dict[ColumnKind | None, list[str]] = {}

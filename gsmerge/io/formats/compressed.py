@@ -1,6 +1,7 @@
 """Read compressed PLY files of PlayCanvas, SuperSplat and gsplat.
 
-Each Gaussian has four packed words. Each chunk of 256 Gaussians has the least and the largest of their values.
+Each Gaussian has four packed words. Each chunk of 256 Gaussians has the least and the largest of the values of its
+Gaussians.
 
 The layout is that of PlayCanvas' reader. Positions and scales have 11, 10 and 11 bits between a chunk's minimum and
 maximum. Rotations are the three smaller components of quaternions at 10 bits. Colours and opacities have 8 bits.
@@ -23,7 +24,7 @@ from gsmerge.kernels.elementary import log, log1p
 CHUNK = 256  # Gaussians in a chunk
 _POSITION_RANGES = tuple(f"{bound}_{axis}" for bound in ("min", "max") for axis in "xyz")
 _SCALE_RANGES = tuple(f"{bound}_scale_{axis}" for bound in ("min", "max") for axis in "xyz")
-# Columns that a chunk must have. It may lack the columns COLOR_RANGES
+# Columns that a chunk must have. The columns COLOR_RANGES may be missing
 RANGE_COLUMNS = (*_POSITION_RANGES, *_SCALE_RANGES)
 COLOR_RANGES = tuple(f"{bound}_{channel}" for bound in ("min", "max") for channel in "rgb")
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
@@ -47,7 +48,7 @@ def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
 
 
 def _check_types(path: Path, element: PlyElement, columns: tuple[str, ...], types: tuple[str, str]) -> None:
-    """Raise SceneError if an element lacks one of ``columns``, or has it in a type that is not in ``types``."""
+    """Raise SceneError if an element lacks one of ``columns``, or stores it in a type that is not in ``types``."""
     stored = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
     wrong = next((name for name in columns if stored.get(name) not in types), None)
     if wrong is not None:
@@ -77,7 +78,7 @@ def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
 
 
 def _num_rest(path: Path, data: PlyData, count: int) -> int:
-    """Count the columns of harmonics above degree 0; SceneError unless they make up degree 0, 1, 2 or 3."""
+    """Count the columns of harmonics above degree 0; raise SceneError unless they make up degree 0, 1, 2 or 3."""
     if "sh" not in data:
         return 0
     names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}  # columns of bytes
@@ -93,8 +94,8 @@ def _interpolate(
 ) -> np.ndarray:
     """Interpolate from the minimum to the maximum of each Gaussian's chunk; return values ``[n,3]``.
 
-    ``weights``: three arrays ``[n]`` of weights of the maximum, in [0, 1]. They are the result if the file lacks the
-    columns ``ranges``. ``ranges``: names of the three columns with minima, then of those with maxima. ``chunk_ids
+    ``weights``: three arrays ``[n]`` of weights of the maximum, in [0, 1]. The weights are the result if the file lacks
+    the columns ``ranges``. ``ranges``: names of the three columns with minima, then of those with maxima. ``chunk_ids
     [n]``: the chunk of each Gaussian.
     """
     if all(name in (chunk.dtype.names or ()) and chunk.dtype[name].kind == "f" for name in ranges):
@@ -107,7 +108,7 @@ def _interpolate(
 
 
 def _unpack_words(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
-    """Unpack several numbers in [0, 1] from each word, the first from the highest of the used bits.
+    """Unpack several numbers in [0, 1] from each word, the first number from the highest of the used bits.
 
     ``bits``: how many bits each number has.
     """

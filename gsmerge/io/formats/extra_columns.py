@@ -17,7 +17,7 @@ from gsmerge.io.formats.table import PLY, Format
 def read_extra_columns(info: FileInfo) -> np.ndarray:
     """Read the columns of a file that do not belong to Gaussians, as a structured array ``[n]``.
 
-    The array has no fields if there are no such columns. SceneError if the file changed or cannot be read.
+    The array has no fields if all columns belong to Gaussians. Raise SceneError if the file changed or cannot be read.
     """
     path = Path(info.path)
     if not info.extra_columns:
@@ -30,7 +30,7 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
 
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """Join the rows of files in the columns that all have; also return the names of the columns left out."""
+    """Join the rows of files, in the columns that all files have; also return the names of all other columns."""
     types = [
         {name: part.dtype[name] for name in part.dtype.names or ()} for part in parts
     ]  # of each file: name -> type
@@ -43,7 +43,7 @@ def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[st
 
 
 def describe_extra_columns(columns: np.ndarray, missing: Sequence[str], format_: Format, *, moves: bool) -> list[str]:
-    """Note which additional columns an output in a format keeps: one sentence each, without a full stop.
+    """Note which additional columns an output in ``format_`` keeps. Each note is a sentence without a full stop.
 
     ``missing``: columns that some inputs lack. ``moves``: whether the positions of Gaussians are changed.
     """

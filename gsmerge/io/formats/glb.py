@@ -1,10 +1,10 @@
 """Read and write binary glTF 2.0 (``.glb``) with the extension ``KHR_gaussian_splatting`` of KhronosGroup/glTF.
 
 The axis y points up in glTF, and down in a ``.ply``. Therefore the writer rotates Gaussians by half a turn about z, and
-the reader rotates them back. Viewers that do not know the extension show points in the base colours.
+the reader rotates them back. Viewers that do not know the extension show a point in the base colour for each Gaussian.
 
-The reader also accepts files in which a packed ``.spz`` replaces the separate values. It refuses files of the
-extension's drafts, whose scales are logarithms.
+The reader also accepts files in which one packed ``.spz`` replaces the arrays of positions, colours and so on. The
+reader refuses files of the extension's drafts, whose scales are logarithms.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ READ_EXTENSIONS = {NAME, COMPRESSED, "KHR_mesh_quantization", "KHR_materials_unl
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
 _TYPE_NAMES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # width of a value -> its type in glTF
 _WIDTHS = {name: width for width, name in _TYPE_NAMES.items()}
-# NumPy's type -> glTF's number of this type, and back
+# NumPy's name of a type -> glTF's number of the type; then the number -> NumPy's name
 _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-# The first bytes of the file are a mark, the version and the length. Those of a chunk are its length and kind
+# A file begins with a mark, the version and the file's length. A chunk begins with its length and its kind
 _FILE_HEAD, _CHUNK_HEAD = struct.Struct("<4sII"), struct.Struct("<I4s")
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # turns the axes of a ``.ply`` to those of glTF, and back
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
@@ -66,7 +66,7 @@ _MOVING_KEYS = {"matrix", "rotation", "scale", "translation"}  # keys of a node 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
     """Encode a ``.glb`` file as :func:`glb_bytes` does, with a camera node for each view of the contents.
 
-    The view nearest to the middle of all is the first camera, since viewers look from that one.
+    The view nearest to the middle of all views is the first camera, since viewers look from the first camera.
     """
     cameras = contents.cameras if contents.options.viewer_cameras else NO_CAMERAS
     names = contents.names or number_views(len(cameras))
@@ -86,9 +86,9 @@ def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
 def glb_bytes(
     gaussians: Gaussians, _: Sequence[str] = (), *, nodes: Sequence[Any] = (), cameras: Sequence[Any] = ()
 ) -> bytes:
-    """Encode a ``.glb`` file without comments; ValueError if there is NaN or inf.
+    """Encode a ``.glb`` file without comments; raise ValueError if there is NaN or inf.
 
-    ``nodes`` and ``cameras``: entries of these lists in the glTF document.
+    ``nodes`` and ``cameras``: further entries of the lists with these names in the glTF document.
 
     Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
@@ -99,7 +99,7 @@ def glb_bytes(
     views, accessors = _describe_arrays(list(attributes.values()))
     for name, bound in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
         accessors[0][name] = bound(attributes["POSITION"], axis=0).tolist()
-    # Padded rows are written from the array of which they are a view
+    # An attribute with padded rows is a view of a wider array, which is written with the padding
     content = b"".join((array if array.base is None else array.base).tobytes() for array in attributes.values())
     splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
     splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
@@ -130,12 +130,12 @@ def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
 
 
 def _join(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """Join blocks ``[n,width]`` of rows. If each block is a view of padded rows, so is the result."""
+    """Join blocks ``[n,width]`` of rows. If the blocks are views of padded rows, the result is one, too."""
     return np.concatenate([block if block.base is None else block.base for block in blocks])[:, : blocks[0].shape[1]]
 
 
 def _describe_arrays(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return glTF's buffer views and accessors of arrays ``[n,width]`` that follow each other in a buffer."""
+    """Return glTF's lists of buffer views and accessors for arrays ``[n,width]`` that follow each other in a buffer."""
     views, accessors, offset = list[dict[str, Any]](), list[dict[str, Any]](), 0
     for view_id, array in enumerate(arrays):
         row_bytes, width = array.strides[0], array.shape[1]
@@ -186,7 +186,7 @@ def holds_gaussians(path: Path) -> bool:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read all Gaussians of a ``.glb``, with the axes of a ``.ply``; SceneError if it has none or is damaged."""
+    """Read all Gaussians of a ``.glb``, with the axes of a ``.ply``; raise SceneError for none, or for damage."""
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
     with _damage_errors(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
         document, total = _read_document(file, budget)
@@ -239,11 +239,11 @@ class _Content:
     file: IO[bytes]
     document: dict[str, Any]
     start: int  # of the binary chunk, in bytes from the start of the file
-    end: int  # of the same, in bytes from the start of the file
+    end: int  # of the binary chunk, too
     num_read: int = 0  # bytes read so far, at most the size of the chunk
 
     def read_view(self, view_id: int) -> bytes:
-        """Read a buffer view of bytes, which are those of a ``.spz``; the view must lie in the binary chunk."""
+        """Read a buffer view with the bytes of a ``.spz``; the view must lie in the binary chunk."""
         view = self.document["bufferViews"][view_id]
         at, length = view.get("byteOffset", 0), view["byteLength"]
         self.num_read += length
@@ -253,7 +253,7 @@ class _Content:
         return self.file.read(length)
 
     def read_values(self, accessor_id: int) -> _Values:
-        """Read the values of an accessor; they must lie in the binary chunk."""
+        """Read the values of an accessor; its bytes must lie in the binary chunk."""
         accessor = self.document["accessors"][accessor_id]
         if "sparse" in accessor or "bufferView" not in accessor:
             raise _ForeignError("one with sparse values")
@@ -278,7 +278,7 @@ class _Content:
 
 
 def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any], int]:
-    """Return the JSON of a ``.glb`` and the length that its header states.
+    """Return the JSON document of a ``.glb``, and the length that the file's header states.
 
     The next bytes to read from ``file`` are then the content of the binary chunk.
     """
@@ -304,7 +304,7 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any],
 
 
 def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Yield each primitive of Gaussians with the matrix ``[4,4]`` from its frame to that of a ``.ply``."""
+    """Yield each primitive of Gaussians with the matrix ``[4,4]`` from its frame to the frame of a ``.ply``."""
     scenes, nodes, visited = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
     budget.check_steps(_STEPS_PER_NODE * len(nodes), "steps for nodes")
     stack = [(node_id, HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
@@ -333,14 +333,14 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Attributes:
-    """The attributes of a primitive. Reading one adds its number of bytes to ``sizes``."""
+    """The attributes of a primitive. Reading an attribute adds the number of its bytes to ``sizes``."""
 
     content: _Content
     ids: dict[str, Any]  # of accessors, by name of the attribute
     sizes: dict[str, int]  # attribute of Gaussians -> bytes
 
     def read(self, kind: str, width: int, name: str) -> _Values:
-        """Read the glTF attribute ``name`` with ``width`` numbers per Gaussian; add its size to ``sizes[kind]``."""
+        """Read the glTF attribute ``name`` with ``width`` numbers per Gaussian; add its bytes to ``sizes[kind]``."""
         if name not in self.ids:
             raise _ForeignError(f"one whose Gaussians have no {name}")
         bytes_before = self.content.num_read
@@ -379,8 +379,9 @@ def _read_splats(content: _Content, primitive: dict[str, Any], transform: np.nda
     transform_columns = _transformer(transform, len(harmonics))
 
     def unpack(block: slice) -> Columns:
+        """Return the Gaussians of a block of rows."""
         means_block = means[block]
-        # np.stack needs an array even without harmonics, so zeros are put first and cut off
+        # np.stack needs at least one array, so an array of zeros is put before the harmonics and cut off again
         return transform_columns(
             Columns(
                 means=means_block,

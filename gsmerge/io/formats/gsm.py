@@ -1,9 +1,9 @@
 """Read and write states (``.gsm``), the files in which ``extend`` stores batches of views.
 
-They are safetensors files. Their only metadata entry is a header in JSON, with checksums of itself and of each array.
-Files of the kind ``scene`` hold results with their cameras and pictures, and this module reads them. Files of the kind
-``features`` hold Feature Gaussians, and :mod:`gsmerge.states.features` reads them. No content of a file is executed,
-and each array is checked before it is used.
+A ``.gsm`` is a safetensors file. Its only metadata entry is a header in JSON, with checksums of the header and of each
+array. Files of the kind ``scene`` hold results with their cameras and pictures. This module reads ``scene`` files.
+Files of the kind ``features`` hold Feature Gaussians, and are read by :mod:`gsmerge.states.features`. No content of a
+file is executed, and each array is checked before it is used.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 from gsmerge.values.arrays import as_array
 from gsmerge.version import __version__
 
-SCHEMA = 3  # version of the whole file; gsmerge 0.3.0 and earlier wrote lower ones
-HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; gsmerge 0.1 wrote the second
+SCHEMA = 3  # version of the whole file; gsmerge 0.3.0 and earlier wrote lower versions
+HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; gsmerge 0.1 wrote gsmerge-encoded
 SCENE, FEATURES = "scene", "features"  # kinds of files
 REMEDY = "run extend again with all batches"
 # Entry of the header -> its type
@@ -54,7 +54,7 @@ class GsmFile:
         return SceneError(self.path, problem, "copy it again, or " + REMEDY)
 
     def array(self, name: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
-        """Return the array ``name``; SceneError if its type or shape differs. None in ``shape`` allows any size."""
+        """Return the array ``name``; raise SceneError for another type or shape. None in ``shape`` allows any size."""
         array = self.arrays.get(name)
         expected = f"{name}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
         if array is None:
@@ -65,7 +65,7 @@ class GsmFile:
         return array
 
     def finite(self, name: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
-        """Return an array as :meth:`array` does; SceneError also if it has NaN or inf."""
+        """Return an array as :meth:`array` does; also raise SceneError if the array has NaN or inf."""
         array = self.array(name, dtype, *shape)
         if not np.isfinite(array).all():
             raise self.error(f"{name}: expected finite numbers, found NaN or inf")
@@ -77,7 +77,7 @@ def write_gsm(
 ) -> None:
     """Write a ``.gsm`` with ``arrays`` and a header, to which schema, version and checksums are added.
 
-    ``mode``: the largest permissions of the file, since its pictures may be private.
+    ``mode``: the most rights that the file gets, since its pictures may be private.
     """
     header = {"schema": SCHEMA, "gsmerge": __version__, **header}
     data = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
@@ -96,7 +96,7 @@ def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> d
 
 
 def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
-    """Read a ``.gsm`` of a ``kind``, or of any kind if None; SceneError for other files or a wrong checksum."""
+    """Read a ``.gsm`` of a ``kind``, or of any kind if None; raise SceneError for other files or a wrong checksum."""
     path = Path(path)
     metadata, arrays = read_tensors(path, "a .gsm file", REMEDY)
     header = _parse_header(path, metadata)
@@ -111,12 +111,12 @@ def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """Read only the header of a ``.gsm``; SceneError for other files."""
+    """Read only the header of a ``.gsm``; raise SceneError for other files."""
     return _parse_header(path, read_tensors(path, "a .gsm file", REMEDY, arrays=False)[0])
 
 
 def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Parse the header of a file; SceneError if the file has no header, or if its schema or an entry is wrong."""
+    """Parse the header of a file; raise SceneError if the file has no header, or if its schema or an entry is wrong."""
     text = metadata.get(HEADER, metadata.get(ENCODED))
     if text is None:
         raise SceneError(path, "expected a .gsm of gsmerge, found another safetensors file", "name the .gsm")
@@ -153,7 +153,7 @@ def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwr
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a ``.gsm`` of results; SceneError if it is damaged or holds Feature Gaussians."""
+    """Read the Gaussians of a ``.gsm`` of results; raise SceneError if it is damaged, or has Feature Gaussians."""
     file = read_gsm(path, SCENE)
     means = file.array("means", np.float32, None, 3)
     n = len(means)
@@ -179,7 +179,7 @@ def read_rows(path: Path) -> StoredRows:
 
 
 def _picture_notes(about: Mapping[str, Any]) -> tuple[str, ...]:
-    """Note if batches have no photos, and which pictures replace these."""
+    """Note if batches have no photos, and which pictures replace the photos."""
     names = about.get("pictures")
     replacements = sorted({str(name)[:40] for name in names if name != "photos"}) if isinstance(names, list) else []
     return (f"some batches have no photos; {' and '.join(replacements)} replace them",) if replacements else ()
@@ -208,7 +208,7 @@ def holds_views(path: Path) -> bool:
 
 
 def read_views(source: CameraSource) -> StoredCameras:
-    """Read the cameras and pictures of a ``.gsm`` of results; SceneError if any of them are missing or damaged."""
+    """Read the cameras and pictures of a ``.gsm`` of results; raise SceneError if some are missing or damaged."""
     file = read_gsm(source.path)
     cameras = stored_cameras(file)
     names = stored_names(file, len(cameras))
@@ -221,7 +221,7 @@ def read_views(source: CameraSource) -> StoredCameras:
 
 
 def stored_names(file: GsmFile, num_views: int) -> tuple[str, ...]:
-    """Return the names of a file's views; SceneError unless there are ``num_views``."""
+    """Return the names of a file's views; raise SceneError unless the file has ``num_views`` names."""
     names = file.header["names"]
     if len(names) != num_views or not all(isinstance(name, str) for name in names):
         raise file.error(f"names: expected {num_views} names, one per view, found others")
@@ -229,7 +229,7 @@ def stored_names(file: GsmFile, num_views: int) -> tuple[str, ...]:
 
 
 def stored_cameras(file: GsmFile) -> Cameras:
-    """Return the cameras of a file; SceneError if they are damaged."""
+    """Return the cameras of a file; raise SceneError if they are damaged."""
     viewmats = file.finite("viewmats", np.float64, None, 4, 4)
     width, height = file.header["width"], file.header["height"]
     check_image_size(file.path, width, height)

@@ -54,7 +54,7 @@ _SIZES = {  # names of types -> bytes of a number
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Open a PLY file, whose rows :func:`open_rows` then reads block by block; SceneError if it holds no Gaussians."""
+    """Open a PLY file for :func:`open_rows`, which reads its rows; raise SceneError if it holds no Gaussians."""
     data, num_left = open_ply(path)
     elements = {element.name: {column.name for column in element.properties} for element in data.elements}
     is_compressed = "chunk" in elements and elements.get("vertex", set()) >= set(arrays.PACKED)
@@ -110,7 +110,7 @@ def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequen
 def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
     """Return a copy of a block of rows with three log scales, and with RGB colours in [0, 1].
 
-    The third scale of 2D Gaussians is :data:`THIN` times the smaller one. ``white``: the stored number for white.
+    The third scale of 2D Gaussians is :data:`THIN` times the smaller scale. ``white``: the stored number for white.
     """
     columns = {name: rows[name] for name in rows.dtype.names or ()}
     if white != 1:
@@ -133,7 +133,7 @@ def is_from_gsmerge(comments: Sequence[str]) -> bool:
 def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
     """Return the rows of the Gaussians with the usual names of columns, and the prefix that the names had.
 
-    SceneError if required columns are missing, or if there is no row.
+    Raise SceneError if required columns are missing, or if there is no row.
     """
     if "vertex" not in data:
         names = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
@@ -141,7 +141,7 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
     vertex = data["vertex"]
     rows, prefix = _without_prefix(vertex.data)
     columns = set(rows.dtype.names or ())
-    # 2D Gaussians have no third scale, and files with plain colours no harmonics of degree 0
+    # 2D Gaussians have no third scale, and files with plain colours have no harmonics of degree 0
     optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
     missing = [name for name in arrays.REQUIRED_COLUMNS if name not in columns | optional]
     if missing:
@@ -151,7 +151,7 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
             remedy = "export it again, since it is compressed but lacks its element 'chunk'"
         elif len(missing) < len(arrays.REQUIRED_COLUMNS) // 2:
             remedy = "export it again with them"
-        if arrays.SCALES[0] in missing:  # without any scale, a third one is expected, too
+        if arrays.SCALES[0] in missing:  # without any scale, the third scale is expected, too
             missing = [name for name in arrays.REQUIRED_COLUMNS if name in {*missing, arrays.SCALES[2]} - columns]
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
@@ -163,8 +163,8 @@ def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
     """Return rows after removing a prefix from the names of their columns; also return the prefix, or "" if none.
 
     Columns ``rotation_0`` to ``rotation_3`` get their usual names. Nothing changes if names are usual or would not be
-    unique, or if a column has lists. CloudCompare writes "scalar_" before names that are
-    not its own, and "scalar_scal_" if it writes the file again.
+    unique, or if a column has lists. CloudCompare writes "scalar_" before column names that it does not know, and
+    "scalar_scal_" if it writes such a file again.
     """
     names, known_name = tuple(rows.dtype.names or ()), arrays.QUATS[0]
     prefix = next((name.removesuffix(known_name) for name in names if name.endswith(known_name)), "")
@@ -179,7 +179,7 @@ def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
-    """Count the columns ``f_rest_*``; SceneError unless they make up all harmonics of a degree."""
+    """Count the columns ``f_rest_*``; raise SceneError unless these are all harmonics up to a degree."""
     names = {name for name in columns if name.startswith("f_rest_")}
     if len(names) not in (0, 9, 24, 45, 72) or names != {f"f_rest_{i}" for i in range(len(names))}:
         numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
@@ -201,7 +201,7 @@ def _layout_name(names: tuple[str, ...], num_rest: int, *, is_compressed: bool) 
 
 
 def _bytes_by_attribute(row_type: np.dtype[Any], count: int) -> dict[str, int]:
-    """Count the bytes of ``count`` rows for each attribute, such as "means" or "scales"."""
+    """Return how many bytes each attribute, such as "means" or "scales", takes in ``count`` rows."""
     columns = {
         "means": arrays.MEANS,
         "normals": arrays.NORMALS,
@@ -219,7 +219,7 @@ def _bytes_by_attribute(row_type: np.dtype[Any], count: int) -> dict[str, int]:
 
 
 def _packed_bytes(rows: np.ndarray | arrays.PackedRows) -> dict[str, int]:
-    """Count the bytes of the rows of a compressed file for each attribute.
+    """Return how many bytes each attribute takes in the rows of a compressed file.
 
     A row has four words of 4 bytes, one of them for colour and opacity, and a byte for each harmonic above degree 0.
     """
@@ -229,7 +229,7 @@ def _packed_bytes(rows: np.ndarray | arrays.PackedRows) -> dict[str, int]:
 
 
 def no_ply_error(path: Path) -> SceneError:
-    """Return the error for a file that is no PLY file; a picture and a file of cameras are recognised."""
+    """Return the error for a file that is no PLY file. If the file is a picture or has cameras, the error says so."""
     if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES:
         remedy = "make Gaussians from photos with a model first, and name its .ply"
         return SceneError(path, "expected Gaussians, found a picture", remedy)
@@ -242,8 +242,9 @@ def no_ply_error(path: Path) -> SceneError:
 def open_ply(path: Path) -> tuple[PlyData, int]:
     """Open a PLY file; also return the number of bytes after its last element.
 
-    Everything is read but binary vertices that are not compressed. These stay in the file as a memory map, from which
-    :func:`open_rows` reads. SceneError if the file is no PLY file, is damaged, or is shorter than its header says.
+    Binary vertices that are not compressed stay in the file as a memory map, from which :func:`open_rows` reads later.
+    All other content is read. Raise SceneError if the file is no PLY file, is damaged, or is shorter than its header
+    says.
     """
     budget = read_budget(path)
     try:
@@ -252,11 +253,11 @@ def open_ply(path: Path) -> tuple[PlyData, int]:
         if start[:4] not in (b"ply\n", b"ply\r"):
             raise no_ply_error(path)
         end, is_text = _check_header(start, budget)
-        # plyfile warns of empty lists and of numbers that are too large
+        # plyfile warns of empty lists and of numbers that are too large for their type
         with _open_for_parser(path, end, is_text=is_text) as file, quiet_warnings():
             data = PlyData.read(file, mmap="r")
             num_left = len(file.read().strip()) if is_text else budget.file_bytes - file.tell()
-        # On Windows nothing stays mapped, since a mapped file cannot be replaced
+        # On Windows no file stays mapped, since a mapped file cannot be replaced
         mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)
         for element in data.elements:
             if isinstance(element.data, np.memmap) and element.name not in mapped:
@@ -312,8 +313,8 @@ class _BinaryRows(BufferedReader):
 def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
-    Mapped rows are read from the file, not from the mapped memory. If another program shortened the file, access to
-    this memory would end the process, while reading the file raises SceneError.
+    Mapped rows are read from the file, not from the mapped memory. If another program shortened the file, access to the
+    mapped memory would end the process, while reading from the file raises SceneError.
     """
     if not isinstance(rows, np.memmap):
         yield rows.__getitem__
@@ -322,6 +323,7 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
     with path.open("rb") as file:
 
         def read(block: slice) -> np.ndarray:
+            """Read a block of rows from the file."""
             start, stop, _ = block.indices(len(rows))
             out = np.empty(stop - start, rows.dtype)
             with lock:
@@ -336,7 +338,7 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
 
 
 def header_counts(path: Path, *, check_size: bool = False) -> tuple[int, int]:
-    """Return the numbers of Gaussians and of columns ``f_rest_*`` in a PLY file's header; zeros if it is unreadable.
+    """Return the numbers of Gaussians and of columns ``f_rest_*`` in a PLY file's header; zeros if it cannot be read.
 
     ``check_size``: also return zeros if the file is too short for the rows in its header.
     """
@@ -366,7 +368,7 @@ def is_file_from_gsmerge(path: Path) -> bool:
 
 
 def _read_header(path: Path, *, check_size: bool = False) -> str:
-    """Return a PLY file's header; "" if it has more than 64 KiB or cannot be read.
+    """Return a PLY file's header; "" if the header is above 64 KiB or cannot be read.
 
     ``check_size``: also return "" if :func:`_check_header` refuses the file.
     """
@@ -388,7 +390,7 @@ def _list_comments(header: str) -> list[str]:
 
 
 def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
-    """Return the size of a header in bytes, and whether rows are text; SceneError if the file is too short for rows.
+    """Return the size of a header in bytes, and whether rows are text; raise SceneError if the file is too short.
 
     ``start``: the first bytes of the file. The header may have other errors, which plyfile's parser finds later.
     """
@@ -407,7 +409,8 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     bytes_left = size - end - len(last_line)
     for element in elements:
         _check_element(budget, element)
-        # Text has a digit and a space per number. A list has at least its length, whose type is its second word
+        # A number in text has at least a digit and a space. A list has at least its length, whose type is the second
+        # word
         row_bytes = sum(2 if is_text else _SIZES.get((words[1:2] or words)[0], 1) for words in element.properties)
         bytes_before, bytes_left = bytes_left, bytes_left - element.count * row_bytes
         if bytes_left < -1:  # the last row of a text may end without a new line
@@ -425,12 +428,12 @@ class _Element:
 
     name: str
     count: int  # number of rows
-    # Words of each column: [its type], or ["list", the type of the length, the type of the values]
+    # For each column, a list of words: [its type], or ["list", the type of the length, the type of the values]
     properties: list[list[str]] = field(default_factory=list)
 
 
 def _parse_elements(lines: list[list[str]]) -> list[_Element]:
-    """Return the elements of a header; each of its ``lines`` is a list of words."""
+    """Return the elements of a header, whose ``lines`` are lists of words."""
     elements: list[_Element] = []
     for words in lines:
         if words[:1] == ["element"] and len(words) == 3 and re.fullmatch(r"[+-]?\d[\d_]*", words[2]):
@@ -468,7 +471,7 @@ def _check_element(budget: ReadBudget, element: _Element) -> None:
 
 
 def _truncated(path: Path, expected: str, num_whole: int, reason: str) -> SceneError:
-    """Make the SceneError of a file that ends early, or is damaged, after ``num_whole`` complete rows."""
+    """Make the SceneError for a file that ends, or is damaged, after ``num_whole`` complete rows."""
     return SceneError(
         path, f"truncated or damaged: expected {expected}, found {num_whole} complete ({reason})", arrays.EXPORT_AGAIN
     )
@@ -477,7 +480,7 @@ def _truncated(path: Path, expected: str, num_whole: int, reason: str) -> SceneE
 def ply_blocks(
     gaussians: Gaussians, degree: int, comments: Sequence[str], *, normals: bool, extra: np.ndarray | None = None
 ) -> Iterator[bytes | memoryview]:
-    """Yield the header and blocks of rows of a PLY file with harmonics up to ``degree``; ValueError for NaN or inf.
+    """Yield a PLY file's header and blocks of rows, with harmonics up to ``degree``; raise ValueError for NaN or inf.
 
     ``extra``: structured array ``[n]`` of little-endian columns, which are written after those of the Gaussians.
     """
@@ -525,7 +528,7 @@ def _header(
         *(f"f_rest_{i}" for i in range(num_rest)),
     ]
     names += ["opacity", *arrays.SCALES, *arrays.QUATS]
-    # Either comment states that opacities are logits, so that readers need not guess it
+    # RESULT_COMMENT and LOGIT_COMMENT both state that opacities are logits, so that readers need not guess the encoding
     comments = comments if arrays.RESULT_COMMENT in comments else (arrays.LOGIT_COMMENT, *comments)
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
@@ -541,9 +544,9 @@ def file_bytes(count: int, sh_degree: int) -> int:
 
 
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
-    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits.
+    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; raise UsageError if none fits.
 
-    The size includes the longest comment on new views, even if the result will have none.
+    The size includes the longest comment on new views, even if the result will have no such comment.
     """
     if not 0 <= sh_degree <= MAX_READ_DEGREE:
         raise ValueError(f"sh_degree: expected 0 to {MAX_READ_DEGREE}, got {sh_degree}")

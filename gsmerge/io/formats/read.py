@@ -38,8 +38,8 @@ class FileInfo:
     format: str  # "ascii", "binary little-endian" or "binary big-endian"
     count: int  # number of rows, including unusable ones
     file_bytes: int  # bytes of the file; of levels of detail, also of the chunks of the level that is read
-    # Attribute (means, normals, sh0, shN, opacities, scales, quats, extra) -> its bytes. Numbers of an ascii file count
-    # as binary ones. For .spz, bytes before compression. For .sog, bytes of textures; those of sh0 include opacities
+    # Attribute (means, normals, sh0, shN, opacities, scales, quats, extra) -> its bytes. Ascii files count as if
+    # binary, a .spz before compression, and a .sog by its textures, where opacities are in sh0
     bytes_by_attribute: dict[str, int]
     columns: tuple[str, ...]  # all columns of the vertex element, in the file's order
     extra_columns: tuple[str, ...]  # the columns that do not belong to Gaussians
@@ -52,10 +52,10 @@ class FileInfo:
     num_nonfinite: int  # rows with NaN, inf, a log scale above 30 or a harmonic beyond +-1e6, which are set aside
     num_empty: int  # rows that only pad the file, which are set aside
     num_zero_quats: int  # Gaussians with a zero quaternion, read as the identity
-    # Says in one sentence without a full stop why the scales are likely wrong; empty if they are plausible
+    # One sentence without a full stop that says why the scales are likely wrong; empty if the scales are plausible
     odd_scales: str = ""
     color_units: ColorUnits | None = None  # units of RGB in the columns of harmonics; None if these hold harmonics
-    color_note: str = ""  # says that these units were guessed, in one sentence without a full stop
+    color_note: str = ""  # sentence without a full stop that says that ``color_units`` were guessed
     open_units: ColorUnits | None = None  # units of RGB that the columns may have if photos confirm it; None: none
     adapted: tuple[str, ...] = ()  # how the content was adapted, one sentence each without a full stop
 
@@ -64,8 +64,8 @@ class FileInfo:
 class GaussianFile:
     """The n Gaussians of a file, row by row, as float32; means are float64 if the file stores them as float64.
 
-    ``valid [n]`` is False for rows that are not finite or only pad the file. Such a row is fully transparent and grey,
-    and has the position and scales of the Gaussian before it.
+    ``valid [n]`` is False for rows that are not finite or only pad the file. A row that is not valid is fully
+    transparent and grey, and has the position and scales of the Gaussian before it.
     """
 
     gaussians: Gaussians
@@ -77,7 +77,7 @@ class GaussianFile:
 
 
 def kept_comments(info: FileInfo) -> tuple[str, ...]:
-    """Return the header comments that copies keep: how to render the Gaussians, and which axis is vertical."""
+    """Return the header comments that copies of a file keep: how to render Gaussians, and which axis is vertical."""
     return arrays.copied_comments(info.comments)
 
 
@@ -110,8 +110,7 @@ def read_ply(
     """Read a PLY file of Gaussians, binary or ascii, with harmonics of any degree up to 4.
 
     Additional columns are not used. Without harmonics of degree 0, colours may be red, green and blue, or r, g and b
-    (bytes, or floats in [0, 1]). 2D Gaussians have two scales; their third scale becomes a thousandth of the smaller
-    one.
+    (bytes, or floats in [0, 1]). 2D Gaussians have two scales, and get as third scale a thousandth of the smaller one.
 
     Args:
         path: The file.
@@ -119,7 +118,7 @@ def read_ply(
             as logits. Infinite logits are opacities of 0 and 1.
         scales: How scales are stored. "auto" reads them as logarithms, unless the size of the scene shows that
             they are linear.
-        colors: What ``f_dc_*`` hold. "auto" reads them as harmonics, unless they fill the range of RGB and end there.
+        colors: What ``f_dc_*`` hold. "auto" reads them as harmonics, unless they fill the range of RGB, but no more.
 
     Raises:
         SceneError: If the file cannot be read, lacks columns, or has fewer than 2 finite Gaussians in 1,000 rows.
@@ -142,7 +141,7 @@ def read_parts(
 ) -> GaussianFile:
     """Read one or several PLY files as one file, in the given order.
 
-    Errors are those of :func:`read_ply`; SceneError also if their columns differ.
+    Errors are those of :func:`read_ply`; also raise SceneError if the columns of the files differ.
     """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
@@ -165,9 +164,9 @@ def read_gaussians(
     """Read a file of Gaussians in the format that its ending names.
 
     Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``. The finest level of a
-    ``lod-meta.json`` is read. ``meta.json`` or its folder is a ``.sog`` without its zip. :func:`read_ply` reads
-    everything else, with ``opacity``, ``scales`` and ``colors``, which other formats do not need. SceneError if the
-    file cannot be read, is damaged, or holds no finite Gaussian. ValueError for an unknown encoding.
+    ``lod-meta.json`` is read. A ``meta.json``, or its folder, is read as a ``.sog`` without a zip. Files with other
+    endings are read by :func:`read_ply`, which alone needs ``opacity``, ``scales`` and ``colors``. Raise SceneError if
+    the file cannot be read, is damaged, or holds no finite Gaussian. Raise ValueError for an unknown encoding.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
@@ -194,7 +193,7 @@ def convert_files(
 ) -> GaussianFile:
     """Convert the rows of one or several files to Gaussians; damaged or empty rows become invalid.
 
-    Counts and bytes in ``info`` are sums over the files. Everything else in it is that of the first file.
+    Counts and bytes in ``info`` are sums over the files. All other facts in ``info`` are those of the first file.
     """
     path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
     names = tuple(dtype.names or ())
@@ -251,7 +250,7 @@ def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.
     """Make uninitialised arrays of ``n`` Gaussians by name, and the array ``valid``.
 
     ``dtype``: the columns of the stored rows. ``file_bytes``: the size of the files. Arrays that are many times as
-    large lie in a temporary file.
+    large as the files lie in a temporary file.
     """
     names = tuple(dtype.names or ())
     num_higher = sum(name.startswith("f_rest_") for name in names) // 3
@@ -275,9 +274,9 @@ def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[s
 def _judge_scales(
     paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray], choice: ScaleChoice
 ) -> ScaleJudgement:
-    """Judge whether stored scales are linear or logarithms; ``out`` was filled as if they were logarithms.
+    """Judge whether stored scales are linear or logarithms; ``out`` was filled as for logarithms.
 
-    Only the scales of a PLY file may be linear. Those in a file of gsmerge are logarithms, unless the caller states
+    Only the scales of a PLY file may be linear. Scales in a file of gsmerge are logarithms, unless the caller states
     something else.
     """
     judgement = judge_scales(out)
@@ -304,8 +303,8 @@ def _choose_colors(
 ) -> tuple[ColorUnits | None, str, ColorUnits | None]:
     """Choose the units of stored colours: those of RGB, or None for harmonics of degree 0.
 
-    Also return a note on a guess, and the units of RGB that the colours may have if photos confirm it. Only a PLY file
-    may have RGB. A file of gsmerge has harmonics, unless the caller states something else.
+    Also return a note if units are guessed, and the units of RGB that the colours have if photos confirm them. Only a
+    PLY file may have RGB. A file of gsmerge has harmonics, unless the caller states something else.
     """
     names = part.rows.dtype.names or ()
     is_stated = choice == "sh" or (choice == "auto" and part.encoding is not None)
@@ -324,7 +323,7 @@ def _choose_colors(
 
 
 def _with_linear_scales(part: StoredRows) -> StoredRows:
-    """Return rows whose linear scales become log scales when a block of rows is read."""
+    """Return rows whose linear scales become logarithms when a block of the rows is read."""
     adapt = part.adapt
     return replace(part, adapt=lambda rows: log_of_scales(rows) if adapt is None else adapt(log_of_scales(rows)))
 
@@ -335,7 +334,7 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
     with ply.open_rows(path, stored.rows) as read:
 
         def convert(start: int) -> tuple[int, int]:
-            """Convert the block of rows from ``start`` on; return its two numbers."""
+            """Convert the block of rows from ``start`` on; return the two numbers for this block."""
             block = slice(start, min(start + block_rows, n))
             rows = read(block) if stored.adapt is None else stored.adapt(read(block))
             counts = _convert(rows, {name: array[block] for name, array in out.items()})
@@ -357,10 +356,10 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
 
 
 def _convert_with_kernel(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
-    """Fill arrays with the first rows of a block by the compiled kernel; return the number of these rows.
+    """Fill arrays with the first rows of a block by the compiled kernel; return how many rows it filled.
 
-    The kernel stops before rows with numbers that are not finite or beyond the limits. The number is 0 if a used column
-    is missing or any column is not float32.
+    The kernel stops before a row with numbers that are not finite or beyond the limits. The returned number is 0 if a
+    used column is missing or any column is not float32.
     """
     columns: dict[str, Any] = dict(rows.dtype.fields or {})  # name -> type and offset in bytes
     num_higher = out["shN"].shape[1]
@@ -382,7 +381,7 @@ def _convert_with_kernel(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
 def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
     """Fill arrays with rows of any type; return the numbers of rows with clipped values and with zero quats.
 
-    A row is valid if all its values are finite. Logits may be infinite, and scales may be zero.
+    A row is valid if its numbers are finite, except that a logit may be infinite and a scale zero.
     """
     color_names, num_higher = arrays.color_columns(rows.dtype.names), out["shN"].shape[1]
     rest_names = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
@@ -416,14 +415,14 @@ def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[i
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions to ``out [n,4]``, and the identity where a quaternion is zero; return where ``[n]``."""
+    """Write unit quaternions to ``out [n,4]``, or the identity for zero quaternions; return ``[n]`` which are zero."""
     w, x, y, z = quats
     squared_lengths = w * w + x * x + y * y + z * z
     inverse_lengths = 1 / np.sqrt(squared_lengths)
     for j, column in enumerate(quats):
         np.multiply(column, inverse_lengths, out=out[:, j])
     is_zero = np.zeros(len(w), np.bool_)
-    # Rows whose squares under- or overflow in float32 are computed again in float64
+    # Quaternions whose squares under- or overflow in float32 are normalised again in float64
     extreme = np.flatnonzero(~((squared_lengths > 1e-30) & (squared_lengths < 1e30)))
     if len(extreme):
         exact = np.stack([column[extreme].astype(np.float64) for column in quats], 1)
@@ -460,8 +459,8 @@ def _choose_encoding(
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
     """Return the encoding of opacities that a part declares; None if no part declares one.
 
-    SceneError if parts have different encodings. For this check, the encoding of a part that declares none is guessed
-    from its values, if they are enough.
+    Raise SceneError if parts have different encodings. For this check, the encoding of a part without a declaration is
+    guessed from its values if it has 100 values.
     """
     start, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
     min_values = 100  # least number of values for a guess
@@ -480,7 +479,7 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
 
 
 def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
-    """Convert stored opacities to [0, 1], in place; rows with infinite values become invalid unless they are logits."""
+    """Convert stored opacities to [0, 1], in place; rows with infinite values other than logits become invalid."""
     if encoding == "raw":
         valid &= np.isfinite(opacities)
         np.clip(opacities, 0, 1, out=opacities)
@@ -492,7 +491,7 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
 
 
 def _check_raw(path: Path, opacities: np.ndarray) -> None:
-    """Raise SceneError if stored values that the caller declares as opacities in [0, 1] lie outside, as logits do."""
+    """Raise SceneError if stored values that the caller declares as opacities in [0, 1] lie outside of [0, 1]."""
     finite = np.isfinite(opacities)
     outside = (np.abs(opacities - 0.5) > 0.5 + arrays.UNIT_ROUNDING) & finite
     if outside.sum() > arrays.MAX_STRAY * finite.sum():
@@ -504,8 +503,8 @@ def _check_raw(path: Path, opacities: np.ndarray) -> None:
 def _spread_low_degree(shN: np.ndarray) -> None:
     """Mend ``shN [n,15,3]``, in place, if a file of Long-LRM has harmonics of degree 1 or 2.
 
-    Long-LRM writes 45 columns for every degree, and fills only the first 9 or 24. They hold all harmonics of red, then
-    of green, then of blue.
+    For degree 1 or 2, Long-LRM fills only the first 9 or 24 of its 45 columns. The filled columns hold all harmonics of
+    red, then of green, then of blue.
     """
     if shN.shape[1] != 15:
         return
@@ -519,7 +518,7 @@ def _spread_low_degree(shN: np.ndarray) -> None:
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
-    """Make invalid rows transparent, in place, and return their number; SceneError if too few rows are valid."""
+    """Make invalid rows transparent, in place, and return their number; raise SceneError if too few rows are valid."""
     valid = out["valid"]
     invalid = np.flatnonzero(~valid)
     num_valid = len(valid) - len(invalid)
@@ -537,7 +536,7 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     """Return the valid rows that are no Gaussians, but only pad the file.
 
     A row at the origin pads the file if it is not rotated, round and grey, as a row of zeros is. VolSplat pads with
-    many equal rows at the origin. If all valid rows are such, a few count as Gaussians, and many raise SceneError.
+    many equal rows at the origin. If all valid rows pad, up to 15 count as Gaussians, and more raise SceneError.
     """
     rows = np.flatnonzero((out["means"][:, 0] == 0) & out["valid"])
     rows = rows[(out["means"][rows] == 0).all(1)]
@@ -561,7 +560,7 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
 def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
     """Make ``rows`` invalid, transparent and grey, in place.
 
-    They get the position and scales of the valid row before them, so that they do not enlarge the scene.
+    Each of ``rows`` gets the position and scales of the valid row before it, so that it does not enlarge the scene.
     """
     if len(rows) == 0:
         return
@@ -575,7 +574,7 @@ def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
 
 
 def _set_aside_impossible(out: dict[str, np.ndarray]) -> list[str]:
-    """Make rows invalid, in place, if they have numbers that no scene has; warn if these rows are many."""
+    """Make rows invalid, in place, if they have numbers that no scene has; warn if there are many such rows."""
     is_possible = (out["scales"] < exp(np.float32(arrays.MAX_LOG_SCALE))).all(1)
     is_possible &= (np.abs(out["means"]) <= arrays.MAX_POSITION).all(1)
     is_possible &= (np.abs(np.concatenate([out["sh0"], out["shN"]], 1)) < MAX_HARMONIC).all((1, 2))

@@ -15,15 +15,15 @@ from gsmerge.io.formats.write import limit_notes, write_gaussians
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arrays import distinct
 
-# Renders change visibly if the mean square of the Gaussians' moves is above this: at this value, a PSNR of 27 dB drops
-# by .05 dB. A move is divided by the Gaussian's size, and at most 1. In scenes around the origin, the mean square is at
-# most a tenth of this.
+# Renders change visibly if the mean square of the Gaussians' moves is above this limit, at which a PSNR of 27 dB drops
+# by .05 dB. A move is divided by the Gaussian's size, and a quotient above 1 counts as 1. In scenes around the origin,
+# the mean square is at most a tenth of this limit.
 VISIBLE_MEAN_SQUARE = 0.005
 ROUNDING_GAUSSIANS = 1 << 17  # number of Gaussians from which the mean is estimated
 
 
 def format_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
-    """Note what the format of a path leaves out, and how far it moves Gaussians; UsageError for an unknown format."""
+    """Note what a path's format leaves out, and how far its rounding moves Gaussians; raise UsageError without one."""
     return limit_notes(path, gaussians.sh_degree, len(gaussians)) + rounding_notes(path, gaussians)
 
 
@@ -32,7 +32,7 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
     if len(gaussians) == 0:
         return []
     format_, columns = output_format(path), gaussians.numpy()
-    # The sample has the extreme positions, since formats choose the steps of their rounding by these
+    # The sample includes the extreme positions, since formats choose the steps of their rounding by the extremes
     extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)
     rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // ROUNDING_GAUSSIANS + 1), *extremes]))
     means, scales = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0)
@@ -54,8 +54,8 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
 def round_as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
     """Return Gaussians as they are after writing and reading a file in the format of ``path``.
 
-    They are written to a temporary file. If the format cannot be read, only their positions are rounded. They are
-    returned unchanged if the rounding of positions is invisible.
+    Gaussians are written to a temporary file and read from it. If the format cannot be read, only positions are
+    rounded. If the rounding of positions is invisible in renders, Gaussians are returned unchanged.
     """
     if not rounding_notes(path, gaussians):
         return gaussians

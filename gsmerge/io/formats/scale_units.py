@@ -28,9 +28,9 @@ class ScaleJudgement:
 def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
     """Judge whether the scales of a file are linear, from ``scales [n,3]``, ``means [n,3]`` and ``valid [n]``.
 
-    ``scales`` were read as logarithms. They are judged linear if they are then too large for the scene, but fit it as
-    they are stored. In addition, either all Gaussians must be about equally large when read as logarithms, or half of
-    them nearly as large as the scene.
+    ``scales`` were read as logarithms. The scales are judged linear if the Gaussians are too large for the scene, but
+    would fit the scene with the stored numbers as sizes. In addition, when scales are read as logarithms, either all
+    Gaussians must be about equally large, or half of the Gaussians must be nearly as large as the scene.
     """
     valid = out["valid"]
     rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)
@@ -47,8 +47,8 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
     max_width = 0.25  # scales are wrong if half of the standard deviations exceed this share of the scene's width
     median_stored, is_vast = float(log(median_size)), median_size > max_width * width
     # Bounds on the median standard deviation, in units of ``spacing``, which is the width of the scene divided by the
-    # square root of the number of Gaussians. The median is 0.3 to 2 units in undamaged files. It is 10 to 1,000 units
-    # if linear scales are read as logarithms
+    # square root of the number of Gaussians. This median is 0.3 to 2 units in undamaged files, and 10 to 1,000 units if
+    # linear scales are read as logarithms
     min_spacings, max_spacings = 0.01, 6.0
     fits_as_stored = min_spacings * spacing <= median_stored <= max_spacings * spacing < median_size
     if fits_as_stored and not arrays.are_logarithms(stored):
@@ -62,10 +62,11 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
 
 
 def _vary_little_as_logs(stored: np.ndarray) -> bool:
-    """Return whether numbers ``stored [s]`` vary much if they are sizes, but hardly if they are logarithms of sizes."""
+    """Return whether numbers ``stored [s]`` vary much as sizes, but hardly vary if they are logarithms of sizes."""
     low, high = (float(value) for value in quantiles(stored.astype(np.float64), (0.1, 0.9)))
-    # Large sizes are at least 1.5 times the small ones, so the difference of their logarithms exceeds 0.4. The
-    # difference of linear scales is much smaller. Read as logarithms, they would give sizes that are all close to 1
+    # Large sizes are at least 1.5 times the small sizes, so the difference of the logarithms of sizes exceeds 0.4. If
+    # the scales are linear, their difference is much smaller. If the stored sizes are read as logarithms, the resulting
+    # sizes are all close to 1
     min_variation, min_ratio = 0.4, 4.0
     return low > 0 and float(log(high / low)) > max(min_variation, min_ratio * (high - low))
 

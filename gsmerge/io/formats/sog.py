@@ -1,9 +1,9 @@
 """Read and write ``.sog`` version 2 (developer.playcanvas.com, "The SOG format"): WebP textures in a zip or a folder.
 
-The textures are lossless, and each pixel is a Gaussian. Positions are signed logarithms of 16 bits. Rotations are the
-three smaller components of quaternions, of 8 bits each. Log scales and colours are indices of codebooks with 256
-values. The harmonics of a Gaussian are the index of one entry in a palette of at most 65,536 entries, which has a
-codebook, too.
+The textures are lossless, and each pixel belongs to one Gaussian. Positions are signed logarithms of 16 bits. Rotations
+are the three smaller components of quaternions, of 8 bits each. Log scales and colours are indices of codebooks with
+256 values. For its harmonics, a Gaussian has the index of one entry in a palette of at most 65,536 entries. The numbers
+of the palette are indices of a codebook, too.
 """
 
 from __future__ import annotations
@@ -61,17 +61,17 @@ _CELLS = 1 << 11  # number of cells of equal width, and of cells with equal coun
 
 @dataclass(frozen=True)
 class _ZipFiles:
-    """The files of a ``.sog`` in a zip; a file that unpacks to more bytes than the zip has is refused."""
+    """The files of a ``.sog`` in a zip. A file that would unpack to more bytes than the zip has is refused."""
 
     archive: zipfile.ZipFile
     size: int  # bytes of the zip
 
     def num_bytes(self, name: str) -> int:
-        """Return the number of bytes that a file takes in the zip."""
+        """Return the number of bytes that the file ``name`` takes in the zip."""
         return self.archive.getinfo(name).compress_size
 
     def read(self, name: str) -> bytes:
-        """Read a file; ValueError if it is larger than the zip."""
+        """Read the file ``name``; raise ValueError if it is larger than the zip."""
         info = self.archive.getinfo(name)
         if info.file_size > self.size:
             raise ValueError(f"{name} of {info.file_size} bytes")
@@ -80,13 +80,13 @@ class _ZipFiles:
 
 @dataclass(frozen=True)
 class _FolderFiles:
-    """The files of a ``.sog`` in a folder."""
+    """The files of a ``.sog`` without a zip, in a folder."""
 
     folder: Path
     size: int  # bytes of all files of the ``.sog``
 
     def num_bytes(self, name: str) -> int:
-        """Return the number of bytes of a file; ValueError if it is outside the folder."""
+        """Return the number of bytes of the file ``name``; raise ValueError if it is outside the folder."""
         path = self.folder / name
         inside = Path(os.path.realpath(path)).parent == Path(os.path.realpath(self.folder))
         if path.name != name or "\\" in name or not inside:
@@ -94,7 +94,7 @@ class _FolderFiles:
         return check_file(path)
 
     def read(self, name: str) -> bytes:
-        """Read a file; ValueError if it is outside the folder, or larger than all files of the ``.sog``."""
+        """Read the file ``name``; raise ValueError if it is outside the folder, or larger than the whole ``.sog``."""
         size = self.num_bytes(name)
         if size > self.size:
             raise ValueError(f"{name} of {size} bytes")
@@ -115,7 +115,7 @@ class SogContent:
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or damaged."""
+    """Read the Gaussians of a ``.sog``; raise SceneError if it is no ``.sog`` of version 2, or is damaged."""
     budget = read_budget(path)
     with _damage_errors(path), open_archive(path) as archive:
         content = _read_content(_ZipFiles(archive, budget.file_bytes), budget)
@@ -125,7 +125,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
 def read_unzipped(path: Path) -> SogContent:
     """Read a ``.sog`` without its zip from its ``meta.json`` and the textures beside it.
 
-    SceneError as in :func:`read_rows`.
+    Raise SceneError as in :func:`read_rows`.
     """
     text = read_text(path)  # the size of the files that it names limits the memory of the reader
     with _damage_errors(path):
@@ -135,7 +135,7 @@ def read_unzipped(path: Path) -> SogContent:
 
 
 def read_folder(path: Path) -> arrays.StoredRows:
-    """Read the rows of a ``.sog`` without its zip, by its ``meta.json``; SceneError as in :func:`read_rows`."""
+    """Read the rows of a ``.sog`` without its zip, by its ``meta.json``; raise SceneError as in :func:`read_rows`."""
     content, meta_bytes = read_unzipped(path), check_file(path)
     rows = arrays.to_stored([content.packed], f"unzipped .sog version {VERSION}", content.sizes, content.mode)
     return replace(rows, bytes_beside=content.num_bytes - meta_bytes)
@@ -187,7 +187,7 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
 
 
 def _image_size(data: bytes) -> tuple[int, int]:
-    """Return width and height of a lossless WebP image; ValueError for any other file."""
+    """Return width and height of a lossless WebP image; raise ValueError for any other file."""
     at = 12  # bytes before the first chunk: "RIFF", the size of the file, "WEBP"
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         # A chunk has 4 bytes of name, 4 bytes of size, and content that is padded to an even number of bytes
@@ -200,7 +200,7 @@ def _image_size(data: bytes) -> tuple[int, int]:
 
 
 def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> np.ndarray:
-    """Decode the first ``count`` pixels of a texture to RGBA ``[count,4]``; alpha is 255 if it has none."""
+    """Decode the first ``count`` pixels of a texture to RGBA ``[count,4]``; without alpha, all get 255."""
     data = files.read(name)
     width, height = _image_size(data)
     if not count <= width * height <= 4 * count + (1 << 16):
@@ -218,7 +218,7 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
 
 
 def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> arrays.Packed:
-    """Decode the textures and codebooks, and return the Gaussians in them; ValueError for damaged content."""
+    """Decode textures and codebooks, and return the Gaussians that they hold; raise ValueError for damaged content."""
 
     def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
         """Decode a texture that ``meta`` names under ``key``, to the first ``channels`` numbers of each Gaussian."""
@@ -235,6 +235,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
     harmonic_codes = np.zeros(CODES) if labels is None else _to_numbers(meta["shN"]["codebook"], CODES)
 
     def unpack(block: slice) -> arrays.Columns:
+        """Return the Gaussians of a block of rows."""
         largest, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
         codes = np.zeros((len(largest), 0, 3), np.uint8) if labels is None else palette[labels[block]]
         return arrays.Columns(
@@ -250,7 +251,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
 
 
 def _to_numbers(values: Any, length: int) -> np.ndarray:
-    """Convert a list of ``meta.json`` to an array ``[length]``; ValueError if it has another length."""
+    """Convert a list of ``meta.json`` to an array ``[length]``; raise ValueError if it has another length."""
     numbers = np.asarray(values, np.float64)
     if numbers.shape != (length,):
         raise ValueError(f"{numbers.shape} numbers instead of {length}")
@@ -262,14 +263,14 @@ def _read_palette(files: _Files, meta: dict[str, Any], count: int, budget: ReadB
     size, num_higher = check_whole(meta["count"], "count", 1, 2**PALETTE_BITS), (meta["bands"] + 1) ** 2 - 1
     palette_name, labels_name = meta["files"]
     labels = _read_texture(files, labels_name, count, budget)[:, :2].copy().view("<u2")[:, 0]
-    # Rows of the texture; a label may exceed the stated size of the palette
+    # Rows of the texture; a label may exceed the size of the palette that ``meta.json`` states
     rows = max(-(-size // PALETTE_COLUMNS), int(labels.max()) // PALETTE_COLUMNS + 1)
     centroids = _read_texture(files, palette_name, rows * PALETTE_COLUMNS * num_higher, budget)[:, :3]
     return labels, centroids.reshape(-1, num_higher, 3)
 
 
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.sog``, with rows in the order of a space-filling curve; ValueError if there is NaN or inf.
+    """Encode a ``.sog``, with rows in the order of a space-filling curve; raise ValueError if there is NaN or inf.
 
     ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
@@ -349,12 +350,12 @@ def _decode_means(codes: np.ndarray, mins: np.ndarray, maxs: np.ndarray) -> np.n
 
 
 def _shorten(values: np.ndarray) -> list[float]:
-    """Round values to eight digits for ``meta.json``. They keep it short, and are enough for float32."""
+    """Round values to eight digits, which keep ``meta.json`` short and are enough for float32."""
     return [float(f"{value:.8g}") for value in values]
 
 
 def _encode_texture(values: np.ndarray) -> bytes:
-    """Encode rows of channels as the pixels of a lossless, roughly square WebP image, padded with zeros."""
+    """Encode rows of channels as pixels of a lossless, roughly square WebP image, whose last pixels may be padding."""
     width = max(4, math.ceil(math.sqrt(len(values)) / 4) * 4)
     height = max(4, math.ceil(len(values) / width / 4) * 4)
     pixels = np.zeros((height * width, values.shape[1]), np.uint8)
@@ -363,7 +364,7 @@ def _encode_texture(values: np.ndarray) -> bytes:
 
 
 def _encode_webp(image: np.ndarray) -> bytes:
-    """Encode a lossless WebP image. The colours of a pixel may change if its alpha is 0."""
+    """Encode a lossless WebP image. The colours of a pixel with an alpha of 0 may change."""
     bgr_or_bgra = [2, 1, 0, 3][: image.shape[2]]  # OpenCV's order of channels
     lossless = 101  # OpenCV's WebP quality
     _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., bgr_or_bgra]), [cv2.IMWRITE_WEBP_QUALITY, lossless])
@@ -371,18 +372,18 @@ def _encode_webp(image: np.ndarray) -> bytes:
 
 
 def fit_codebook(values: np.ndarray) -> np.ndarray:
-    """Choose ``[256]`` rising values that represent finite numbers of any shape, by 1-D k-means.
+    """Choose ``[256]`` rising codes that represent finite ``values`` of any shape, by 1-D k-means.
 
-    The values are first divided into thousands of cells. Each step merges the two neighbours with the least
-    added squared error (Ward 1963), until 256 cells are left. Isolated values thus keep their own codes. Lloyd's
-    algorithm then improves the codes. Unused codes repeat the last one.
+    The values are first divided into thousands of cells. Each step merges the two neighbours with the least added
+    squared error (Ward 1963), until 256 cells are left. Isolated values thus keep their own codes. Lloyd's algorithm
+    then improves the codes. Codes that are not needed repeat the last code.
     """
     ordered = np.sort(values, axis=None)
     distinct = np.unique(ordered)
     if len(distinct) <= CODES:
         return np.pad(distinct, (0, CODES - len(distinct)), "edge" if len(distinct) else "constant")
     sums = np.concatenate([[0], np.cumsum(ordered)])
-    # Cells of equal width keep isolated values apart, and cells of equal counts divide dense ranges
+    # Cells of equal width keep isolated values apart, and cells with equal counts of values divide dense ranges
     equal_width = np.searchsorted(ordered, np.linspace(ordered[0], ordered[-1], _CELLS))
     equal_count = np.linspace(0, len(ordered), _CELLS).astype(int)
     ends = np.unique([*equal_width, *equal_count])
@@ -399,15 +400,15 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
 
 
 def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Merge neighbouring cells until 256 are left, and return their means.
+    """Merge neighbouring cells until 256 cells are left, and return the means of their values.
 
-    ``numbers [n]``: how many values each cell has. ``means [n]``: the mean of these values.
+    ``numbers [n]``: how many values each cell has. ``means [n]``: the mean of the values in each cell.
     """
     count, mean = numbers.tolist(), means.tolist()
     previous, following = list(range(-1, len(count) - 1)), list(range(1, len(count) + 1))
 
     def merge_entry(i: int) -> tuple[float, int, int, float, float]:
-        """Return the error that merging cell ``i`` with the next one adds, both cells, and their counts of values."""
+        """Return the error that merging cell ``i`` with the next cell adds, both cells, and their counts of values."""
         j = following[i]
         added_error = count[i] * count[j] / (count[i] + count[j]) * (mean[i] - mean[j]) ** 2
         return added_error, i, j, count[i], count[j]
@@ -438,7 +439,7 @@ def fit_palette(vectors: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndar
     """Choose a palette of at most ``2**max_bits`` entries for ``vectors [n,d]``; also return each vector's entry.
 
     Groups of vectors are halved ``max_bits`` times at the median of the coordinate with the largest spread. The entries
-    are the means of the final groups. If there are at most ``2**max_bits`` vectors, each of them is an entry.
+    are the means of the final groups. If there are at most ``2**max_bits`` vectors, each vector is an entry.
     """
     count = len(vectors)
     if count <= 2**max_bits:

@@ -1,7 +1,7 @@
 """Read and write ``.splat``, the format of antimatter15/splat, which most viewers read.
 
-It has 32 bytes per Gaussian and no header. A component q of a quaternion wxyz is the byte 128 + 128 q. Harmonics above
-degree 0 cannot be stored.
+A ``.splat`` has 32 bytes per Gaussian and no header. A component q of a quaternion wxyz is the byte 128 + 128 q.
+Harmonics above degree 0 cannot be stored.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), 
 
 
 def splat_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
-    """Encode a ``.splat`` file, which has no comments; ValueError if there is NaN or inf."""
+    """Encode a ``.splat`` file, which has no comments; raise ValueError if there is NaN or inf."""
     all_rows = np.empty(len(gaussians), ROW)
     for start, columns in column_blocks(gaussians, MAX_DEGREE):
         rows = all_rows[start : start + len(columns)]
@@ -34,7 +34,7 @@ def splat_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a ``.splat``; SceneError unless it consists of whole rows of 32 bytes."""
+    """Read the Gaussians of a ``.splat``; raise SceneError unless the file consists of rows of 32 bytes."""
     size = check_file(path)
     if size % ROW.itemsize:
         problem = f"expected a .splat of {ROW.itemsize} bytes per Gaussian, found {size} bytes"

@@ -17,7 +17,7 @@ TIME_LIMIT = 1800  # seconds after which the program is stopped
 
 
 def find_program() -> str:
-    """Return the path of the program; UsageError if it is not installed."""
+    """Return the path of splat-transform; raise UsageError if the program is not installed."""
     named = os.environ.get(VARIABLE)
     program = shutil.which(named or SPLAT_TRANSFORM_PROGRAM)
     if program is None:
@@ -28,9 +28,9 @@ def find_program() -> str:
 
 
 def run_program(*arguments: object) -> None:
-    """Run the program on the CPU with ``arguments``, the last of which is the file that it writes.
+    """Run splat-transform on the CPU with ``arguments``, the last of which is the file that it writes.
 
-    GsmergeError if it fails or takes longer than ``TIME_LIMIT``, UsageError if it is not installed.
+    Raise GsmergeError if the program fails or takes longer than ``TIME_LIMIT``, UsageError if it is not installed.
     """
     program = find_program()
     command = [program, "-q", "-w", "-g", "cpu", *map(str, arguments)]

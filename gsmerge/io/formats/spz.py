@@ -5,9 +5,9 @@ Rotations are the three smaller components of quaternions, each with a sign and 
 their 5 highest bits (degree 1) or 4 highest bits. Version 3 is one gzip stream, with harmonics up to degree 3. Version
 4 has an uncompressed header, a table of compressed and uncompressed sizes, and one Zstandard stream for each column.
 
-The README says that axes point right, up and back. However, Niantic's converters, splat-transform and SuperSplat keep
-the axes of a ``.ply``: right, down and front. This module keeps them, too. The extension
-``SPZ_ADOBE_coordinate_system`` may state other axes, and then the reader rotates the Gaussians to those of a ``.ply``.
+The README says that axes point right, up and back. However, Niantic's converters, splat-transform and SuperSplat write
+the axes of a ``.ply``: right, down and front. This module writes the axes of a ``.ply``, too. The extension
+``SPZ_ADOBE_coordinate_system`` may state other axes. The reader then rotates the Gaussians to the axes of a ``.ply``.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.types import SH_C0, Gaussians, StrPath
 from gsmerge.values.arrays import as_array, to_float32
 
-# Default version of written files, and their largest degree of harmonics. Spark 2.2 does not read version 4, and old
-# readers read only version 2
+# Default version and largest degree of harmonics of written files. Spark 2.2 does not read version 4 of the format, and
+# old readers read only version 2
 VERSION, MAX_DEGREE = 3, 3
 MAGIC = 0x5053474E  # "NGSP", the first bytes of the header
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, number of streams or zero
@@ -42,8 +42,8 @@ TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in 
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
 MIP_FLAG = 1  # flag of Gaussians that are rendered antialiased
 EXTENSION_RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
-# Directions of the axes x, y and z, such as left, down and back. The extension states the number of a row, counted from
-# 1
+# Directions of the axes x, y and z, such as left, down and back. SPZ_ADOBE_coordinate_system states the number of an
+# entry of this table, counted from 1
 AXIS_SYSTEMS = (
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
@@ -58,7 +58,7 @@ SCENE_BITS = 14  # bits of a position within the scene: steps of a sixteenth of 
 LARGEST_POSITION = 2**23 - 1
 _SHIFTS = (20, 10, 0)  # lowest bits of the three smaller components of a rotation in its word
 COLOR_SCALE = 0.15  # factor of sh0, so that colours slightly outside [0, 1] can be stored
-# Names of the attributes in the order of the file
+# Names of the attributes of Gaussians, in the order of a .spz file
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
 
@@ -86,7 +86,7 @@ class Header:
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Read the Gaussians of a ``.spz``; SceneError if it is damaged."""
+    """Read the Gaussians of a ``.spz``; raise SceneError if it is damaged."""
     check_file(path)
     with read_errors(path), path.open("rb") as file:
         packed = file.read(len(ZSTANDARD_MAGIC))
@@ -100,7 +100,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
 
 
 def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, dict[str, int], tuple[str, ...]]:
-    """Read the content ``packed`` of a ``.spz``; return its header, its Gaussians, bytes by attribute, and notes.
+    """Read the content ``packed`` of a ``.spz``; return header, Gaussians, bytes by attribute, and notes.
 
     The Gaussians have the axes of a ``.ply``. ``path``: the file that holds the content, for errors.
     """
@@ -109,7 +109,7 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     extensions_flag = 2  # flag of a file with extensions
     axes = _stored_axes(path, extensions) if header.flags & extensions_flag else PLY_AXES
-    # From these axes to those of a .ply: a rotation, or a mirror image if these axes are left-handed
+    # The map from the file's axes to those of a .ply: a rotation, or a mirror image if the file's axes are left-handed
     rotation = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
     rotate = arrays.rotator(rotation * (1, -1, -1) if axes in _REVERSED else rotation, header.num_higher)
     rows = arrays.Packed(
@@ -121,9 +121,10 @@ def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, di
 
 
 def _stored_axes(path: StrPath, extensions: bytes) -> str:
-    """Return the axes that an extension states, or else those of a ``.ply``; SceneError if it is damaged."""
+    """Return the axes of an extension, or else those of a ``.ply``; raise SceneError if the extension is damaged."""
     position = 0  # in ``extensions``
-    # Kind of SPZ_ADOBE_coordinate_system. Its content is 1 for the first of AXIS_SYSTEMS, and 0 for unknown axes
+    # Kind of the extension SPZ_ADOBE_coordinate_system, whose content is 1 for the first of AXIS_SYSTEMS, and 0 for
+    # unknown axes
     axes_kind = 0xADBE0003
     while position + EXTENSION_RECORD.size <= len(extensions):
         kind, size = EXTENSION_RECORD.unpack_from(extensions, position)
@@ -140,7 +141,7 @@ def _stored_axes(path: StrPath, extensions: bytes) -> str:
 
 
 def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int]) -> Header:
-    """Read the header from ``start``, its unpacked bytes; SceneError if it is invalid or has too many Gaussians."""
+    """Parse the unpacked header, ``start``; raise SceneError if it is invalid or states too many Gaussians."""
     path = budget.path
     if len(start) < HEADER.size:
         raise SceneError(path, FOUND_EARLY_END, arrays.EXPORT_AGAIN)
@@ -160,14 +161,14 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
 
 
 def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
-    """Read version 1 to 3; return header, columns ``[n,width]`` uint8, extensions, and number of bytes after them."""
+    """Read version 1 to 3; return header, columns ``[n,width]`` uint8, extensions, and number of bytes at the end."""
     path = budget.path
     stream = zlib.decompressobj(wbits=31)
     try:
         header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
-        # This call also checks the checksum. It gets no bytes if the stream has ended, since ``unused_data`` would then
-        # count them twice
+        # This call also checks the checksum. If the stream has ended, the call gets no bytes, since ``unused_data``
+        # would count them twice
         extensions = stream.decompress(b"" if stream.eof else stream.unconsumed_tail, _MAX_EXTENSIONS)
     except zlib.error as error:
         raise SceneError(
@@ -214,8 +215,8 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np
 def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) -> tuple[int, np.ndarray]:
     """Return where the table of version 4 starts, and the start of each stream followed by the end of the last one.
 
-    They are positions in the file, in bytes. ``sizes``: bytes of each unpacked column. SceneError if the table has
-    other sizes, or if the file is too short for it.
+    Both results are positions in the file, in bytes. ``sizes``: bytes of each unpacked column. Raise SceneError if the
+    table has other sizes, or if the file is too short for the table.
     """
     try:
         (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
@@ -237,7 +238,8 @@ def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
     """Convert a block of rows, given as a part of each stored column, to Gaussians."""
     version, fraction = header.version, header.fraction
     means, opacities, colors, scales, rotations, harmonics = parts
-    # Three little-endian bytes of a signed number are the upper bytes of an int32, which keeps the sign when shifted
+    # The three little-endian bytes of a signed number become the upper bytes of an int32, which is shifted and keeps
+    # the sign
     words = np.zeros((len(means), 3, 4), np.uint8)
     if version > 1:
         words[..., 1:] = means.reshape(-1, 3, 3)
@@ -277,7 +279,8 @@ def round_means(means: np.ndarray) -> np.ndarray:
 def choose_fraction(means: np.ndarray, scene_bits: int) -> int:
     """Choose how many bits of quantised means follow the binary point.
 
-    Means near the center of the scene then need ``scene_bits`` bits, or fewer if the farthest mean would overflow.
+    With the chosen number, means near the center of the scene need ``scene_bits`` bits, or fewer if the farthest mean
+    would overflow.
     """
     if not len(means):
         return 0
@@ -298,7 +301,7 @@ def spz_columns(
 ) -> tuple[bytes, tuple[np.ndarray, ...]]:
     """Quantise Gaussians; return the header, and columns ``[n,bytes]`` uint8 in the order of the file.
 
-    ``version``: 2 or 3. ValueError if there is NaN or inf.
+    ``version``: 2 or 3. Raise ValueError if there is NaN or inf.
     """
     means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
     # Means that are not finite raise an error below
@@ -335,8 +338,8 @@ def _quantise_harmonics(harmonics: np.ndarray) -> np.ndarray:
 def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
     """Pack unit quaternions ``[n,4]`` wxyz to bytes, which :func:`_read_rotations` unpacks.
 
-    Version 2 stores x, y and z as bytes, with signs for which w is positive. Version 3 stores a word. Its two highest
-    bits are the index of the largest of xyzw. The sign and magnitude of each other component follow.
+    Version 2 stores x, y and z as bytes, with signs for which w is positive. Version 3 stores a word whose two highest
+    bits are the index of the largest of xyzw. The sign and magnitude of each of the three other components follow.
     """
     if version < 3:
         return arrays.to_bytes(127.5 * (np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] + 1))
@@ -350,7 +353,7 @@ def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
 
 
 def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.spz`` file of version 3; ValueError if there is NaN or inf.
+    """Encode a ``.spz`` file of version 3; raise ValueError if there is NaN or inf.
 
     ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
@@ -358,7 +361,7 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 
 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
-    """Encode a ``.spz`` file in the version of ``contents.options``; ValueError if there is NaN or inf.
+    """Encode a ``.spz`` file in the version of ``contents.options``; raise ValueError if there is NaN or inf.
 
     The file has no extensions, since three 0.187 and mkkellogg's viewer refuse bytes after the columns.
     """

@@ -2,8 +2,8 @@
 
 The index ``lod-meta.json`` is a tree of boxes. For each level of detail, a leaf names a run, which is a range of rows
 in a chunk. A chunk is an unzipped ``.sog`` in a folder of its own. A viewer loads the visible chunks at the level that
-suits their distance, and always shows the Gaussians of the ``environment``. PlayCanvas' splat-transform writes all
-these files.
+suits their distance, and always shows the Gaussians of the ``environment``. The program splat-transform of PlayCanvas
+writes the index and the chunks.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from gsmerge.values.words import count_words
 
 VERSION = 1  # of the format, as the index states it
 MAX_DEGREE = sog.MAX_DEGREE
-# Thousands of Gaussians in a region for which a viewer chooses one level. A room of a few hundred thousand Gaussians
-# has about twenty regions.
+# Thousands of Gaussians in a region of space, for which a viewer chooses one level. A room of a few hundred thousand
+# Gaussians has about twenty regions.
 CHUNK_THOUSANDS = 16
 _CHUNK_NAME = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # name of a chunk's folder: level, number, hash
 
@@ -45,19 +45,19 @@ _CHUNK_NAME = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # name of a chunk's folder: le
 def write_levels(
     path: StrPath, levels: Sequence[Gaussians], *, overwrite: bool = False, comments: Sequence[str] = ()
 ) -> None:
-    """Write levels of detail as Streamed SOG, by splat-transform: an index, and chunks beside it.
+    """Write levels of detail as Streamed SOG, an index with chunks beside it, by the program splat-transform.
 
-    A viewer loads the visible chunks, at the level that fits. Either all files are written or none. If an index is
-    replaced, its chunks are removed.
+    A viewer loads the visible chunks at the level that suits their distance. Either all files are written or none. If
+    an index is replaced, the chunks of the old index are removed.
 
     Args:
-        path: The index, a ``lod-meta.json``; its folder is made if it is missing.
+        path: The index, a ``lod-meta.json``. A missing folder is made.
         levels: Gaussians with finite values, the finest level first.
         overwrite: Replace an existing index.
         comments: Lines as in :func:`write_gaussians`; "SplatRenderMode: mip" is kept.
 
     Raises:
-        UsageError: If the path has another name, or splat-transform is not installed.
+        UsageError: If the path has another name than ``lod-meta.json``, or splat-transform is not installed.
         SceneError: If the file exists or cannot be written.
         ValueError: If there is NaN or inf, a level has no Gaussian, or a comment is not a line of ASCII.
 
@@ -77,8 +77,8 @@ def write_levels(
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of a Streamed SOG.
 
-    Arguments and result are those of :data:`gsmerge.io.formats.table.WriteOutput`. In the result, the path of a coarser
-    level is the ``meta.json`` of its first chunk.
+    ``add`` makes the temporary file of a path; ``index`` is that of ``path``. Return the path of each level, with its
+    temporary files. The path of a coarser level is the ``meta.json`` of its first chunk.
     """
     with TemporaryDirectory(prefix="gsmerge-") as folder:
         arguments: list[object] = []
@@ -108,7 +108,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
 def _name_by_content(path: Path) -> None:
     """Append a hash of the content to the name of each chunk's folder, also in the index ``path``.
 
-    Caches thus never mix chunks of two results.
+    With these hashes, caches never mix chunks of two results.
     """
     document = read_json(path)
     for number, name in enumerate(document["filenames"]):
@@ -122,7 +122,7 @@ def _name_by_content(path: Path) -> None:
 
 @dataclass(frozen=True)
 class StreamedIndex:
-    """Content of an index: the chunks of each level, with their numbers of Gaussians."""
+    """Content of an index: the chunks of each level, each with its number of Gaussians."""
 
     levels: tuple[dict[Path, int], ...]
     environment: Path | None  # the ``meta.json`` of Gaussians that are shown with every level
@@ -134,7 +134,7 @@ class StreamedIndex:
 
 
 def read_index(path: Path) -> StreamedIndex:
-    """Read a ``lod-meta.json``; SceneError if it is damaged or its parts contradict each other."""
+    """Read a ``lod-meta.json``; raise SceneError if it is damaged or contradicts itself."""
     document = read_json(path)
     try:
         return _check_index(path, document)
@@ -144,7 +144,7 @@ def read_index(path: Path) -> StreamedIndex:
 
 
 def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
-    """Return the content of an index; ValueError, LookupError or TypeError if it is damaged."""
+    """Return the content of an index; raise ValueError, LookupError or TypeError if the index is damaged."""
     version = document.get("version", VERSION)
     if version != VERSION:
         problem = f"expected Streamed SOG version {VERSION}, found {version}"
@@ -181,7 +181,7 @@ def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int],
 
 
 def _chunk_path(index: Path, name: Any) -> Path:
-    """Return the path of the chunk ``name`` of an index; ValueError if it is outside the folder of the index."""
+    """Return the path of the chunk ``name`` of an index; raise ValueError if this is outside the index's folder."""
     chunk = PurePosixPath(str(name))
     is_outside = chunk.is_absolute() or ".." in chunk.parts or "\\" in str(name) or "\0" in str(name)
     if is_outside or chunk.name != sog.META:
@@ -190,7 +190,7 @@ def _chunk_path(index: Path, name: Any) -> Path:
 
 
 def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield each run of the tree, leaf by leaf, after its level; ValueError for an invalid node."""
+    """Yield the level and the content of each run of the tree, leaf by leaf; raise ValueError for an invalid node."""
     nodes = [tree]
     while nodes:
         node = nodes.pop()
@@ -206,7 +206,7 @@ def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _count_by_chunk(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
-    """Return the number of Gaussians in each chunk of a level; ValueError if its runs overlap or have gaps.
+    """Return the number of Gaussians in each chunk of a level; raise ValueError if its runs overlap or have gaps.
 
     ``runs``: the index of the chunk, the first row, and the number of rows of each run.
     """
@@ -222,8 +222,8 @@ def _count_by_chunk(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]
 def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) -> arrays.StoredRows:
     """Read the Gaussians of one level; level 0, the finest, includes the environment.
 
-    ``index``: result of :func:`read_index` for the path; None: read it. SceneError if the index or a chunk cannot be
-    read, or if they contradict each other.
+    ``index``: result of :func:`read_index` for the path; None: read the index. Raise SceneError if the index or a chunk
+    cannot be read, or if a chunk contradicts the index.
     """
     index = index or read_index(path)
     chunks: dict[Path, int | None] = {**index.levels[level]}
@@ -243,12 +243,12 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
 
 
 def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> GaussianFile:
-    """Read one level of detail of a ``lod-meta.json``; 0 is the finest. SceneError as in :func:`read_gaussians`."""
+    """Read one level of detail of a ``lod-meta.json``; 0 is the finest. Raise errors as :func:`read_gaussians`."""
     return convert_files([path], [read_rows(path, level, index)], "auto")
 
 
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
-    """Read chunks; SceneError if they take more memory than a file as large as all of them may take.
+    """Read chunks; raise SceneError if the chunks take more memory than one file of as many bytes may take.
 
     ``chunks``: path of each chunk -> the number of Gaussians that the index states for it, or None.
     """
@@ -273,7 +273,7 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
 
 
 def remove_unused_chunks(path: Path) -> None:
-    """Remove chunks in the folder of an index that it does not name, since they belong to an index that it replaced.
+    """Remove chunks beside an index that the index does not name, since they belong to an index that was replaced.
 
     Other files in the chunks' folders stay. A chunk that cannot be removed stays, too.
     """

@@ -31,7 +31,7 @@ WRITE_APART = _lazy("write.write_apart")
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """The content of an output, of which a format leaves out what it cannot store."""
+    """The content of an output. A format leaves out the parts that it cannot store."""
 
     levels: Sequence[Gaussians]  # the finest level of detail first
     comments: Sequence[str] = ()  # lines for the header
@@ -42,19 +42,19 @@ class Contents:
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
-# A function that writes the files of an output. Its arguments: the function of :func:`gsmerge.io.atomic_outputs` that
-# adds a temporary file, the path of the output, the temporary file of this path, and the content. It returns a
-# dictionary: path of each level of detail, finest first -> temporary files of the level.
+# A function that writes the files of an output. Its arguments are the function of :func:`gsmerge.io.atomic_outputs`
+# that adds a temporary file, the path of the output, the temporary file of this path, and the content. The function
+# returns a dictionary: path of each level of detail, finest first -> temporary files of the level.
 WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]]
 
 
 @dataclass(frozen=True, eq=False)
 class Format:
-    """A format of files of Gaussians: its ending, and how to read and write it.
+    """A format of files of Gaussians: its ending, and functions that read and write the format.
 
-    All properties of a format that a run needs are here, so that a new format is one module and one row of the table.
-    The table names most functions by text, so that a module is imported when its function is first called. The writers
-    of pages are in another package, since they render the scene.
+    All properties of a format that a run needs are here, so that a new format takes one module and one row of the table
+    of formats. The table names most functions by text, so that a module is imported when its function is first called.
+    The writers of pages are in another package, since they render the scene.
     """
 
     ending: str  # of names, in lower case; without a leading dot, it is the whole name of a folder's main file
@@ -63,11 +63,11 @@ class Format:
     # Returns the content of one file with Gaussians and comments; None: ``write_ply`` or ``write`` writes the file
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
     max_degree: int  # largest degree of harmonics that is written; -1: the format is only read
-    # Returns the content of one file if this also depends on cameras and options; None: ``encode`` returns it
+    # Returns the content of one file if the content also depends on cameras and options; None: ``encode`` returns it
     encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
-    first_view: bool = False  # True: viewers look from its first camera, so one is placed if there is none
+    first_view: bool = False  # True: viewers start at the first camera of a file, which always gets one
     beside: str = ""  # name of a file that is written beside an output; "": none
-    # Name of a file beside the output that says from where viewers look first. {stem} is the output's name without its
+    # Name of a file beside the output that gives viewers their first camera. {stem} is the output's name without its
     # ending. "": there is no such file
     settings: str = ""
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
@@ -75,21 +75,22 @@ class Format:
     finish: Callable[[Path], object] = lambda _: None  # is called with the output's path after all files were renamed
     holds: Callable[[Path], bool] | None = None  # returns whether a file of this name has Gaussians; None: each has
 
-    # How levels of detail are written: "" if only one can be, "apart" as a file for each, "inside" all in one output
+    # How levels of detail are written: "" if only one level can be, "apart" as a file for each, "inside" all in one
+    # output
     levels: Literal["", "apart", "inside"] = "apart"
     has_cameras: bool = False  # True: the cameras of views are inside the output, not in a file beside it
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as a file of the format does
     columns: bool = False  # whether the user can choose which of INRIA's columns a file has
     marks: Sequence[str] | None = ()  # comments of the input that a copy keeps; None: all of ``copied_comments``
     max_gaussians: float = math.inf  # most Gaussians that its public readers read
-    # Note on harmonics that the format leaves out
+    # Note for the user on harmonics that the format leaves out
     harmonics_note: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
 
-    # Bytes of a Gaussian with harmonics up to degree 0, 1, 2 and 3, which are measured for packed formats. Empty:
+    # Bytes of a Gaussian with harmonics up to degree 0, 1, 2 and 3; those of packed formats are measured. Empty:
     # budgets in bytes are refused
     gaussian_bytes: Sequence[float] = ()
     other_bytes: Callable[[], int] = lambda: 0  # returns the bytes of an output besides those of its Gaussians
-    # Returns how many Gaussians of a degree fit into a number of bytes; None if the size depends on their values
+    # Returns how many Gaussians of a degree fit into a number of bytes; None if the values of Gaussians change the size
     count: Callable[[int, int], int] | None = None
     # Returns the bytes of an output of Gaussians, cameras and comments; None: as many as ``encode`` returns
     measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None
@@ -100,12 +101,12 @@ class Format:
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
     def settings_path(self, output: Path) -> Path | None:
-        """Return the path of the file that says from where viewers look first; None if the format has none."""
+        """Return the path of the file that gives viewers their first camera; None if the format has no such file."""
         stem = output.name.removesuffix(self.ending)
         return output.with_name(self.settings.format(stem=stem)) if self.settings else None
 
     def beside_path(self, output: Path) -> Path | None:
-        """Return the path of the file that this format always writes beside an output; None if it writes none."""
+        """Return the path of the file that this format always writes beside an output; None if there is none."""
         return output.with_name(self.beside.format(stem=output.stem)) if self.beside else None
 
 
@@ -178,16 +179,17 @@ FORMATS = (*FILES, HTML, LEVELS, TILESET, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 # Endings of results that a page shows
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)
-# Endings of files that may hold something else than Gaussians, such as a .npz of cameras and depth maps
+# Endings of files that may hold other content than Gaussians, such as a .npz of cameras and depth maps
 SEVERAL_USES = (".npz", *(row.ending for row in FORMATS if row.holds))
 READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FILES if row.read is not None))
 
 
 def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
-    """Return how many Gaussians fit into an output of at most ``max_bytes``; UsageError if none fits.
+    """Return how many Gaussians fit into an output of at most ``max_bytes``; raise UsageError if none fits.
 
-    The number is exact for a ``.ply``. It is approximate for other formats, since their size depends on the content.
+    The number is exact for a ``.ply``. The number is approximate for other formats, since their size depends on the
+    values of Gaussians.
     """
     if format_.count is not None:
         return format_.count(max_bytes, sh_degree)
@@ -202,8 +204,8 @@ def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
 def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
     """Estimate the number of Gaussians in all files, and the largest number of columns ``f_rest_*`` in any file.
 
-    The numbers of a ``.ply`` are those in its header. Files of other formats are judged by their size. A file counts as
-    empty if it cannot be read, or if it is too short for the rows in its header.
+    The numbers of a ``.ply`` are read from its header. The numbers of other formats are estimated from the file's size.
+    A file counts as empty if it cannot be read, or if it is too short for the rows in its header.
     """
     counts = [
         ply.header_counts(path, check_size=True) if find_format(path).read is ply.read_rows else _count_by_size(path)
@@ -213,7 +215,7 @@ def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
 
 
 def _count_by_size(path: Path) -> tuple[int, int]:
-    """Estimate the number of Gaussians of a file by its size, as if they had degree 0; also return 0 ``f_rest_*``."""
+    """Estimate a file's number of Gaussians by its size, as if of degree 0; also return 0, as columns ``f_rest_*``."""
     try:
         return int(path.stat().st_size / (find_format(path).gaussian_bytes or (math.inf,))[0]), 0
     except OSError:
@@ -235,7 +237,7 @@ def may_hold_gaussians(path: Path) -> bool:
 
 
 def output_format(path: StrPath, *, alone: bool = False) -> Format:
-    """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
+    """Return the format in which to write a path; raise UsageError for an unknown ending or a missing package.
 
     ``alone``: refuse pages, and formats with an index and files beside it.
     """

@@ -1,8 +1,8 @@
 """Read and write 3D Tiles 1.1 for Cesium: a ``tileset.json`` with one tile, which is a ``.glb`` with a ``.spz`` inside.
 
 The ``.glb`` uses ``KHR_gaussian_splatting_compression_spz_2``, which Cesium requires. A node of the ``.glb`` rotates
-the axes of the ``.spz`` to those of glTF, with y up. Cesium rotates them to z up. The index adds half a turn. On the
-globe, the axes x, y and z of the ``.spz`` then point east, down and north.
+the axes of the ``.spz`` to the axes of glTF, with y up. Cesium rotates glTF's axes to z up. The ``tileset.json`` adds
+half a turn, so that the axes x, y and z of the ``.spz`` point east, down and north on the globe.
 """
 
 from __future__ import annotations
@@ -34,9 +34,13 @@ _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  #
 
 
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write the files of a tileset; arguments and result are those of :data:`gsmerge.io.formats.table.WriteOutput`."""
+    """Write the files of a tileset.
+
+    ``add`` makes the temporary file of a path; ``index`` is that of ``path``. Return ``path``, with a list of all
+    temporary files.
+    """
     tile = path.with_name(TILESET.beside)
-    # The bounds are these percentiles of the means, since a few far Gaussians would make the scene look small
+    # The bounds are percentiles of the means, since bounds with a few far Gaussians would make the scene look small
     percentiles = 1, 99
     file, low, high = add(tile), *np.percentile(contents.levels[0].means.astype(np.float64), percentiles, axis=0)
     file.write_bytes(_tile_bytes(contents, low, high))
@@ -61,7 +65,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a tileset with one tile; SceneError for any other tileset."""
+    """Read the Gaussians of a tileset with one tile; raise SceneError for any other tileset."""
     document = read_json(path)
     try:
         root = document["root"]

@@ -16,9 +16,9 @@ from gsmerge.values.arguments import check_arguments
 
 
 def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
-    """Note if the format of a path leaves out harmonics, or if its public readers refuse ``count`` Gaussians.
+    """Note if the format of a path leaves out harmonics, or if public readers of the format refuse ``count`` Gaussians.
 
-    UsageError if no format has the ending of the path.
+    Raise UsageError if no format has the ending of the path.
     """
     format_, notes = output_format(path), list[str]()
     if sh_degree > format_.max_degree:
@@ -36,9 +36,10 @@ def level_output(output: Path, level: int) -> Path:
 
 
 def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write each level of detail to a separate file.
+    """Write each level of detail of ``contents`` to a separate file.
 
-    Arguments and result are those of :data:`gsmerge.io.formats.table.WriteOutput`.
+    ``add`` makes the temporary file of a path; ``temporary`` is that of ``path``. Return the path of each level, with a
+    list of its only temporary file.
     """
     written, format_ = {path: [temporary]}, output_format(path, alone=True)
     for level in range(1, len(contents.levels)):
@@ -77,15 +78,15 @@ def write_gaussians(
 ) -> None:
     """Write Gaussians to a file; the ending of its name, one of ``OUTPUT_FORMATS``, chooses the format.
 
-    All formats except ``.ply`` quantise. In ``.glb`` y points up, so Gaussians are rotated by half a turn about z.
-    Harmonics of degree 4 are left out; only :func:`write_ply` writes them.
+    All formats except ``.ply`` quantise numbers. In ``.glb`` y points up, so Gaussians are rotated by half a turn about
+    z. Harmonics of degree 4, which only :func:`write_ply` writes, are left out.
 
     Args:
         path: The file. It is written completely or not at all.
         gaussians: Gaussians with finite values.
         overwrite: Replace an existing file.
         comments: Lines for the header of a ``.ply``; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
-        ending: Ending of the format to write, instead of that of the name.
+        ending: Ending that chooses the format instead of the ending of the name.
         normals: Write the columns of normals to a ``.ply``, as :func:`write_ply` does.
 
     Raises:
@@ -128,15 +129,15 @@ def write_ply(
         gaussians: Gaussians with finite values.
         overwrite: Replace an existing file.
         sh_degree: Drop harmonics above this degree. None: keep all.
-        comments: Lines for the header, such as :func:`gsmerge.io.kept_comments` of another file.
-        normals: Write three columns of zeros, 12 bytes per Gaussian. No renderer uses them, but a few readers, such as
-            SIBR's, expect them.
+        comments: Lines for the header, such as those that :func:`gsmerge.io.kept_comments` returns for another file.
+        normals: Write three columns of zeros, 12 bytes per Gaussian. No renderer uses normals, but a few readers, such
+            as SIBR's, expect the three columns.
 
     Raises:
         SceneError: If the file exists or cannot be written.
-        ValueError: If the name has the ending of another format, if there is no Gaussian, if there is NaN or inf, if
-            ``sh_degree`` is above that of the Gaussians, if a comment is not a line of ASCII, or if comments have more
-            than half a million characters.
+        ValueError: If the name has the ending of another format than ``.ply``, if there is no Gaussian, if there is NaN
+            or inf, if ``sh_degree`` is above that of the Gaussians, if a comment is not a line of ASCII, or if comments
+            have more than half a million characters.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=300)
