@@ -1,6 +1,6 @@
 """Build the native library of the kernels.
 
-``pip install`` runs this file, and so does ``python tasks.py native`` after a change. It runs before anything is
+``pip install`` runs this file, and so does ``python tasks.py native`` after a change. This file runs before anything is
 installed, so it needs only the standard library. The clang of the PyPI wheel ``ziglang`` builds every target.
 ``GSMERGE_CC`` names another compiler, whose rounding may differ.
 """

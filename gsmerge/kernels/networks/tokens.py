@@ -1,7 +1,7 @@
 """Compute the inputs of the networks in the frame of each group, and apply the corrections that networks put out.
 
 Arrays are float32, and ids int64. Corrections ``residuals`` have 13 columns, see :mod:`gsmerge.networks.corrections`.
-They are applied in place, and a correction of zero changes no bit. The columns of a frame are its axes.
+Corrections are applied in place, and a correction of zero changes no bit. The columns of a frame are its axes.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Cut pictures into superpixels by BASS (Uziel, Ronen and Freifeld 2019), without its splits and merges.
 
-Each region is a Gaussian in colour and in position. The colour has a fixed standard deviation, the position a
-normal-inverse-Wishart prior. Each round fits these Gaussians, and then moves pixels to the most likely regions (hard
-expectation maximisation). A Potts term keeps borders short. A pixel may change its label only if every region stays
-connected, so no region becomes empty. Pixels at the border of the picture may change as well.
+Each region is a Gaussian in colour and in position. The colour has a fixed standard deviation, and the position has a
+normal-inverse-Wishart prior. Each round fits the Gaussians of the regions, and then moves pixels to the most likely
+regions (hard expectation maximisation). A Potts term keeps borders short. A pixel may change its label only if every
+region stays connected, so no region becomes empty. Pixels at the border of the picture may change as well.
 """
 
 from __future__ import annotations
