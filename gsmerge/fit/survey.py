@@ -76,7 +76,8 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
 def choose_photos(gaussians: Gaussians, photos: Photos) -> list[int]:
     """Return the indices of the photos for a survey: the scored photos, and others that show something new.
 
-    A photo shows something new if many of its Gaussians are inside fewer than ``ENOUGH_PHOTOS`` of those chosen so far.
+    A photo shows something new if many of its Gaussians are inside fewer than ``ENOUGH_PHOTOS`` of the photos chosen so
+    far.
     """
     sample_gaussians = 4096  # a sample of about this many Gaussians, at most twice as many, is projected
     means = gaussians.means[:: max(1, len(gaussians) // sample_gaussians)]
