@@ -214,7 +214,7 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
 
 
 def _match_pattern(pattern: str, search: _Search) -> Iterator[NamedScene]:
-    """Yield the scenes that match a pattern, and those in matching folders; ``**`` does not pass through links."""
+    """Yield the scenes that match a pattern, and those in folders that match; ``**`` passes through no links."""
     anchor, named = Path(pattern).anchor, Path(pattern).parts
     paths = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
     # Hidden files and folders match only if the pattern has their names

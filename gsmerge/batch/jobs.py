@@ -106,7 +106,7 @@ class CompactCall:
         return f"{scene}.{digest({'settings': settings, 'reading': reading})}"
 
     def run(self, files: SceneFiles, outputs: Outputs, threads: int) -> tuple[dict[str, Any], list[Path]]:
-        """Compact a scene. Return its report, and the paths of the result, its coarser levels and its cameras."""
+        """Compact a scene. Return the report, and the paths of the result, its coarser levels and its cameras."""
         document = compact_files(
             files, replace(self.settings, threads=threads), outputs,
             opacity=self.opacity, hints=self.hints, hashed=True,

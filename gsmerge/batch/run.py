@@ -62,8 +62,8 @@ class Run:
 def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrency:
     """Choose by the processors and the free memory how many scenes run at the same time, with how many threads each.
 
-    The memory limits the number as if every scene had the median size. While scenes larger than the median run, fewer
-    scenes run at the same time.
+    The free memory limits how many scenes run at once, as if every scene had the median size. While scenes larger than
+    the median run, fewer scenes run at the same time.
     """
     threads, processors = options.settings.threads, available_threads()
     if options.engine == "ray":
@@ -142,8 +142,8 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
     """Make the results of all jobs in a folder, several at a time; yield the record of each job as it ends.
 
     The record of a job that was done before says "skipped". Several runs may share a folder. Jobs on which another run
-    works come last. Close the generator to end the processes. SceneError if the folder cannot be written, UsageError if
-    Ray is not installed.
+    works come last. A caller that closes the generator ends the processes. SceneError if the folder cannot be written,
+    UsageError if Ray is not installed.
     """
     concurrency = choose_concurrency(jobs, options)
     prepare_folder(folder)

@@ -1,4 +1,4 @@
-"""Cut the Gaussians of a fit at the edges of the views, because no photo shows how far they reach beyond.
+"""Cut the Gaussians of a fit at the edges of the views, because no photo shows how far they reach beyond its edges.
 
 A view has four edges, the borders of its picture. In space, an edge is the plane through the camera and a border. A
 viewer who steps back sees Gaussians that reach across the edges as a soft rim and as clouds around the scene. A cut

@@ -18,8 +18,8 @@ OFFSET = 0.7
 FADED = 0.005  # fainter Gaussians are dropped, because their halves would be fainter than 1 / 255 and not be drawn
 FAINT = 0.02  # late in a run, fainter Gaussians only fade away; without them the run takes .9 of the time
 # Most Gaussians after a growth, as a multiple of those that are left when the growth begins. The usual number of
-# Gaussians is a share of all pixels, which is far more than surfaces can use that many views show. If many views show
-# the same surfaces, most Gaussians of the start are hidden, and halves of halves are smaller than the details of the
+# Gaussians is a share of all pixels, which is far more than surfaces need that many views show. If many views show the
+# same surfaces, most Gaussians of the start are hidden, and halves of halves are smaller than the details of the
 # photos, so most halves of halves fade. Compared with growth without a limit, this limit gains .1 to .2 dB in real
 # scenes of 60 and 84 views, and takes .7 to .8 of the time. A rendered room loses .06 dB if MOST_GROWTH is 4 instead of
 # 8. Scenes of up to a dozen views never grow by this factor
@@ -54,10 +54,10 @@ def grow_to(
 def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.ndarray]:
     """Split the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
 
-    Each Gaussian is split at most once, so the number at most doubles. Gaussians that no photo shows are not split.
-    Both halves inherit the momentum, the share of the box and the least size of their parent. First halves take the
-    rows of their parents, and second halves are appended. Returns the new state and its masses; the mass of a half is
-    half of its parent's mass.
+    Each Gaussian is split at most once, so ``count`` may not be reached, and the number at most doubles. Gaussians that
+    no photo shows are not split. Both halves inherit the momentum, the share of the box and the least size of their
+    parent. First halves take the rows of their parents, and second halves are appended. Returns the new state and its
+    masses; the mass of a half is half of its parent's mass.
     """
     num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:
@@ -71,7 +71,7 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     is_half = np.zeros(len(x), bool)
     is_half[worst] = is_half[len(state.x) :] = True
     unsplit = ~is_half[: len(state.x)]
-    # the centre of the box and the unit of size of a half follow from its own parameters, not from its parent's
+    # the centre of a half's box and the unit of its size follow from its own parameters, not from its parent's
     grown.x0[~is_half], grown.units[~is_half] = state.x0[unsplit], state.units[unsplit]
     for name in set(CARRIED) - {"x0", "units"}:
         getattr(grown, name)[:] = getattr(state, name)[parents]

@@ -44,7 +44,7 @@ def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] |
 
 
 def _with_empty(photos: Photos, scene: PicturedScene) -> Photos:
-    """Return the photos with a mask of the pixels in which the scene is empty; these count in a fit as background."""
+    """Return the photos with a mask of the pixels in which the scene is empty, which a fit treats as background."""
     if scene.empty is None:
         return photos
     size = photos.width, photos.height

@@ -64,8 +64,8 @@ class FitJob:
     seed: int = 0
     progress: OnStep | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, true for Gaussians that must not change; None if all may
-    # If renders stand for photos, the result is scored on the first `num_scored` renders. If there are photos, this is
-    # None, and the result is scored on all photos
+    # If renders stand for photos, the result is scored on the first `num_scored` renders. If there are real photos,
+    # `num_scored` is None, and the result is scored on all photos
     num_scored: int | None = None
     held_out: Photos | None = None  # If given, the result is scored on these photos instead; no step draws them
     # Views from outside, in which some steps remove fog and veils; None for no such steps
@@ -103,7 +103,8 @@ class FitRun:
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the steps that are the first steps, which draw a quarter of the pixels
     samples: bool = True  # True if most of the first steps draw samples of photos; otherwise all draw half-size photos
-    # [h,w] bool of each photo at full size: pixels that count in the first steps; None: those of later steps
+    # [h,w] bool of each photo at full size: the pixels that count in the first steps, or None if the same pixels
+    # count as in later steps
     first_pixels: tuple[np.ndarray, ...] | None = None
 
     def weight(self, step: Step) -> np.ndarray:

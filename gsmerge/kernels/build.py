@@ -92,7 +92,7 @@ def source_files() -> list[Path]:
 
 
 def hash_sources() -> str:
-    """Return a hash of the names and contents of all sources, or an empty string if there are none."""
+    """Return a hash of the names and contents of all sources, or an empty string without sources."""
     digest, paths = hashlib.sha256(), source_files()
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())

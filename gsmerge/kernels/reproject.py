@@ -49,7 +49,7 @@ def see_points(points, viewmats, Ks, depths, width, height, near, behind):
     views=i4("v", out=True), width=i8(least=1), height=i8(least=1), mixed=i4(least=0, most=1),
 )  # fmt: skip
 def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, width, height, mixed):
-    """Choose a pixel for each point so that as many points as possible are in the order of their pixels.
+    """Choose pixels of points so that the order of as many points as possible is the order of their pixels.
 
     A point may project into several views. The chosen pixels are written to ``ids``, and -1 for points without a pixel.
     Returns the number of points with a pixel. Pixels are ordered by view and then by line. If ``mixed`` is 1, pixels

@@ -199,7 +199,7 @@ class FilledTable:
             self[key] = size
 
     def point(self, key: str, array: np.ndarray[Any, Any]) -> None:
-        """Let the struct point to another array, or raise ValueError if its sizes differ from those before."""
+        """Let the struct point to another array, or raise ValueError if it has other sizes."""
         self[key] = _convert(self.table.name, key, self.table.arrays[key], array, self._sizes)
         self.arrays[key] = array
 

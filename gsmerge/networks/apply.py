@@ -255,7 +255,7 @@ def prepare_children(
     """Return the Gaussians that the heads correct: the children or, for absolute outputs, as many round Gaussians.
 
     A round Gaussian has the mean, the base colour and the size of its group, the axes of the group's frame, and an
-    opacity of 0.5. The outputs of the head are offsets from the numbers of these Gaussians (paper section 4.3).
+    opacity of 0.5. The head puts out offsets from the parameters of round Gaussians (paper section 4.3).
     """
     if not options.makes_children:
         return children
@@ -325,7 +325,7 @@ def _run_head(
     slots, latents = mask.shape[1], group_features.features.latents
 
     def run_table(rows: np.ndarray, _: int) -> Any:
-        """Run the head on the runs ``rows``."""
+        """Run the head on the runs of children with the numbers ``rows``."""
         owners = parents[rows]
         tokens = context.make_tokens(children, ids[rows].reshape(-1), np.repeat(owners, slots), group_features)
         table = tokens.reshape(len(rows), slots, PART_COLUMNS)

@@ -128,7 +128,7 @@ def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray
     """Split groups of ``sizes [g]`` into tables, and yield the groups and the width of each table.
 
     A table has groups of similar size. The width of a table is a power of two, at most ``max_width``. Groups with more
-    members have to be sampled. The split depends only on the sizes.
+    members have to be sampled. How groups are split into tables depends only on their sizes.
     """
     bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # exponents of the next powers of two
     widths = np.minimum(1 << bits, max_width)

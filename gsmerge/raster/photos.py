@@ -307,8 +307,8 @@ def _score_render(image: np.ndarray, covered: np.ndarray, photos: Photos, view: 
 def _scored_pixels(photos: Photos, view: int, every: int) -> np.ndarray | None:
     """Return the mask ``[h,w]`` of the pixels that are scored, or None for all pixels.
 
-    Pixels are scored inside the photo's mask and inside the scored tiles. If there are none, all pixels of the photo's
-    mask are scored. If the photo's mask is empty, all pixels of the scored tiles are scored.
+    Pixels are scored inside the photo's mask and inside the scored tiles. If no pixel is inside both, all pixels of the
+    photo's mask are scored. If the photo's mask is empty, all pixels of the scored tiles are scored.
     """
     tiles = scored_tiles(view, photos.width, photos.height, every)
     in_tiles = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]

@@ -306,8 +306,8 @@ def tile_view(
 
     Tiles have 16 x 16 pixels. Only tiles with a True ``tiles [tile_height,tile_width]`` have to be complete. ``band``
     is the first line of tiles to draw and the line after the last. If ``band`` is given, the result is a view of the
-    lines in the band alone. ``columns`` is the first column of tiles and the column after the last. All other tiles are
-    empty.
+    lines in the band alone. ``columns`` is the first column of tiles and the column after the last. Tiles outside of
+    ``band`` and ``columns`` are empty.
 
     The size of the result depends on the number of visible Gaussians, not on n. Raises ValueError if a size or a number
     is out of range.

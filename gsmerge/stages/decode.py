@@ -130,7 +130,8 @@ def mixed_counts(
     """Choose K for every group, 1 to 4, by the rule of the options (paper supplement, per-superpixel K).
 
     ``saliency`` has a number for every pixel of all views. One rule ranks groups by their saliency. The rule
-    "distortion" makes as many Gaussians in all, but more of them where they lower distortion most.
+    "distortion" makes as many Gaussians in all as the rule by saliency, but more of them where they lower distortion
+    most.
     """
     counts = counts_by_saliency(group_saliency(features, members, saliency), options)
     if options.k_rule == "distortion":
@@ -202,8 +203,8 @@ def halve_groups(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Divide the members of some ``groups`` into at most ``counts [g]`` children each, by repeated halving.
 
-    Returns the start ``[n+1]`` of each child in a list of members, this list ``[m]`` of rows of ``members``, and the
-    group ``[n]`` of each child.
+    Returns the start ``[n+1]`` of each child in a list of members, the list itself, which has rows ``[m]`` of
+    ``members``, and the group ``[n]`` of each child.
     """
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
@@ -223,7 +224,7 @@ def halve_groups(
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
-    """Return the number of children ``[g]`` of each group, if there are ``extra`` more children than groups.
+    """Return the number of children ``[g]`` of each group, if there are ``extra`` children more than groups.
 
     Each group has at least one child. Further children go to groups in which they lower distortion most, as far as the
     members suffice. If a child lowers distortion only together with the next child, both count with their mean gain,

@@ -64,8 +64,8 @@ def correct(
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """List the members of all superpixels that are not empty.
 
-    Returns the start ``[g+1]`` of each superpixel in a list of members, this list ``[m]`` int32 of rows of ``members``,
-    and the view ``[g]`` of each superpixel.
+    Returns the start ``[g+1]`` of each superpixel in a list of members, the list itself, which has int32 rows ``[m]``
+    of ``members``, and the view ``[g]`` of each superpixel.
     """
     counts = np.asarray(groups.counts)
     offsets, flat = np.cumsum(counts) - counts, groups.labels.reshape(-1)

@@ -119,7 +119,7 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
 def _pool_latents(latents: Array, share: np.ndarray, run: np.ndarray, count: int) -> Array:
     """Return the sum ``[count,d]`` of the ``latents [m,d]`` of each cluster, weighted by ``share [m]``.
 
-    ``run [m]`` are the clusters. Tensors, which training uses, pass gradients.
+    ``run [m]`` are the clusters. If the latents are tensors, as in training, gradients pass through the sum.
     """
     if isinstance(latents, np.ndarray):
         sums = np.zeros((count, latents.shape[1]), np.float32)

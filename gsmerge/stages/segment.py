@@ -2,9 +2,9 @@
 
 The tree merges neighbouring superpixels of all views. Merges that add the least distortion come first. A cut through
 the tree has few superpixels where merges lose little, and many elsewhere, so every Gaussian lowers the distortion about
-equally. Distortion is measured in the image. The distortion is the squared error of colours plus the squared relative
-error of depths from a plane. As depths are compared with a plane, a flat wall costs nothing from any angle, and as
-errors of depth are relative, far things count as much as near things.
+equally. The distortion is measured in the image, and is the squared error of colours plus the squared relative error of
+depths from a plane. As depths are compared with a plane, a flat wall costs nothing from any angle, and as errors of
+depth are relative, far things count as much as near things.
 """
 
 from __future__ import annotations

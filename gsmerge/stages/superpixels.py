@@ -38,7 +38,8 @@ RECTANGLES, EARLY_SWEEPS = 2.0, 0  # defaults of rdseg: rectangles per superpixe
 def segment(images: np.ndarray, options: SegmentOptions, count: int | None = None) -> Groups:
     """Cut every view into the same number of superpixels.
 
-    ``images [v,h,w,3]`` are float in [0, 1] or uint8. ``count`` is the number per view, by default that of the options.
+    ``images [v,h,w,3]`` are float in [0, 1] or uint8. ``count`` is the number of superpixels per view, by default that
+    of the options.
     """
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")

@@ -1,8 +1,8 @@
 """Add batches of views to Feature Gaussians with ``recipe=paper`` (paper section 4.5, "Online reconstruction").
 
 New views are encoded, matched with the earlier Feature Gaussians, merged into them and refined. The decoder heads of
-the networks make K Gaussians of each Feature Gaussian, for any K. For a single batch the result has the same bytes as
-that of ``compact``.
+the networks make K Gaussians of each Feature Gaussian, for any K. The result of a single batch has the same bytes as
+the result of ``compact``.
 """
 
 from __future__ import annotations
@@ -277,7 +277,7 @@ def _join_batch(
     cameras = concat_cameras(state.cameras, resize_cameras(context.cameras, *size))
     views = features.views + len(state.cameras)
     parts = FeatureGaussians.concat([state.merged, _without_members(replace(features, views=views))])
-    # Each part lists its own row, so that merging lists the rows of the parts
+    # Each part lists its own row as its only member, so that merged Feature Gaussians list the rows of their parts
     parts = replace(parts, starts=np.arange(len(parts) + 1), members=np.arange(len(parts)).astype(np.int32))
     part_members = np.concatenate([state.num_members, np.diff(features.starts)])
     all_samples = ViewSamples.concat([state.samples, samples])

@@ -14,7 +14,7 @@ from gsmerge.kernels.signature import STATUS, f4, f8, i8, native
     frames=f4("g", 3, 3, out=True), sizes=f4("g", out=True),
 )  # fmt: skip
 def place_frames(means, scales, viewmats, views, frames, sizes):
-    """Write the frame and the size of each group. The size is the geometric mean of the two largest scales.
+    """Write the frame and the size of each group. The size of a group is the geometric mean of its two largest scales.
 
     The columns of a frame are axes in the world: right and down in the picture of the group's view, and along the ray
     from the camera to the group.

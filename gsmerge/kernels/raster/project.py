@@ -1,8 +1,9 @@
 """Project Gaussians into a view, to find which ones it may show, with their conics and boxes. Run the backward pass.
 
-The conventions are those of gsplat. The dilation is 0.3 square pixels. Conics follow from the first-order (EWA)
-projection, whose directions are clamped 15 % outside the image. Contributions below 1/255 are left out. A conic is
-stored with its square completed, so that the exponent of a pixel is never positive, however thin the Gaussian::
+Cameras, Gaussians and images follow the conventions of gsplat. The dilation is 0.3 square pixels. Conics follow from
+the first-order (EWA) projection, whose directions are clamped 15 % outside the image. Contributions below 1/255 are
+left out. A conic is stored with its square completed, so that the exponent of a pixel is never positive, however thin
+the Gaussian::
 
     ln w(x, y) = lnop - (rate_x (x - mean_x - slope (y - mean_y)))^2 - rate_y (y - mean_y)^2
 

@@ -39,8 +39,8 @@ _fit_regions = declare(
 def fit_regions(labels, colours, areas):
     """Return the parameters ``[count,9]`` float32 of every region: means, inverse covariance, and its log-determinant.
 
-    The covariance is ``(A² I + S) / (n + 50 A - 3)``. S is the scatter of the n positions of a region. A is its
-    expected area in pixels, from ``areas [count]`` float64.
+    The covariance is ``(A² I + S) / (n + 50 A - 3)``. S is the scatter of the n positions of a region. A is the
+    expected area of a region in pixels, from ``areas [count]`` float64.
     """
     rows = np.empty((len(areas), REGION_COLUMNS), np.float32)
     _fit_regions(labels, colours, areas, np.zeros((len(areas), 9)), rows)

@@ -26,7 +26,7 @@ def adjacent_pairs(labels):
 
     Pairs may be repeated. There is about one pair for each straight piece of a common border.
     """
-    # There are at most two pairs for each pixel, with the pixels to the right and below
+    # Each pixel makes at most two pairs, one with the pixel to its right and one with the pixel below
     pairs = np.empty((2 * (labels.shape[0] - 2) * (labels.shape[1] - 2) + 1, 2), np.int32)
     return pairs[: _adjacent_pairs(labels, pairs)]
 
