@@ -35,7 +35,7 @@ class Survey:
     pixels: np.ndarray  # [n] float32 size of the finest pixel that shows the Gaussian, world units; inf if none does
 
     def visible(self, min_weight: float) -> np.ndarray:
-        """Return a mask ``[n]`` of Gaussians that weigh ``min_weight`` in some pixel, or are outside of all frustums."""
+        """Return a mask ``[n]`` of Gaussians that weigh ``min_weight`` in some pixel or are outside of all frustums."""
         return ~self.inside | (self.peaks >= min_weight)
 
     def __getitem__(self, rows: np.ndarray) -> Survey:
