@@ -27,8 +27,8 @@ NamedScene = tuple[Path, Path | None]  # a scene, and the named folder in which 
 MAX_FOLDERS = 100_000  # most folders in a row without a scene; a link into a system's folders leads to more
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
-# A folder that has one of these names in it, with or without .ply, looks like a scene. A folder that itself has one of
-# these names is a part of a scene
+# A folder looks like a scene if a file or folder in it has one of _USUAL_NAMES, with or without .ply. A folder whose
+# own name is in _USUAL_NAMES is a part of a scene
 _USUAL_NAMES = {place.split("/")[0].removesuffix(".ply") for place in (*PLY_PLACES, *IMAGE_PLACES, *CAMERA_PLACES)}
 
 
@@ -62,8 +62,8 @@ def count_links(path: Path) -> int:
 def describe_lost(lookalikes: Sequence[str], scenes: Collection[str]) -> list[str]:
     """Return a list with a note about folders beside scenes that look like scenes, but have no Gaussians.
 
-    The list is empty if there are no such folders. ``lookalikes`` are all folders that look like scenes, with or
-    without Gaussians. ``scenes`` are all scenes.
+    The list is empty if no folder looks like a scene without Gaussians. ``lookalikes`` are all folders that look like
+    scenes, with or without Gaussians. ``scenes`` are all scenes.
     """
     with_gaussians = {str(folder) for scene in scenes for folder in (Path(scene), *Path(scene).parents)}
     with_scenes = {os.path.dirname(folder) for folder in lookalikes if folder in scenes}
@@ -129,7 +129,10 @@ def _remedy(folder: Path) -> str:
 
 @dataclass
 class _Search:
-    """The search for the scenes of one argument. It enters each folder once, even if several links lead to it."""
+    """The search for the scenes of one argument.
+
+    The search enters each folder once, even if several links lead to the folder.
+    """
 
     skip: str  # real path of the output folder, which is not searched
     lookalikes: list[str]  # folders that look like scenes, because they have photos, cameras or files with usual names
@@ -169,7 +172,10 @@ class _Search:
 
 
 def _is_packed(path: Path) -> bool:
-    """Return whether a file is a zip archive with Gaussians. It counts as a scene, so that its reader refuses it."""
+    """Return whether a file is a zip archive with Gaussians.
+
+    Such an archive counts as a scene, so that its reader refuses it.
+    """
     if path.suffix != ".zip" or path.with_suffix("").exists():  # an archive beside its unpacked folder is not needed
         return False
     with suppress(OSError, SceneError, BadZipFile), open_archive(path) as archive:
@@ -208,7 +214,7 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
 
 
 def _match_pattern(pattern: str, search: _Search) -> Iterator[NamedScene]:
-    """Yield the scenes that match a pattern, and those in matching folders; ``**`` does not pass through links."""
+    """Yield the scenes that match a pattern, and those in folders that match; ``**`` passes through no links."""
     anchor, named = Path(pattern).anchor, Path(pattern).parts
     paths = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
     # Hidden files and folders match only if the pattern has their names

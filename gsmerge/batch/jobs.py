@@ -91,8 +91,8 @@ class CompactCall:
     def key(self, files: SceneFiles) -> str:
         """Return the key of a result, which tells whether an earlier result of these ``files`` can be kept.
 
-        The key has two digests with a dot between them. The first is of the scene's files and the version of gsmerge,
-        the second is of the settings.
+        The key has two digests with a dot between them. The first digest is of the scene's files and the version of
+        gsmerge, and the second digest is of the settings.
         """
         settings = self.settings.to_dict()
         del settings["threads"]
@@ -106,7 +106,7 @@ class CompactCall:
         return f"{scene}.{digest({'settings': settings, 'reading': reading})}"
 
     def run(self, files: SceneFiles, outputs: Outputs, threads: int) -> tuple[dict[str, Any], list[Path]]:
-        """Compact a scene. Return its report, and the paths of the result, its coarser levels and its cameras."""
+        """Compact a scene. Return the report, and the paths of the result, its coarser levels and its cameras."""
         document = compact_files(
             files, replace(self.settings, threads=threads), outputs,
             opacity=self.opacity, hints=self.hints, hashed=True,
@@ -161,7 +161,7 @@ def find_jobs(
         out: The output folder, which is not searched.
         options: Settings of the batch.
         results: Real paths of former results, which are not scenes.
-        lookalikes: The folders that look like scenes are appended to this list, for :func:`describe_lost`.
+        lookalikes: List to which the folders that look like scenes are appended, for :func:`describe_lost`.
 
     If several paths lead to a scene, the path with the fewest links names it. If another result or a scene has the name
     of a result, the job has a ``clash``. Raises SceneError if an argument does not exist or has no scene, if cameras,

@@ -62,8 +62,8 @@ class Run:
 def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrency:
     """Choose by the processors and the free memory how many scenes run at the same time, with how many threads each.
 
-    The memory limits the number as if every scene had the median size. While larger scenes run, fewer run at the same
-    time.
+    The free memory limits how many scenes run at once, as if every scene had the median size. While scenes larger than
+    the median run, fewer scenes run at the same time.
     """
     threads, processors = options.settings.threads, available_threads()
     if options.engine == "ray":
@@ -77,7 +77,7 @@ def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrenc
 def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> list[tuple[Job, str | None]]:
     """List the jobs that a run would take on, each with the reason if it would refuse the job, or None.
 
-    These are the jobs whose results are not done, and with ``overwrite`` all jobs.
+    A run takes on the jobs whose results are not done, and with ``overwrite`` all jobs.
     """
     results, pending = RecordIndex(folder).read_on().results, list[tuple[Job, str | None]]()
     for job in jobs:
@@ -142,8 +142,8 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
     """Make the results of all jobs in a folder, several at a time; yield the record of each job as it ends.
 
     The record of a job that was done before says "skipped". Several runs may share a folder. Jobs on which another run
-    works come last. Close the generator to end the processes. SceneError if the folder cannot be written, UsageError if
-    Ray is not installed.
+    works come last. A caller that closes the generator ends the processes. SceneError if the folder cannot be written,
+    UsageError if Ray is not installed.
     """
     concurrency = choose_concurrency(jobs, options)
     prepare_folder(folder)
@@ -179,8 +179,8 @@ def run_job(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str
     """Make a result unless it is done, record the outcome, and return the record.
 
     If another process works on the result, the call waits for it, or returns None without ``wait``. ``lost`` says why
-    the process that should make the result has ended. With it only this failure is recorded. SceneError if the record
-    cannot be written.
+    the process that should make the result has ended. If ``lost`` is given, only this failure is recorded. SceneError
+    if the record cannot be written.
     """
     with lock_result(run.folder, job.output, wait=wait) as mark:
         if mark is None:

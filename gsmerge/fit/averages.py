@@ -26,7 +26,7 @@ class RecentMean:
 
 @dataclass
 class TailMean:
-    """Mean of the parameters ``[n,14]`` over the last steps of a fit, because those after a single step are noisy."""
+    """Mean of the parameters ``[n,14]`` over the last steps of a fit, as they are noisy after a single step."""
 
     total: np.ndarray | None = None
     count: int = 0  # Number of steps whose parameters are in the total

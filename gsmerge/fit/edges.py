@@ -1,4 +1,4 @@
-"""Cut the Gaussians of a fit at the edges of the views, because no photo shows how far they reach beyond.
+"""Cut the Gaussians of a fit at the edges of the views, because no photo shows how far they reach beyond its edges.
 
 A view has four edges, the borders of its picture. In space, an edge is the plane through the camera and a border. A
 viewer who steps back sees Gaussians that reach across the edges as a soft rim and as clouds around the scene. A cut
@@ -25,15 +25,15 @@ from gsmerge.raster import Splats
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
-# The edges are moved out, because pixels at a border also show Gaussians with centres outside of the picture. The unit
-# is the distance between neighbouring Gaussians if the result were spread evenly over all photos
+# The edges are moved out, because pixels at a border also show Gaussians with centres outside of the picture. MARGIN is
+# in units of the distance that neighbouring Gaussians would have if the result were spread evenly over all photos
 MARGIN = 2.0
 ROWS = 16384  # Gaussians per task
 REACH = 2.0  # a Gaussian ends at this many standard deviations, as in kernels/gaussians/edges.c
 SOFT = 0.01  # a Gaussian is split if its soft border is wider than this, as a share of the width of the view
 FALL = 1.69  # standard deviations over which the opacity of an opaque Gaussian falls from .9 to .1: its soft border
-# A Gaussian is split if its opacity at the edge is above this. Fainter Gaussians are haze in front of the scene. To
-# split them would change the photos by up to 1 dB, and hardly narrow the rim
+# A Gaussian is split if its opacity at the edge is above this. Fainter Gaussians are haze in front of the scene. A
+# split of these fainter Gaussians would change the photos by up to 1 dB, and hardly narrow the soft rim of the scene
 SHOWN = 0.2
 
 
@@ -65,7 +65,7 @@ def find_edges(cameras: Cameras, count: int) -> Edges:
 def cut_state(state: FitState, edges: Edges) -> None:
     """Cut the Gaussians of a state at the edges of all views, in place, except fixed Gaussians.
 
-    The box in which a mean may move is then centred at the mean after the cut. The limits of the scales do not change.
+    After a cut, the box in which a mean may move is centred at the new mean. The limits of the scales do not change.
     """
     splats, x = state.splats, state.x
     means, covars, is_cut = _compute_cuts(splats, edges)
@@ -157,8 +157,8 @@ def _find_nearest_edges(
 
     Returns the outward normal ``[n,3]`` of the edge, the distance ``[n]`` of the mean from the edge in standard
     deviations of the Gaussian along the normal, positive inside, and the width ``[n]`` of the Gaussian's soft border as
-    a share of the view's width. The kernel that cuts Gaussians has the same rule (``nearest_plane`` in edges.c), but
-    does not return the edge.
+    a share of the view's width. The kernel that cuts Gaussians chooses the edge by the same rule (``nearest_plane`` in
+    edges.c), but does not return it.
     """
     rows, deepest, cameras = np.arange(len(means)), np.full(len(means), -np.inf), edges.cameras
     nearest, widths = np.zeros((len(means), 3)), np.zeros(len(means))

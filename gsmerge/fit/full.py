@@ -1,9 +1,9 @@
 """Fit all parameters of Gaussians to photos by a short optimisation, in which each parameter stays near its start.
 
-Each step draws one view over a random background. Its loss combines the L1 error of pixels, the L1 error of differences
-between neighbouring pixels, and structural similarity. Adam's rates are in units of each Gaussian's own size. The first
-steps draw only a sample of each photo's pixels. Long runs begin with fewer Gaussians than they may have, and add the
-rest where errors are large.
+Each step draws one view over a random background. The loss of a step combines the L1 error of pixels, the L1 error of
+differences between neighbouring pixels, and structural similarity. The step sizes of the optimiser (Adam) are in units
+of each Gaussian's own size. The first steps draw only a sample of each photo's pixels. Long runs begin with fewer
+Gaussians than they may have, and add the rest where errors are large.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ def score_fit(fit: FullFit) -> None:
 def renew_state(fit: FullFit) -> None:
     """Add Gaussians, drop faint ones, or cut Gaussians at the edges of the views, if one of these is due.
 
-    Afterwards a row may be another Gaussian, or have other axes, so the mean of the last steps begins anew. If some
-    Gaussians are fixed, none are dropped or added, because the caller expects every Gaussian in its row.
+    After such a change a row may be another Gaussian, or have other axes, so the mean over the last steps begins anew.
+    If some Gaussians are fixed, none are dropped or added, because the caller expects every Gaussian in its row.
     """
     job, options = fit.run.job, fit.run.job.options
     if not options.grows or not fit.reaches(GROWTH, *CLEARS, *CUTS):
@@ -145,7 +145,7 @@ def end_fit(fit: FullFit) -> FitResult:
     final = state_of(fit.tail.of(fit.state.x), fit.state.splats.shN)
     final.origins, final.min_sizes = fit.state.origins, fit.state.min_sizes
     # A fit that fills an exact number of Gaussians has no room for halves. There are no edges if renders stand for
-    # photos, because renders show what lies beyond
+    # photos, because renders also show what lies beyond the edges of photos
     has_room = job.options.grows and not job.options.fills
     if has_room and job.edges is not None and job.fixed is None:
         split = split_at_edges(final, job.edges, job.count)
@@ -153,7 +153,7 @@ def end_fit(fit: FullFit) -> FitResult:
             mse, split_mse = (
                 float(photo_mses(gaussians_of(s.x, s.splats.shN), fit.half).mean()) for s in (final, split)
             )
-            # two halves cover more than their parent: where large Gaussians overlap, photos may lose .5 dB
+            # photos may lose .5 dB where large Gaussians overlap, because two halves cover more than their parent
             final = split if split_mse <= SPLIT_LOSS * mse else final
     report = FitReport(
         method="full",
@@ -171,10 +171,10 @@ def end_fit(fit: FullFit) -> FitResult:
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
     """Return how far each Gaussian may move, as a share ``[n]`` of its full range, and its least log scale ``[n]``.
 
-    A Gaussian that a single photo shows may move by ``single_view_share``, and one that two photos show by 1. The
-    effective number of photos is (sum w)^2 / sum w^2, where w is the sum of the Gaussian's blending weights in a photo.
-    The least scale is ``min_scale`` times the size of the finest pixel that shows the Gaussian (the 3D filter of
-    Mip-Splatting). If no photo shows the Gaussian, its scale has no lower limit.
+    A Gaussian that a single photo shows may move by the share ``single_view_share``, and a Gaussian that two photos
+    show by the share 1. The effective number of photos is (sum w)^2 / sum w^2, where w is the sum of the Gaussian's
+    blending weights in a photo. The least scale is ``min_scale`` times the size of the finest pixel that shows the
+    Gaussian (the 3D filter of Mip-Splatting). If no photo shows the Gaussian, its scale has no lower limit.
     """
     num_photos = survey.sums**2 / np.maximum(survey.squares, 1e-12)
     box_shares = np.clip(num_photos - 1, rates.single_view_share, 1).astype(np.float32)

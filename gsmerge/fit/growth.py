@@ -17,11 +17,12 @@ from gsmerge.runtime.threads import in_turn
 OFFSET = 0.7
 FADED = 0.005  # fainter Gaussians are dropped, because their halves would be fainter than 1 / 255 and not be drawn
 FAINT = 0.02  # late in a run, fainter Gaussians only fade away; without them the run takes .9 of the time
-# Most Gaussians after a growth, as a multiple of those that are left when it begins. The usual number of Gaussians is a
-# share of all pixels. Where many views show the same surfaces, this is far more than the surfaces can use. Most
-# Gaussians of the start are hidden there, and halves of halves are smaller than the details of the photos, so most of
-# them fade. Compared with no limit, real scenes of 60 and 84 views gain .1 to .2 dB, and their fit takes .7 to .8 of
-# the time. With a limit of 4, a rendered room loses .06 dB. Scenes of up to a dozen views do not reach the limit
+# Most Gaussians after a growth, as a multiple of those that are left when the growth begins. The usual number of
+# Gaussians is a share of all pixels, which is far more than surfaces need that many views show. If many views show the
+# same surfaces, most Gaussians of the start are hidden, and halves of halves are smaller than the details of the
+# photos, so most halves of halves fade. Compared with growth without a limit, this limit gains .1 to .2 dB in real
+# scenes of 60 and 84 views, and takes .7 to .8 of the time. A rendered room loses .06 dB if MOST_GROWTH is 4 instead of
+# 8. Scenes of up to a dozen views never grow by this factor
 MOST_GROWTH = 8
 
 
@@ -37,8 +38,8 @@ def grow_to(
     """Drop Gaussians with an opacity below ``least``, then split others until there are ``count``.
 
     The number of Gaussians that remain after the drop grows at most by the factor ``most_growth``; None sets no limit.
-    There are also fewer than ``count`` if no photo shows a Gaussian that could be split. The errors of the half-size
-    photos ``half`` decide which Gaussians are split.
+    The result also has fewer Gaussians than ``count`` if no photo shows a Gaussian that could be split. The errors of
+    the half-size photos ``half`` decide which Gaussians are split.
     """
     state = drop_faint(state, least)
     count = count if most_growth is None else min(count, most_growth * len(state.x))
@@ -53,10 +54,10 @@ def grow_to(
 def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.ndarray]:
     """Split the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
 
-    Each Gaussian is split at most once, so the number at most doubles. Gaussians that no photo shows are not split.
-    Both halves inherit the momentum, the share of the box and the least size of their parent. First halves take the
-    rows of their parents, and second halves are appended. Returns the new state and its masses; the mass of a half is
-    half of its parent's mass.
+    Each Gaussian is split at most once, so ``count`` may not be reached, and the number at most doubles. Gaussians that
+    no photo shows are not split. Both halves inherit the momentum, the share of the box and the least size of their
+    parent. First halves take the rows of their parents, and second halves are appended. Returns the new state and its
+    masses; the mass of a half is half of its parent's mass.
     """
     num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:
@@ -70,7 +71,7 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     is_half = np.zeros(len(x), bool)
     is_half[worst] = is_half[len(state.x) :] = True
     unsplit = ~is_half[: len(state.x)]
-    # the centre of the box and the unit of size of a half follow from its own parameters, not from its parent's
+    # the centre of a half's box and the unit of its size follow from its own parameters, not from its parent's
     grown.x0[~is_half], grown.units[~is_half] = state.x0[unsplit], state.units[unsplit]
     for name in set(CARRIED) - {"x0", "units"}:
         getattr(grown, name)[:] = getattr(state, name)[parents]
@@ -97,8 +98,9 @@ def split_parameters(parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def fade_halves(logits: np.ndarray) -> np.ndarray:
     """Return the opacity logits ``[m]`` for halves of Gaussians with the opacity ``logits [m]``."""
     transmittances = 1 / (1 + exp(logits.astype(np.float64)))  # 1 - opacity
-    # Optical depth of a half, as a share of the parent's. Halves are narrower than the parent. With a share of 0.7 they
-    # would together cover as much as the parent. They cover a little more, which closes gaps between them
+    # Optical depth of a half, as a share of the parent's. Halves are narrower than the parent. With a share of 0.7,
+    # both halves together would cover as much as the parent. With 0.8 they cover a little more, which closes gaps
+    # between the halves
     depth_share = 0.8
     return np.asarray(log(1 / power(transmittances, depth_share) - 1))
 

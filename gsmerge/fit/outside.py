@@ -1,9 +1,10 @@
 """Place views outside of the capture, from which a fit removes fog and veils.
 
-Photos do not show the space between their fields of view, nor the space close to other cameras. A fit fills these
-spaces with large Gaussians. A viewer who steps back sees them as fog where the input is empty, and as veils in front of
-the input's surfaces. So some steps of a fit draw the Gaussians from cameras behind, beside, above and below those of
-the photos, and compare their opacities and depths with those of the input.
+Photos do not show the space between their fields of view, nor the space close to other cameras. A fit fills spaces that
+no photo shows with large Gaussians. A viewer who steps back sees these large Gaussians as fog where the input is empty,
+and as veils in front of the input's surfaces. To remove fog and veils, some steps of a fit draw the Gaussians from
+cameras behind, beside, above and below those of the photos, and compare their opacities and depths with those of the
+input.
 """
 
 from __future__ import annotations
@@ -26,15 +27,16 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
 # Least and largest step back as a share of a view's median depth, rotation to the sides about the middle of the view in
-# degrees, and rotation up or down in degrees. Without a step back, cameras would see the same as new views between the
-# photos, where a fit has to fill gaps
+# degrees, and rotation up or down in degrees. Cameras that do not step back would see the same as new views between the
+# photos, in which a fit has to fill gaps
 STEP_BACK_LOW, STEP_BACK_HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
-# Multiples of this vector, modulo one, fill a cube evenly, whatever their number (the R sequence of Roberts 2018)
+# The multiples of EVEN, modulo one, fill a cube evenly, whatever the number of multiples (the R sequence of Roberts
+# 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 PLACES = 42  # largest number of views from outside, if there are not more photos; then one for each photo
 DEPTH_GAUSSIANS = 2000  # the depths of views are measured on at least this many Gaussians, or on all if there are fewer
-# The views from outside are drawn from a sample of the input. It has this many Gaussians for each photo, but at most
-# for PLACES photos, because more photos do not make the pictures larger
+# The views from outside are drawn from a sample of the input. The sample has GAUSSIANS_PER_PHOTO Gaussians for each
+# photo, but at most for PLACES photos, because more photos do not make the pictures larger
 GAUSSIANS_PER_PHOTO = 4000
 OUTSIDE_NEAR_PLANE = 0.25  # depth of the near plane, as a share of the median depth of a view
 # Depths are clipped to at most FAR_FACTOR times their quantile FAR_QUANTILE, because a Gaussian that is much too far
@@ -45,13 +47,13 @@ EMPTY_OPACITY, SOLID_OPACITY = 0.15, 0.9
 # Width of the rim around the outlines of the input, as a share of the picture's width. Empty pixels in the rim do not
 # count, because Gaussians beside an outline fill the background that becomes visible in new views
 RIM_SHARE = 0.04
-# A pixel is veiled if its loss (see veil_gradients) is above this. If the pixel is opaque, its mean depth is then less
-# than the limit by more than this share of the limit
+# A pixel is veiled if its loss (see veil_gradients) is above VEILED_LOSS. An opaque pixel is veiled if its mean depth
+# is less than the limit of its depth by more than the share VEILED_LOSS of this limit
 VEILED_LOSS = 0.15
-# The weight of fog in the loss is 1 if the start has at least MANY_PER_PHOTO Gaussians for each photo. Fewer Gaussians
-# are larger, and reach from the borders of photos into empty space. With a weight of 1 they would vanish, although the
-# photos show them. So the weight of fog is smaller then, but at least LEAST_FOG_WEIGHT. VEIL_WEIGHT is the weight of
-# veils relative to fog
+# The weight of fog in the loss is 1 if the start has at least MANY_PER_PHOTO Gaussians for each photo. If a start has
+# fewer Gaussians, each one is larger and reaches from the borders of photos into empty space. With a weight of 1 such
+# large Gaussians would vanish, although the photos show them, so a start with fewer Gaussians gets a smaller weight of
+# fog, but at least LEAST_FOG_WEIGHT. VEIL_WEIGHT is the weight of veils relative to fog
 MANY_PER_PHOTO, LEAST_FOG_WEIGHT, VEIL_WEIGHT = 1000, 0.15, 30
 OUTSIDE_LEVEL = 3  # width of a pixel of the pictures, in pixels of a photo: 2 leaves as much fog, 4 a fifth more
 LEAST_WIDTH = 64  # least width of the pictures, pixels
@@ -83,10 +85,10 @@ class Outside:
 def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options: FitOptions) -> Outside | None:
     """Place views outside of the capture for a fit, and draw the scene in them to find the limits of depths.
 
-    The cameras are those of ``photos``, stepped back and rotated. Pictures are a third as wide as the photos, but at
-    least ``LEAST_WIDTH`` pixels. If the scene has no Gaussians, as when blocks are joined, the ``start`` of the fit is
-    drawn instead. Returns None if the fit has no steps for views from outside, or if in every view too few pixels would
-    count.
+    The cameras of these views are the cameras of ``photos``, stepped back and rotated. Pictures are a third as wide as
+    the photos, but at least ``LEAST_WIDTH`` pixels. If the scene has no Gaussians, as when blocks are joined, the
+    ``start`` of the fit is drawn instead. Returns None if the fit has no steps for views from outside, or if in every
+    view too few pixels would count.
     """
     num_steps = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     if num_steps == 0:  # steps on views from outside

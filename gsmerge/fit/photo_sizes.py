@@ -44,7 +44,7 @@ def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] |
 
 
 def _with_empty(photos: Photos, scene: PicturedScene) -> Photos:
-    """Return the photos with a mask of the pixels in which the scene is empty; these count in a fit as background."""
+    """Return the photos with a mask of the pixels in which the scene is empty, which a fit treats as background."""
     if scene.empty is None:
         return photos
     size = photos.width, photos.height
@@ -89,8 +89,8 @@ def largest_scale(scene: Scene) -> float:
 def large_photos(scene: Scene, scale: float) -> Photos:
     """Read the photos at ``scale`` times the views' size; ``scale`` is at most :func:`largest_scale`.
 
-    The pictures are uint8, because they may take as much memory as the scene. They are compared with renders that have
-    the low-pass filter of a viewer at this size. Raises ValueError if the scene has no larger photos.
+    The pictures are uint8, because they may take as much memory as the scene. The photos are compared with renders that
+    have the low-pass filter of a viewer at the photos' size. Raises ValueError if the scene has no larger photos.
     """
     large, cameras = scene.large_photos, scene.cameras
     if large is None:
@@ -110,8 +110,8 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
     """Return the weights ``[h,w]`` float32 of the pixels of each view in training: 0 on held-out patches.
 
-    ``share`` is the share of the patches that is held out. Elsewhere the weights are those of the photo. Pixels with a
-    weight below 1 are not held out, and a weight of 0 is replaced by ``HIDDEN_WEIGHT``.
+    ``share`` is the share of the patches that is held out. Outside of held-out patches the weights are those of the
+    photo. Pixels with a weight below 1 are not held out, and a weight of 0 is replaced by ``HIDDEN_WEIGHT``.
     """
     return [training_weight(photos, view, share, seed) for view in range(len(photos))]
 
@@ -178,8 +178,9 @@ def exposure_gains(
     """Return factors ``[v,3]`` float32 that bring the renders of all views to the exposure of their photos.
 
     Each factor is the least-squares solution on the weighted pixels of one view and channel, clipped to the range from
-    ``1 / MAX_GAIN`` to ``MAX_GAIN``. Then the factors of a channel are divided by their geometric mean, after which
-    they may lie outside this range. If all factors are between ``1 / min_gain`` and ``min_gain``, all are set to 1.
+    ``1 / MAX_GAIN`` to ``MAX_GAIN``. After the clipping, the factors of a channel are divided by their geometric mean,
+    so a factor may leave the range again. If all factors are between ``1 / min_gain`` and ``min_gain``, all are set to
+    1.
     """
 
     def view_gains(view: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from gsmerge.settings.fit import Tuning
 
 @dataclass(eq=False)
 class PoseState:
-    """Motions of the cameras during a fit. Their mean stays zero, so that the scene does not drift."""
+    """Motions of the cameras during a fit. The mean of the motions stays zero, so that the scene does not drift."""
 
     start: np.ndarray  # [v,4,4] viewmats before the fit
     viewmats: np.ndarray  # [v,4,4] float64; steps update it in place, and all sizes of the photos share it

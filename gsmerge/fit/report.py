@@ -63,7 +63,8 @@ def record_fit(report: FitReport) -> None:
 def report_steps(step: int, steps: int, psnr: float, half_part: float) -> None:
     """Report the progress of a fit after ``step`` of ``steps`` steps, with the PSNR (dB) of the last photos.
 
-    Progress is measured by time. The share ``half_part`` of the steps draws only samples of photos and takes less time.
+    Progress is measured by time. The first steps, which are the share ``half_part`` of all steps, draw only samples of
+    photos and take less time.
     """
     num_first = half_part * steps
     time, total_time = (count - (1 - SAMPLE_COST) * min(count, num_first) for count in (step, steps))

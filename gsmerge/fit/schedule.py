@@ -24,22 +24,23 @@ CLEARS = (0.6, 0.7, 0.8)  # shares of the steps after which a run that grows dro
 FEW_VIEWS = 5  # with no more views, a run of MANY_STEPS or more memorises the photos, unless it has a dropout
 MANY_STEPS = 150
 # Most of the first steps draw a sample of a photo's pixels, each time a different sample: every STRIDE-th pixel in both
-# directions. It costs as much as the photo at half size, and shows details that are lost at half size
+# directions. A sample costs as much as the photo at half size, and shows details that are lost at half size
 STRIDE = 2
 OFFSETS = ((0, 0), (1, 1), (1, 0), (0, 1))  # first column and first row of each sample, one sample after the other
 DROPOUT = 0.1  # share of the Gaussians that each step leaves out if there are at most FEW_VIEWS
-# The same share if there are more views, in runs of at least LONG_STEPS steps that draw each view LONG_ROUNDS times
+# Share of the Gaussians that each step leaves out if there are more than FEW_VIEWS views, in runs of at least
+# LONG_STEPS steps that draw each view LONG_ROUNDS times
 LONG_DROPOUT = 0.05
 LONG_ROUNDS = 30  # steps for each view
-# If there are larger photos, they are drawn by the steps LARGE_STEPS (counted from 0) of each LARGE_CYCLE steps. With
-# more such steps, renders at the size of the views would become worse
+# If there are photos larger than the views, the steps LARGE_STEPS (counted from 0) of each LARGE_CYCLE steps draw them.
+# If more steps drew larger photos, renders at the size of the views would become worse
 LARGE_CYCLE = 5
 LARGE_STEPS = (0, 2)
-# Draw modes, which the steps use one after the other. A mode has three parts: the size (0 full, 1 half), the variance
-# of the low-pass filter as a share of the variance in viewers, and whether small Gaussians are made fainter to offset
-# the low-pass, as some viewers do. From near by, the low-pass is smaller relative to the scene, and from afar it is
-# larger. Gaussians that are fitted to one mode alone look thin or fat in the other modes (Mip-Splatting, Yu et al.
-# 2024). The first steps decide the sizes of Gaussians, so they have several modes, too
+# The steps use the draw modes one after the other. A mode is the size (0 full, 1 half), the variance of the low-pass
+# filter as a share of the variance in viewers, and whether small Gaussians are made fainter to offset the low-pass, as
+# some viewers do. The low-pass of a viewer is smaller relative to the scene from near by, and larger from afar.
+# Gaussians that are fitted to one mode alone look thin or fat in the other modes (Mip-Splatting, Yu et al. 2024). The
+# first steps have several modes too, because these steps decide the sizes of Gaussians
 FIRST_MODES = (0, 1.0, False), (0, 0.25, False), (0, 1.0, False), (1, 1.0, False)
 DRAW_MODES = (
     (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
@@ -63,8 +64,8 @@ class FitJob:
     seed: int = 0
     progress: OnStep | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, true for Gaussians that must not change; None if all may
-    # If renders stand for photos, the result is scored on the first `num_scored` renders. If there are photos, this is
-    # None, and the result is scored on all photos
+    # If renders stand for photos, the result is scored on the first `num_scored` renders. If there are real photos,
+    # `num_scored` is None, and the result is scored on all photos
     num_scored: int | None = None
     held_out: Photos | None = None  # If given, the result is scored on these photos instead; no step draws them
     # Views from outside, in which some steps remove fog and veils; None for no such steps
@@ -97,12 +98,13 @@ class FitRun:
     # `HIDDEN_WEIGHT` on pixels that neither steps nor scores use; 1 elsewhere
     score_weights: list[np.ndarray]
     # [h,w] float32 weights of each photo at each size, for the steps: 0 on hidden pixels, and the importance of the
-    # pixel elsewhere. At half size, the weights on held-out patches are 0, too
+    # pixel elsewhere. The weights at half size are also 0 on held-out patches
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the steps that are the first steps, which draw a quarter of the pixels
     samples: bool = True  # True if most of the first steps draw samples of photos; otherwise all draw half-size photos
-    # [h,w] bool of each photo at full size: pixels that count in the first steps; None: those of later steps
+    # [h,w] bool of each photo at full size: the pixels that count in the first steps, or None if the same pixels
+    # count as in later steps
     first_pixels: tuple[np.ndarray, ...] | None = None
 
     def weight(self, step: Step) -> np.ndarray:
@@ -123,8 +125,8 @@ class FitRun:
         """Return how step ``step`` (from 1) draws the scene.
 
         The first steps draw samples of the photos, and later steps draw whole photos. Steps use the modes of different
-        viewers one after the other. If there are larger photos, some of the later steps draw these, which has the
-        effect of a viewer who moves closer.
+        viewers one after the other. If there are larger photos, some of the later steps draw the larger photos, which
+        has the effect of a viewer who moves closer.
         """
         photos, has_larger = self.job.photos, len(self.job.photos) > 2
         is_early = progress < self.half_part
@@ -136,7 +138,8 @@ class FitRun:
             return DrawMode(2, photos[2].eps2d)
         modes = FIRST_MODES if is_early else DRAW_MODES
         size, low_pass, antialiased = modes[step % len(modes)]
-        # In short runs, steps on half-size photos cost more than they gain. With larger photos, every third is enough
+        # In short runs, steps on half-size photos cost more than they gain. If there are larger photos, it is enough
+        # that every third step may draw at half size
         half_cycle = 3
         if not self.job.options.grows or (has_larger and step % half_cycle):
             size = 0
@@ -260,6 +263,7 @@ def first_decay(rates: Tuning, rounds: float) -> float:
     """Return the decay of Adam's first moment after a number of ``rounds`` over all views.
 
     The moment averages about two steps at first, and one step more after every four rounds, up to ``rates.beta1``.
-    Early gradients change quickly, so few are averaged. Later gradients differ most between views, so more are.
+    Early gradients change quickly, so few gradients are averaged. Later gradients differ most between views, so more
+    gradients are averaged.
     """
     return min(rates.beta1, 1 - 1 / (2 + rounds / 4))

@@ -86,7 +86,7 @@ def fit_gaussians(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
-    """Fit the Gaussians that some photo shows; return these Gaussians without the fit if most photos became worse."""
+    """Fit the Gaussians that some photo shows, or return them as they were if the fit made most photos worse."""
     run = prepare_fit(job)
     scored_photos = job.scored_photos(0) if job.held_out is None else job.held_out
     survey = survey_photos(gaussians, run)

@@ -1,7 +1,7 @@
 """Take the steps of a fit with few calls of the native library, in buffers that many steps share.
 
-Memory is allocated and arguments are checked once for many steps. The tests compare these steps bit by bit with the
-same steps taken by single calls of the kernels.
+Memory is allocated and arguments are checked once for many steps. Tests compare the steps of this module, bit by bit,
+with steps that are taken by single calls of the kernels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from gsmerge.raster.gradient import viewmat_gradient
 from gsmerge.raster.tiled_view import cache_line_rows, hides_most
 from gsmerge.runtime.threads import parallel_map
 
-# The native library reads a table of arrays by name. These names are those of a state's arrays, and of its splats'
+# The native library reads a table of arrays by name. OF_STATE are the names of a state's arrays, and OF_SPLATS those of
+# the arrays of its splats
 OF_STATE = ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors")
 OF_SPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 # Arrays whose values each step sets, and the lengths of these arrays

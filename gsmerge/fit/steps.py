@@ -107,13 +107,14 @@ class Optimiser:
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:
         """The limits of the parameters, as ``kernels.adam`` takes them, before and after Gaussians are added.
 
-        Before that, nothing limits how long Gaussians are relative to their width, because no new Gaussians could fill
-        the gaps beside shorter ones.
+        Before Gaussians are added, nothing limits how long a Gaussian is relative to its width, because no new
+        Gaussians could fill the gaps beside a shorter one.
         """
         rates = self.run.job.options.tuning
         moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
         width = max(photos.width for photos in self.run.job.photos)  # pixels
-        # Three standard deviations are at most a share of the width. The unit is the least scale, min_scale pixels
+        # Three standard deviations of a Gaussian are at most the share long_share of a photo's width. The limit of a
+        # scale is in units of the least scale, which is min_scale pixels
         max_length = rates.long_share * width / (3 * max(rates.min_scale, 1e-9))
         log_ratio, log_length = log(np.array([rates.max_ratio, max_length]))
         before = np.array([*moves, np.inf, log_length], np.float32)

@@ -35,7 +35,7 @@ class Survey:
     pixels: np.ndarray  # [n] float32 size of the finest pixel that shows the Gaussian, world units; inf if none does
 
     def visible(self, min_weight: float) -> np.ndarray:
-        """Return a mask ``[n]`` of the Gaussians with a peak of at least ``min_weight``, or outside of all frustums."""
+        """Return a mask ``[n]`` of Gaussians that weigh ``min_weight`` in some pixel or are outside of all frustums."""
         return ~self.inside | (self.peaks >= min_weight)
 
     def __getitem__(self, rows: np.ndarray) -> Survey:
@@ -76,7 +76,8 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
 def choose_photos(gaussians: Gaussians, photos: Photos) -> list[int]:
     """Return the indices of the photos for a survey: the scored photos, and others that show something new.
 
-    A photo shows something new if many of its Gaussians are inside fewer than ``ENOUGH_PHOTOS`` of those chosen so far.
+    A photo shows something new if many of its Gaussians are inside fewer than ``ENOUGH_PHOTOS`` of the photos chosen so
+    far.
     """
     sample_gaussians = 4096  # a sample of about this many Gaussians, at most twice as many, is projected
     means = gaussians.means[:: max(1, len(gaussians) // sample_gaussians)]

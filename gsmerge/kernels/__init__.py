@@ -7,6 +7,6 @@ different views (:mod:`gsmerge.runtime.threads`). Tests in ``tests/kernels`` com
 function.
 
 The sources are plain C11 with vectors of sixteen floats, without globals, allocations or libraries. The compiler may
-not reassociate sums, and fuses a product with a sum only where the source says so. So every processor and every number
-of threads gives the same bits.
+not reassociate sums, and fuses a product with a sum only where the source says so. For these reasons every processor
+and every number of threads gives the same bits.
 """

@@ -1,6 +1,6 @@
 """Build the native library of the kernels.
 
-``pip install`` runs this file, and so does ``python tasks.py native`` after a change. It runs before anything is
+``pip install`` runs this file, and so does ``python tasks.py native`` after a change. This file runs before anything is
 installed, so it needs only the standard library. The clang of the PyPI wheel ``ziglang`` builds every target.
 ``GSMERGE_CC`` names another compiler, whose rounding may differ.
 """
@@ -92,7 +92,7 @@ def source_files() -> list[Path]:
 
 
 def hash_sources() -> str:
-    """Return a hash of the names and contents of all sources, or an empty string if there are none."""
+    """Return a hash of the names and contents of all sources, or an empty string without sources."""
     digest, paths = hashlib.sha256(), source_files()
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())

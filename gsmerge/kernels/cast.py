@@ -6,7 +6,7 @@ There are these kinds.
 - QUAD is the rectangle z = 0.
 - BOX is a box.
 - ELLIPSOID is an ellipsoid.
-- CONE is a cylinder about y with closed ends. Its radius at +y is ``extra`` times that at -y.
+- CONE is a cylinder about y with closed ends. The radius of a CONE at +y is ``extra`` times its radius at -y.
 - LEAF is the part of z = 0 where ``|x| <= hx (1 - (y / hy)^2)``, with the half sizes hx and hy.
 - BLOB is an ellipsoid whose radius, in units of the half sizes, is 1 plus the sum of its four waves.
 

@@ -55,7 +55,7 @@ def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
 
     ``means`` and ``others`` are the points of all pixels of the two views. Two pixels show the same surface if the
     other view's point is ``valid``, and the logarithms of both depths differ by less than ``same``. Returns the
-    positions of such pixels in ``rows``, and the pixels of the other view.
+    positions in ``rows`` of the pixels whose surface the other view shows, and the pixels of the other view.
     """
     ids, pixels = np.empty((2, len(rows)), np.int64)
     count = _find_surfaces(means, rows, others, valid.view(np.uint8), viewmat, K, width, near, same, ids, pixels)

@@ -1,7 +1,7 @@
 """Compute elementary functions of arrays with the same bits on every processor, which NumPy's functions do not ensure.
 
-Results are exact up to two units of the last place. The functions take the same arguments as NumPy's. They return
-float32 for float32 arrays, and float64 for all others.
+Results are exact up to two units of the last place. The functions take the same arguments as NumPy's functions, and
+return float32 for float32 arrays and float64 for all others.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Binary(Protocol):
 def _make_function(name: str, doc: str, arguments: tuple[str, ...] = ("values",), narrow: bool = False) -> Any:
     """Return a function of arrays called ``name``, with the docstring ``doc``.
 
-    It flattens its arguments, and calls a function of the library: NAME_each for float64 results or, if ``narrow`` is
-    true, NAME_floats for float32 results.
+    The returned function flattens its arguments, and calls a function of the library: NAME_each for float64 results or,
+    if ``narrow`` is true, NAME_floats for float32 results.
     """
     of_doubles = declare(f"{name}_each", **{key: f8("n") for key in arguments}, out=f8("n", out=True))
     of_floats = None

@@ -122,7 +122,8 @@ def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False
 def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
     """Return the indices ``[4,new]`` of the four old pixels around each new pixel, and their weights ``[4,new]``.
 
-    A line of ``old`` pixels is enlarged to ``new`` pixels. At its ends, indices may be below 0 or above the last pixel.
+    A line of ``old`` pixels is enlarged to ``new`` pixels. At the ends of the line, indices may be below 0 or above the
+    last pixel.
     """
     centres = (np.arange(new) + 0.5) * (old / new) - 0.5  # centres of the new pixels, in old pixels
     floors, taps = np.floor(centres).astype(np.int64), np.arange(-1, 3)[:, None]
@@ -136,8 +137,8 @@ def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
 def turn_picture(picture: Picture, orientation: int) -> Picture:
     """Turn a stored picture ``[h,w,...]`` as its ``orientation`` from 0 to 7 says.
 
-    From 4 on, the picture is first mirrored left to right. Then it is rotated counterclockwise by ``orientation % 4``
-    quarter turns.
+    For an orientation of 4 or more, the picture is first mirrored left to right. Every picture is then rotated
+    counterclockwise by ``orientation % 4`` quarter turns.
     """
     return np.rot90(picture[:, ::-1] if is_mirrored(orientation) else picture, orientation % (ORIENTATIONS // 2))
 

@@ -33,8 +33,9 @@ _see_points = declare(
 def see_points(points, viewmats, Ks, depths, width, height, near, behind):
     """Return a mask ``[v,n]`` of ``points [n,3]`` inside the picture of each camera, and one of those that it sees.
 
-    A point is inside only if its depth is more than ``near``. It is seen if its depth is at most ``behind`` times the
-    depth of the surface there. ``depths [v,lines,columns]`` are these depths in a grid of cells over each picture.
+    A point is inside only if its depth is more than ``near``. A point inside is seen if its depth is at most ``behind``
+    times the depth of the surface at its projection. ``depths [v,lines,columns]`` are the depths of surfaces in a grid
+    of cells over each picture.
     """
     inside, seen = np.empty((2, len(viewmats), len(points)), bool)
     masks = inside.view(np.uint8), seen.view(np.uint8)
@@ -48,11 +49,11 @@ def see_points(points, viewmats, Ks, depths, width, height, near, behind):
     views=i4("v", out=True), width=i8(least=1), height=i8(least=1), mixed=i4(least=0, most=1),
 )  # fmt: skip
 def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, width, height, mixed):
-    """Choose a pixel for each point so that as many points as possible are in the order of their pixels.
+    """Choose pixels of points so that the order of as many points as possible is the order of their pixels.
 
     A point may project into several views. The chosen pixels are written to ``ids``, and -1 for points without a pixel.
-    Returns the number of points with a pixel. Pixels are ordered by view and then by line. If ``mixed`` is 1, they are
-    ordered by line and column, and then by view. The arrays from ``tails`` to ``views`` are scratch, of which
+    Returns the number of points with a pixel. Pixels are ordered by view and then by line. If ``mixed`` is 1, pixels
+    are ordered by line and column, and then by view. The arrays from ``tails`` to ``views`` are scratch, of which
     ``before`` has n·v values.
     """
 

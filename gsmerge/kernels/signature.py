@@ -113,7 +113,8 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
 
     Args:
         returns: Scalar that the C function returns, or None for no result. With STATUS, the Python function returns
-            nothing. With COUNT, it returns a count. Both raise ValueError for an index outside its array.
+            nothing, and with COUNT, it returns a count. With STATUS or COUNT, it raises ValueError for an index outside
+            its array.
         arguments: Declarations of the arguments in their order.
     """
 
@@ -186,7 +187,7 @@ class Table:
 
 
 class FilledTable:
-    """A struct that a :class:`Table` declares. It keeps its arrays in memory."""
+    """A struct that a :class:`Table` declares. The struct keeps its arrays in memory."""
 
     def __init__(self, table: Table, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
         """Check the arrays, and write their addresses and sizes to ``values``."""
@@ -198,7 +199,7 @@ class FilledTable:
             self[key] = size
 
     def point(self, key: str, array: np.ndarray[Any, Any]) -> None:
-        """Let the struct point to another array, or raise ValueError if its sizes differ from those before."""
+        """Let the struct point to another array, or raise ValueError if it has other sizes."""
         self[key] = _convert(self.table.name, key, self.table.arrays[key], array, self._sizes)
         self.arrays[key] = array
 

@@ -13,9 +13,9 @@ from gsmerge.kernels.signature import f4, i4, i8, native
 def convert_rows(rows, places, most_position, most_harmonic, most_log_scale, means, quats, scales, opacities, sh0, shN):
     """Convert rows with usual values, in blocks of 64 rows, and return the number of converted rows.
 
-    The first block with an unusual row ends the conversion, so that the caller can handle it. Later rows of the outputs
-    are undefined. A row is usual if its values are finite, its positions, harmonics and log scales are within the
-    limits, and its quaternion has a length between 1e-15 and 1e15. ``places`` are the columns of x, y, z, of the
-    harmonics in the order of ``sh0`` and ``shN``, of the log scales, of the quaternions wxyz, and of the opacity.
-    Opacities are copied.
+    The first block with an unusual row ends the conversion, so that the caller can handle it. The rows of the outputs
+    after the converted rows are undefined. A row is usual if its values are finite, its positions, harmonics and log
+    scales are within the limits, and its quaternion has a length between 1e-15 and 1e15. ``places`` are the columns of
+    x, y, z, of the harmonics in the order of ``sh0`` and ``shN``, of the log scales, of the quaternions wxyz, and of
+    the opacity. Opacities are copied.
     """

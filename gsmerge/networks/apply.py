@@ -45,7 +45,8 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, as_array, concat_columns, concat_rows, like
 
-# Fields that a merged Feature Gaussian can take from one of its parts. The other fields describe the whole cluster
+# Fields that a merged Feature Gaussian can take from one of its parts. All other fields describe the whole cluster of
+# parts
 OWN_COLUMNS = (*CORRECTED, "gains", "shN", "footprints")
 RunTable = Callable[[np.ndarray, int], Array]  # takes the groups and the width of a table, and returns [groups,columns]
 
@@ -77,7 +78,7 @@ class NetworkContext(Corrector):
         encoded = encode_features(features, self)
         if self.options.geometry != "carried":
             return encoded
-        # The head gives only scales and rotations. The mean is that of the encoder (paper section 4.2)
+        # The head for K = 1 gives only scales and rotations, and the encoder gives the mean (paper section 4.2)
         return replace(encoded, covars=self.decode_covars(encoded))
 
     def decode_covars(self, features: FeatureGaussians) -> Array:
@@ -92,7 +93,7 @@ class NetworkContext(Corrector):
         """Correct merged Feature Gaussians with the merger (paper section 4.4).
 
         Row i of ``pooled`` is a cluster of the rows ``order[cuts[i] : cuts[i + 1]]`` of the Feature Gaussians
-        ``parts``. In the paper the merger corrects the first of these rows instead of the pooled Feature Gaussian.
+        ``parts``. In the paper the merger corrects the first row of a cluster instead of the pooled Feature Gaussian.
         """
         options = self.options
         if not options.merger:
@@ -164,7 +165,7 @@ class NetworkContext(Corrector):
     ) -> Array:
         """Return tokens ``[m,c]`` that describe the Gaussians ``ids [m]`` of ``parts`` relative to their groups.
 
-        ``owners [m]`` are the groups. Members have more columns than other Gaussians.
+        ``owners [m]`` are the groups. Tokens of members have more columns than tokens of other Gaussians.
         """
         return part_tokens(
             parts, ids, owners, group_features, MEMBER_COLUMNS if isinstance(parts, Members) else PART_COLUMNS
@@ -237,11 +238,11 @@ def _apply_outputs(group_features: GroupFeatures, outputs: Array, context: Netwo
 def decode_gaussians(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Gaussians:
-    """Correct the children of each Feature Gaussian with the decoder head for their number (paper section 4.3).
+    """Correct the children of each Feature Gaussian with the head for that number of children (paper section 4.3).
 
     The children of a Feature Gaussian are adjacent. ``parents [n]`` are the rows of the Feature Gaussians in
-    ``group_features``, ascending. Three children use the head for four. Five to eight children are corrected in two
-    halves, as if each half were a group of its own. Heads with absolute outputs cannot do this.
+    ``group_features``, ascending. Groups of three children use the head for four children. Five to eight children are
+    corrected in two halves, as if each half were a group of its own. Heads with absolute outputs cannot correct halves.
     """
     children = prepare_children(children, parents, group_features, context.options)
     residuals = as_array(run_heads(contiguous(children), parents, group_features, context))
@@ -254,7 +255,7 @@ def prepare_children(
     """Return the Gaussians that the heads correct: the children or, for absolute outputs, as many round Gaussians.
 
     A round Gaussian has the mean, the base colour and the size of its group, the axes of the group's frame, and an
-    opacity of 0.5. The outputs of the head are offsets from these numbers (paper section 4.3).
+    opacity of 0.5. The head puts out offsets from the parameters of round Gaussians (paper section 4.3).
     """
     if not options.makes_children:
         return children
@@ -324,7 +325,7 @@ def _run_head(
     slots, latents = mask.shape[1], group_features.features.latents
 
     def run_table(rows: np.ndarray, _: int) -> Any:
-        """Run the head on the runs ``rows``."""
+        """Run the head on the runs of children with the numbers ``rows``."""
         owners = parents[rows]
         tokens = context.make_tokens(children, ids[rows].reshape(-1), np.repeat(owners, slots), group_features)
         table = tokens.reshape(len(rows), slots, PART_COLUMNS)

@@ -57,8 +57,8 @@ def move_features(
     """Apply corrections ``residuals [g,14]`` to Feature Gaussians.
 
     ``base`` are the Gaussians with their moments. ``frames [g,3,3]`` have the axes of each group as columns, in the
-    world. ``LOGIT_COLUMN`` is added to the logarithms of both the integrated optical depth and the mass,
-    ``MASS_COLUMN`` only to that of the mass. A change of scales does not change the opacity.
+    world. ``LOGIT_COLUMN`` is added to the logarithms of both the integrated optical depth and the mass, and
+    ``MASS_COLUMN`` only to the logarithm of the mass. A change of scales does not change the opacity.
     """
     names = ("means", "covars", "masses", "extinctions", "sh0")
     columns = {name: np.array(getattr(features, name), np.float32, order="C") for name in names}

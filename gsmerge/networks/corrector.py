@@ -28,8 +28,8 @@ class Corrector:
     ) -> FeatureGaussians:
         """Return merged Feature Gaussians with corrections.
 
-        Each row of ``pooled`` is a cluster of rows of ``parts``. These rows are a run of ``order``, and ``cuts`` are
-        the starts of these runs.
+        Each row of ``pooled`` is a cluster of rows of ``parts``. The rows of a cluster are adjacent in ``order``, and
+        ``cuts`` are the positions in ``order`` at which clusters begin.
         """
         return pooled
 

@@ -32,9 +32,9 @@ def cross_view_stats(
     with the ``most`` views nearest to its own view, by default with all others.
 
     Returns statistics ``[g,7]`` float32, scaled to about 1. Column 0 is the logarithm of the number of views that see
-    the point. Columns 1 to 3 are the shares of these views that have a surface at the point, behind it, and in front of
-    it. Columns 4 and 5 are the mean differences of colours and of relative depths, and column 6 is the logarithm of the
-    number of all views.
+    the point. Columns 1 to 3 are the shares, among the views that see the point, of those that have a surface at the
+    point, behind it, and in front of it. Columns 4 and 5 are the mean differences of colours and of relative depths,
+    and column 6 is the logarithm of the number of all views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, -1] = math.log(len(cameras)) / 4
@@ -67,8 +67,8 @@ def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> 
 
     The finite points ``means [g,3]`` float64 belong to ``views [g]``. A view below 0 differs from all others. Rows with
     fewer than ``count`` points end with -1. The search for a point ends after ``MAX_COMPARED`` times ``count``
-    comparisons, at least 1,024. Most of the compared points are of its own view, and Gaussians farther away do not
-    overlap. The paper matches such neighbours in section 4.4.
+    comparisons, at least 1,024. The search is limited because most compared points are of the point's own view, and
+    Gaussians farther away do not overlap. The paper matches neighbours of other views in section 4.4.
     """
     num = len(means)
     neighbors, means = np.empty((num, count), np.int64), np.ascontiguousarray(means)

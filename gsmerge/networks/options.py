@@ -25,7 +25,10 @@ PAPER_NUMBERS = (4, 8, 9, 10)  # mass and base colour, which are the numbers of 
 
 @dataclass(frozen=True)
 class Bounds(Settings):
-    """Largest corrections by the decoder. Encoder, merger and refiner may each correct by half as much."""
+    """Largest corrections by the decoder.
+
+    The encoder, the merger and the refiner may each correct by half as much as the decoder.
+    """
 
     mean: float = setting(1.0, "Shift along each axis of the group's frame, in units of the Gaussian's size.", least=0,
         most=8)  # fmt: skip
@@ -75,7 +78,7 @@ class NetworkOptions(Settings):
     def reads_children(self) -> bool:
         """True if heads read the Gaussians that they correct.
 
-        With absolute outputs, these Gaussians tell only the group's size.
+        If outputs are absolute, the Gaussians that heads read tell only the group's size.
         """
         return self.group_numbers or not self.makes_children
 

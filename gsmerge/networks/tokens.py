@@ -1,8 +1,8 @@
 """Compute the inputs of the networks, which are numbers without a unit in the frame of each group.
 
 The axes of a frame point right and down in the picture of the group's view, and along the ray from the camera to the
-group. Lengths are in units of the Feature Gaussian's size or of the footprint of one pixel. So the inputs do not depend
-on depth, focal length, resolution or the scale of the world.
+group. Lengths are in units of the Feature Gaussian's size or of the footprint of one pixel. With these frames and
+units, inputs do not depend on depth, focal length, resolution or the scale of the world.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
 def choose_token_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
     """Return the view ``[g]`` int64 in which the frame of each Feature Gaussian is defined.
 
-    A Feature Gaussian has the view that it was made from. If it was merged across views, it gets the view of most of
-    its members, which are weighted by their opacities.
+    A Feature Gaussian has the view that it was made from. A Feature Gaussian that was merged across views gets the view
+    of most of its members, which are weighted by their opacities.
     """
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)
@@ -127,8 +127,8 @@ def part_tokens(
 def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray, int]]:
     """Split groups of ``sizes [g]`` into tables, and yield the groups and the width of each table.
 
-    A table has groups of similar size. Its width is a power of two, at most ``max_width``. Groups with more members
-    have to be sampled. The split depends only on the sizes.
+    A table has groups of similar size. The width of a table is a power of two, at most ``max_width``. Groups with more
+    members have to be sampled. How groups are split into tables depends only on their sizes.
     """
     bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # exponents of the next powers of two
     widths = np.minimum(1 << bits, max_width)
@@ -158,7 +158,7 @@ def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.nd
     uint64 choose a random member of each run, so that the sample covers the group (paper supplement, encoder compute).
 
     Returns positions ``[g,width]`` in ``keys``, and a mask ``[g,width]`` that is false where a group has too few
-    members. The positions there repeat the first one of the group.
+    members. Where the mask is false, the position is that of the group's first member.
     """
     offsets = np.cumsum(sizes) - sizes
     order = np.lexsort((keys, np.repeat(np.arange(len(sizes)), sizes)))

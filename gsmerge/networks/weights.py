@@ -1,8 +1,8 @@
 """Run the forward pass of the networks on arrays with the native library.
 
 The arithmetic is that of the torch modules for training, :mod:`gsmerge.research.training.modules`, up to rounding.
-Every group is computed by itself. So its results depend neither on the other groups of a table nor on the number of
-threads.
+Every group is computed by itself, so the results for a group depend neither on the other groups of a table nor on the
+number of threads.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class NetworkWeights:
         """Run ``"encoder"``, ``"merger"``, ``"refiner"`` or ``"heads.K"`` on a table of b groups.
 
         The inputs are those of the torch module of the same name. Returns the outputs of this network after tanh in one
-        array ``[b,columns]``, with 0 in place of NaN. A head has ``K * 13`` columns.
+        array ``[b,columns]``, with 0 in place of NaN. The outputs of a head have ``K * 13`` columns, 13 for each child.
         """
         if name.startswith("heads."):
             return self._run_head(name, *inputs)
@@ -89,7 +89,10 @@ class NetworkWeights:
         return np.concatenate([self._dense(f"{name}.{out}", hidden, TANH) for out in outs], 1)
 
     def _run_refiner(self, tokens: np.ndarray, mask: np.ndarray, group: np.ndarray) -> np.ndarray:
-        """Run the refiner. The first token of each group describes the group itself, the others its neighbours."""
+        """Run the refiner.
+
+        The first token of each group describes the group itself, and its other tokens describe neighbours.
+        """
         x = self._mlp("refiner.embed", tokens)
         last = self.options.refine_blocks - 1
         for i in range(last + 1):

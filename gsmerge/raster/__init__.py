@@ -3,9 +3,9 @@
 :func:`render` makes images. :func:`render_in_batches` makes more images than fit into memory. Stages that need more
 than images work on one view at a time: :func:`tile_view` projects, sorts and bins the Gaussians once, and
 :func:`composite`, :func:`splat_adjoint` and :func:`contributions` then use the same tile lists with the same blending
-weights. The conventions are those of gsplat. The dilation is 0.3 square pixels. Alpha is clamped at 0.99, and
-contributions below 1/255 are cut. Blending of a pixel stops before its transmittance would reach 1e-4. Pixel centres
-are at +0.5.
+weights. Cameras, Gaussians and images follow the conventions of gsplat. The dilation is 0.3 square pixels. Alpha is
+clamped at 0.99, and contributions below 1/255 are cut. Blending of a pixel stops before its transmittance would reach
+1e-4. Pixel centres are at +0.5.
 
 :func:`render` can be differentiated. The fit takes gradients from :mod:`gsmerge.raster.gradient`.
 

@@ -83,8 +83,9 @@ def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLi
 def splat_adjoint(tiled: TiledView, image: Array) -> Array:
     """Return, for each Gaussian, the sum ``[n,c]`` float32 of its blending weights times ``image [h,w,c]``.
 
-    This map is the transpose of :func:`composite` (without background), which maps colours linearly to images. Four
-    channels cost little more than one. Raises ValueError unless the image has the size of the view.
+    This map is the transpose of :func:`composite` (without background), which maps colours linearly to images. An image
+    of four channels costs little more time than an image of one channel. Raises ValueError unless the image has the
+    size of the view.
     """
     if image.ndim != 3 or image.shape[:2] != (tiled.height, tiled.width):
         raise ValueError(f"image: expected shape {[tiled.height, tiled.width, 'c']}, got {list(image.shape)}")
@@ -165,8 +166,8 @@ class Rendering(ArrayFields):
 def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
     """Return the Gaussians as splats, and the viewmats and the intrinsics of the cameras in float64.
 
-    The origin of the splats is the cameras' mean centre. It is subtracted in float64, so that scenes in geographic
-    coordinates keep their detail.
+    The origin of the splats is the cameras' mean centre. The origin is subtracted in float64, so that scenes in
+    geographic coordinates keep their detail.
     """
     cameras = cameras.numpy()
     origin = cameras.centres.astype(np.float64).mean(0) if len(cameras) else np.zeros(3)

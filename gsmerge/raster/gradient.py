@@ -18,7 +18,7 @@ from gsmerge.raster.tiled_view import Array, TiledView, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 # Least number of intersections or Gaussians per thread. The forward pass has a higher number, because it takes less
-# time for each of them
+# time for each intersection or Gaussian than the backward pass
 MIN_PER_THREAD = 1 << 12
 
 
@@ -71,9 +71,10 @@ def gradients_of(
 
     All arrays are float32 and contiguous. ``colors [m,3]`` are the colours of the view's Gaussians. ``image [h,w,3]``,
     with its background, and ``transmittance [h,w]`` are the results of ``composite``. ``grad_image [h,w,3]`` and
-    ``grad_left [h,w]`` are the gradients of the loss with respect to the image and the transmittance. Without
-    ``grad_left``, the latter is zero. ``with_viewmat`` also asks for the gradient of the view matrix. The gradient of
-    alpha is zero where alpha is clamped at 0.99. Thresholds that decide whether a Gaussian is drawn have no gradient.
+    ``grad_left [h,w]`` are the gradients of the loss with respect to the image and the transmittance. If ``grad_left``
+    is None, the gradient with respect to the transmittance is zero. ``with_viewmat`` also asks for the gradient of the
+    view matrix. The gradient of alpha is zero where alpha is clamped at 0.99. Thresholds that decide whether a Gaussian
+    is drawn have no gradient.
     """
     m, splats = len(tiled.ids), tiled.splats
     slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
@@ -120,8 +121,8 @@ def color_gradients(
     """Return the gradients of a loss through the spherical harmonics of the Gaussians of a view.
 
     ``grad_colors [m,3]`` are :attr:`Gradients.colors`. No gradient passes where ``colors [m,3]``, which are float32,
-    are clipped at 0. ``used`` is an earlier result that is no longer needed. Its memory is reused if it has the same
-    number of coefficients and enough rows, since new memory costs a quarter of the time or more.
+    are clipped at 0. ``used`` is an earlier result that is no longer needed. The memory of ``used`` is reused if it has
+    the same number of coefficients and enough rows, since new memory costs a quarter of the time or more.
     """
     m, splats = len(tiled.ids), tiled.splats
     shape_N = splats.shN.shape[1:]
@@ -147,8 +148,8 @@ def pose_gradient(tiled: TiledView, gradients: Gradients, color_grads: ColorGrad
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
     if color_grads is not None:
-        # The eye is -R^T t. Only the position of the eye relative to the means counts, so its gradient is minus the sum
-        # of the gradients of all means
+        # The eye is -R^T t. Only the position of the eye relative to the means counts, so the gradient of the eye is
+        # minus the sum of the gradients of all means
         eye = -color_grads.means.sum(0, dtype=np.float64)
         viewmat[:3, :3] -= np.outer(tiled.viewmat[:3, 3], eye)
         viewmat[:3, 3] -= matmul(tiled.viewmat[:3, :3], eye)

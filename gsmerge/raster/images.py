@@ -103,7 +103,7 @@ def render_in_batches(
 
     At most ``at_once`` images are in memory. Large images are drawn and converted in bands, so ``convert`` has to work
     pixel by pixel. ``columns`` has, for each image, the first column of pixels to draw and the column after the last.
-    Tiles outside these columns may show the background only.
+    Tiles outside the columns to draw may show the background only.
     """
     background_rgb = background_color(background)
     tile_one = _make_tiler(gaussians, cameras, {"near": near}, columns)

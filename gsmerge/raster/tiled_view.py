@@ -67,7 +67,7 @@ class TiledView:
 
     @property
     def lists(self) -> tuple[Array, Array, Array, int]:
-        """First arguments of the kernels that read the lists of tiles: arrays, and the number of tiles per row."""
+        """Arrays and the number of tiles per row, the first arguments of kernels that read the lists of tiles."""
         return self.conics, self.flatten_ids, self.isect_offsets, -(-self.width // projection.TILE)
 
 
@@ -99,8 +99,8 @@ def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats
     """Convert Gaussians to float32 splats for the kernels, without a copy of arrays of the right type and layout.
 
     Means may be float64, for scenes in geographic coordinates. ``origin [3]`` is the world point that becomes the zero
-    of the splats. By default it is the world's zero, or the centre of the means if it is many times as far from zero as
-    the means are spread.
+    of the splats. By default the origin is the world's zero, or the centre of the means if this centre is much farther
+    from zero than the means are from the centre.
     """
     gaussians = gaussians.numpy()
     zero = _choose_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
@@ -132,7 +132,7 @@ def camera_numbers(
     viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool,
     near: float = WORLD_NEAR_PLANE, far: float = FAR_PLANE,
 ) -> Array:  # fmt: skip
-    """Return a camera as the float32 numbers that the kernels read, in their order."""
+    """Return a camera as an array of float32 numbers, in the order in which the kernels read them."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     spare_x, spare_y = SPARE_SHARE * width / fx, SPARE_SHARE * height / fy
     camera = np.zeros(projection.CAMERA, np.float32)
@@ -164,7 +164,7 @@ def _find_visible(
     """Return the ascending ids of the Gaussians that may touch the image or, with ``corner_sums``, its chosen tiles."""
 
     def cull(span: tuple[int, int]) -> Array:
-        """Return the ids of such Gaussians from a range of rows."""
+        """Return the ids of the Gaussians in a range of rows that may touch the image or its chosen tiles."""
         rows, ids = slice(*span), np.empty(span[1] - span[0], np.int32)
         keep_rows = None if keep is None else keep[rows]
         count = projection.cull(
@@ -220,7 +220,7 @@ def _list_by_tile(order: Array, boxes: Array, conics: Array, wanted: Array, thre
         return _list_open_tiles(order, boxes, conics, wanted.shape[0], wanted.shape[1], threads)
     totals, is_wanted = counts.sum(0), wanted.reshape(-1)
     isect_offsets = np.concatenate([[0], np.cumsum(totals * is_wanted)])
-    # The lists of tiles that are not wanted are written behind the others, and then cut off
+    # The lists of unwanted tiles are written behind the lists of wanted tiles, and then cut off
     ends = np.where(is_wanted, isect_offsets[1:], isect_offsets[-1] + np.cumsum(totals * ~is_wanted))
     cursors = ends - totals + np.cumsum(counts, 0) - counts
     flatten_ids = np.empty(totals.sum(), np.int32)
@@ -305,8 +305,9 @@ def tile_view(
     the Gaussians. Gaussians with a False ``keep [n]`` are left out.
 
     Tiles have 16 x 16 pixels. Only tiles with a True ``tiles [tile_height,tile_width]`` have to be complete. ``band``
-    is the first line of tiles to draw and the line after the last. The result is a view of these lines alone.
-    ``columns`` is the first column of tiles and the column after the last. All other tiles are empty.
+    is the first line of tiles to draw and the line after the last. If ``band`` is given, the result is a view of the
+    lines in the band alone. ``columns`` is the first column of tiles and the column after the last. Tiles outside of
+    ``band`` and ``columns`` are empty.
 
     The size of the result depends on the number of visible Gaussians, not on n. Raises ValueError if a size or a number
     is out of range.

@@ -1,7 +1,7 @@
 """Store the blending weights of a view as a sparse matrix, for stages that render one geometry many times.
 
-The image is W times the colours. W has one row per pixel and one column per Gaussian. A row has some twenty entries, so
-a product takes much less time than blending along the tile lists.
+The matrix is called W, and an image is W times the colours of the Gaussians. W has one row per pixel and one column per
+Gaussian. A row has some twenty entries, so a product takes much less time than blending along the tile lists.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Me
 
     A Gaussian belongs to the superpixel of its pixel. If views have no Gaussians of their own, ``by_contribution``
     assigns each Gaussian to the superpixel, of any view, in which the sum of its blending weights is largest (paper,
-    supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure these sums. Raises
-    UsageError if no view sees any Gaussian.
+    supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure the sums of blending
+    weights. Raises UsageError if no view sees any Gaussian.
     """
     members = scene_members(scene)
     if by_contribution and not scene.has_own_pixels:

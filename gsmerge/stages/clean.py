@@ -17,9 +17,9 @@ from gsmerge.types import Cameras, Gaussians
 
 BOX_QUANTILES = (1, 99)  # the scene's box reaches from the first to the second percentile of positions on each axis
 FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of this many nearest Gaussians
-# A fit may leave Gaussians that hang across the scene like curtains. Their second largest scale exceeds CURTAIN[0]
-# times half the diagonal of the scene's box, or their largest scale exceeds CURTAIN[1] times this. The scale is also
-# more than CURTAIN_FACTOR times the median of all Gaussians
+# A fit may leave Gaussians that hang across the scene like curtains. The second largest scale of such a curtain exceeds
+# the share CURTAIN[0] of half the diagonal of the scene's box, or its largest scale exceeds the share CURTAIN[1] of
+# half the diagonal. The scale that is too large also exceeds CURTAIN_FACTOR times its median over all Gaussians
 CURTAIN, CURTAIN_FACTOR = (0.1, 0.33), 8.0
 FLOATER_GAUSSIANS = 200_000  # the share of floaters is estimated from at most about this many Gaussians
 
@@ -83,7 +83,7 @@ def _sorted_scales(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
     """Return a mask ``[m]`` of the Gaussians among ``rows [m]`` that hang across the scene like curtains.
 
-    Their second largest or their largest scale is too large for the scene, see ``CURTAIN``.
+    The second largest or the largest scale of a curtain is too large for the scene, see ``CURTAIN``.
     """
     low, high = np.percentile(gaussians.means.astype(np.float64), BOX_QUANTILES, axis=0)
     radius = np.sqrt(((high - low) ** 2).sum()) / 2

@@ -32,10 +32,11 @@ def decode(
     """Decode each Feature Gaussian into K Gaussians, which are its children.
 
     The members are halved repeatedly across their widest direction in colour and position, and each part becomes a
-    child. So the children for K = 2 are unions of those for K = 4. Members with the same position and colour cannot be
-    halved, so their group has fewer children. Networks with absolute outputs do not halve, but make exactly K children
-    of every group. ``counts [g]`` has a K of at least 1 for each group. Without it, K is ``options.max_k``. The
-    children of a group are adjacent. Children that are fainter than ``options.min_opacity`` are left out.
+    child. Because of this halving, the children for K = 2 are unions of the children for K = 4. Members with the same
+    position and colour cannot be halved, so their group has fewer children. Networks with absolute outputs do not
+    halve, but make exactly K children of every group. ``counts [g]`` has a K of at least 1 for each group. Without
+    ``counts``, K is ``options.max_k``. The children of a group are adjacent. Children that are fainter than
+    ``options.min_opacity`` are left out.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)
@@ -59,8 +60,8 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOptions, *, grows: bool) -> Decoded:
     """Decode merged views into the Gaussians that a fit starts from.
 
-    If an exact number was requested, this number is made, unless the fit ``grows`` to it later. Otherwise each group
-    gets K Gaussians.
+    If an exact number was requested, this number is made, unless the fit ``grows`` to it later. If no exact number was
+    requested, each group gets K Gaussians.
     """
     count, exact = merged.segmentation.count, merged.segmentation.exact
     if exact and not grows:
@@ -129,7 +130,8 @@ def mixed_counts(
     """Choose K for every group, 1 to 4, by the rule of the options (paper supplement, per-superpixel K).
 
     ``saliency`` has a number for every pixel of all views. One rule ranks groups by their saliency. The rule
-    "distortion" makes as many Gaussians in all, but more of them where they lower distortion most.
+    "distortion" makes as many Gaussians in all as the rule by saliency, but more of them where they lower distortion
+    most.
     """
     counts = counts_by_saliency(group_saliency(features, members, saliency), options)
     if options.k_rule == "distortion":
@@ -154,9 +156,10 @@ def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarr
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
     """Return the number of Gaussians to decode merged views into, or None for K of each Feature Gaussian.
 
-    If an exact number was requested and no fit grows to it, this number is returned. Otherwise it is K for each group
-    and for each superpixel without members, whose Gaussians other groups get. A superpixel has no members if its
-    Gaussians belong to a nearer view. Heads that make exactly K Gaussians of every group cannot give one group more.
+    If an exact number was requested and no fit grows to it, this number is returned. In all other cases the number is K
+    for each group and for each superpixel without members, whose Gaussians other groups get. A superpixel has no
+    members if its Gaussians belong to a nearer view. Heads that make exactly K Gaussians of every group cannot give one
+    group more.
     """
     segmentation, num_empty = merged.segmentation, len(merged.segmentation.groups) - merged.num_groups
     if segmentation.exact and not grows:
@@ -200,8 +203,8 @@ def halve_groups(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Divide the members of some ``groups`` into at most ``counts [g]`` children each, by repeated halving.
 
-    Returns the start ``[n+1]`` of each child in a list of members, this list ``[m]`` of rows of ``members``, and the
-    group ``[n]`` of each child.
+    Returns the start ``[n+1]`` of each child in a list of members, the list itself, which has rows ``[m]`` of
+    ``members``, and the group ``[n]`` of each child.
     """
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
@@ -221,11 +224,12 @@ def halve_groups(
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
-    """Return the number of children ``[g]`` of each group, if there are ``extra`` more children than groups.
+    """Return the number of children ``[g]`` of each group, if there are ``extra`` children more than groups.
 
     Each group has at least one child. Further children go to groups in which they lower distortion most, as far as the
     members suffice. If a child lowers distortion only together with the next child, both count with their mean gain,
-    which is a slope of the convex hull of the group's distortion. So no group loses a child if ``extra`` grows.
+    which is a slope of the convex hull of the group's distortion. As gains fall along a convex hull, no group loses a
+    child if ``extra`` grows.
     """
     if extra < 0:
         raise ValueError(f"extra: expected at least 0, got {extra}")
@@ -252,7 +256,7 @@ def deal_order(features: FeatureGaussians, members: Members, max_children: int =
 def _child_errors(features: FeatureGaussians, members: Members, max_children: int) -> np.ndarray:
     """Return the distortion ``[g,max_children]`` of each group with 1, 2 and more children.
 
-    It is NaN for more children than there are members.
+    The distortion is NaN for more children than the group has members.
     """
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
@@ -274,12 +278,12 @@ def _child_errors(features: FeatureGaussians, members: Members, max_children: in
 def hull_gains(errors: np.ndarray) -> np.ndarray:
     """Return how much each further child of a group lowers its error, ``[g,c-1]``.
 
-    ``errors [g,c]`` are those with 1, 2 and more children. The gains are slopes of the lower convex hull of the errors,
-    so they fall from child to child. The gain of a child that cannot exist is -inf.
+    ``errors [g,c]`` are the errors of g groups with 1, 2 and more children. The gains are slopes of the lower convex
+    hull of the errors, so they fall from child to child. The gain of a child that cannot exist is -inf.
     """
     num_groups, num_children = errors.shape
     gains = np.full((num_groups, num_children - 1), -np.inf)
-    # `corner` is the position in the errors of the last corner of each group's hull so far
+    # `corner` is, for each group, the position in its errors of the last corner of its convex hull so far
     corner, rows = np.zeros(num_groups, int), np.arange(num_groups)
     for _ in range(num_children - 1):
         steps = np.arange(num_children)[None] - corner[:, None]

@@ -22,15 +22,15 @@ from gsmerge.values.arrays import to_float32
 if TYPE_CHECKING:
     from gsmerge.networks.weights import RunnableNetworks
 
-# A group is contradicted if more views see through it than have a surface at its position. If no other view has a
-# surface there, its optical depth is multiplied by ALONE, otherwise by DISPUTED
+# A group is contradicted if more views see through it than have a surface at its position. The optical depth of a
+# contradicted group is multiplied by ALONE if no other view has a surface at its position, and by DISPUTED if one has
 ALONE, DISPUTED = 0.15, 0.39
 
 
 def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
     """Return an object that corrects the results of the stages by networks, which read the scene.
 
-    Without networks it is ``ANALYTIC``, which changes nothing.
+    Without networks the object is ``ANALYTIC``, which changes nothing.
     """
     if networks is None:
         return ANALYTIC
@@ -55,7 +55,8 @@ def correct(
 ) -> FeatureGaussians:
     """Correct pooled Feature Gaussians with the encoder of the networks, which also adds latents.
 
-    ``weaken`` makes groups fainter if other views see through them. This makes holes, which a long fit closes.
+    ``weaken`` makes groups fainter if other views see through them. Fainter groups leave holes, which a long fit
+    closes.
     """
     return networks.encode(weaken_contradicted(features, members, cameras) if weaken else features)
 
@@ -63,8 +64,8 @@ def correct(
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """List the members of all superpixels that are not empty.
 
-    Returns the start ``[g+1]`` of each superpixel in a list of members, this list ``[m]`` int32 of rows of ``members``,
-    and the view ``[g]`` of each superpixel.
+    Returns the start ``[g+1]`` of each superpixel in a list of members, the list itself, which has int32 rows ``[m]``
+    of ``members``, and the view ``[g]`` of each superpixel.
     """
     counts = np.asarray(groups.counts)
     offsets, flat = np.cumsum(counts) - counts, groups.labels.reshape(-1)
@@ -100,7 +101,10 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 
 
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
-    """Lower the gain, and so the optical depth, of groups that more views see through than have a surface there."""
+    """Lower the gain, and with it the optical depth, of groups that other views contradict.
+
+    A group is contradicted if more views see through it than have a surface at its position.
+    """
     f = features
     nearest_views = 64  # each group is compared with this many nearest views; more hardly change the result
     _, same_share, behind_share, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, nearest_views).T

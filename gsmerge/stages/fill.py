@@ -1,8 +1,8 @@
 """Fitted Gaussians -> filled Gaussians: fill the gaps that cameras between or just beside the views would show.
 
-New views uncover places that no photo shows. So the result of a fit is drawn from cameras between the views and just
-beside them. Gaps in these pictures are filled with new Gaussians, which continue the farthest surface beside the gap,
-at depths that no view contradicts.
+New views uncover places that no photo shows. To find such places, the result of a fit is drawn from cameras between the
+views and just beside them. Gaps in the drawn pictures are filled with new Gaussians, which continue the farthest
+surface beside the gap, at depths that no view contradicts.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FILL_MARGIN = 0.05  # margin that is added to each side of a drawing, as a share
 # Gaps have a transmittance above the first number, and surfaces have a transmittance below the second one
 GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05
 # A surface is not continued if its depth is less than NEARER_SHARE times the largest depth in a window around the
-# pixel. From the pixel, the window reaches WINDOW_SHARE of the picture's width to each side
+# pixel. The window reaches from the pixel to each side by the share WINDOW_SHARE of the picture's width
 WINDOW_SHARE, NEARER_SHARE = 0.08, 0.85
 MOST_FILLED_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
 DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # depths that are tried for a new Gaussian, in depths of the surface
@@ -50,16 +50,17 @@ def fill_between(
 
     There are at most ``most`` new Gaussians, and at most ``FILLED_SHARE`` times the number of ``fitted`` ones. Gaps
     that cameras half-way between two views show are filled first. The new Gaussians are at positions where neither a
-    photo nor a view from ``outside`` would show them. Each is in the field of view of some photo, unless ``beyond`` is
-    true. Scenes of more than ``MOST_FILLED_VIEWS`` views get none, because their photos show nearly everything between
-    them.
+    photo nor a view from ``outside`` would show them. Each new Gaussian is in the field of view of some photo, unless
+    ``beyond`` is true. Scenes of more than ``MOST_FILLED_VIEWS`` views get no new Gaussians, because their photos show
+    nearly everything between the cameras.
     """
     added, max_count = fitted[:0], min(most, int(FILLED_SHARE * len(fitted)))
     if max_count == 0 or not 1 < len(cameras) <= MOST_FILLED_VIEWS:
         return added
     cameras = _small_cameras(cameras)
-    # Distance of a camera just beside a view, as a share of the distance to the nearest view. It is negative, because
-    # the camera is on the other side. Chosen on seven training captures
+    # Distance of a camera just beside a view, as a share of the distance to the nearest view. The distance is negative,
+    # because the camera is on the side of the view that is away from the nearest view. Chosen on seven training
+    # captures
     beside = -0.1
     between, splats = _widen(between_cameras(cameras, beside)), make_splats(fitted)
     if len(between) == 0:  # all views look in different directions
@@ -172,9 +173,10 @@ def _continue_surfaces(
 ) -> Gaussians:
     """Fill the gaps in a camera's ``drawing`` with Gaussians that continue the farthest surface beside each gap.
 
-    Depths of ``DEPTH_FACTORS`` times the surface's depth are tried for each Gaussian. It gets the first depth that no
-    view contradicts, and is left out if there is none. ``seen`` has what the photos' cameras see, and what the cameras
-    between them see. If ``beyond`` is true, Gaussians may be outside of the field of view of all photos.
+    Depths of ``DEPTH_FACTORS`` times the surface's depth are tried for each Gaussian. A Gaussian gets the first of
+    these depths that no view contradicts, and is left out if views contradict all. ``seen`` has what the photos'
+    cameras see, and what the cameras between them see. If ``beyond`` is true, Gaussians may be outside of the field of
+    view of all photos.
     """
     gaps, surface_depths, colors = _spread_into_gaps(drawing, round(WINDOW_SHARE * camera.width), beyond=beyond)
     eye, rays = camera.centres[0], _rays(gaps, camera)

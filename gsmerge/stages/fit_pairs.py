@@ -16,8 +16,9 @@ from gsmerge.stages.pair_merge import POWERS, merge_neighbors
 from gsmerge.types import Decoded
 
 SHORT = 60  # steps of the short fits that decide between two starts
-# Step sizes of a fit to renders, as a share of the usual ones, if all Gaussians stay. They are small, because the start
-# is close to the renders. If only a share of the Gaussians stays, step sizes are divided by the root of this share
+# Step sizes of a fit to renders, as a share of the usual ones, if all Gaussians stay. The steps are small, because the
+# start is close to the renders. If only a share of the Gaussians stays, step sizes are divided by the root of this
+# share
 RENDERS_STEP = 0.09
 
 
@@ -50,8 +51,8 @@ def merge_scene(count: int, power: float, prepared: Prepared) -> Decoded:
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
     """Fit Gaussians to renders of the scene from its own views and, in a long fit, from cameras around these.
 
-    If the scene has no cameras, some are placed. Then the views that score the fit are left out of it. If the fit makes
-    most views worse, its start is returned.
+    If the scene has no cameras, some are placed, and the placed views that score the fit are left out of it. If the fit
+    makes most views worse, its start is returned.
     """
     share = len(start.gaussians) / len(prepared.scene.gaussians)
     options = replace(options, tuning=options.tuning.scaled(min(1.0, RENDERS_STEP / math.sqrt(share))))

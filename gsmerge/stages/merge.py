@@ -41,7 +41,7 @@ def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = AN
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split the rows into those that are alone in their cluster, and all others, in the order of their clusters.
+    """Split the rows into those that are alone in their cluster, and the others, in the order of their clusters.
 
     Returns the rows of both kinds, and the positions of the first row of each cluster in the second kind.
     """
@@ -64,7 +64,7 @@ def take_features(features: FeatureGaussians, index: np.ndarray) -> FeatureGauss
 def _gather_members(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """List the members of the Feature Gaussians in the rows ``index [m]``.
 
-    Returns the start ``[m+1]`` of each Feature Gaussian in the list, and the list.
+    Returns the start ``[m+1]`` of each Feature Gaussian's members in one list of members, and this list.
     """
     old_starts, sizes = features.starts[index], np.diff(features.starts)[index]
     starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
@@ -76,7 +76,8 @@ def _gather_members(features: FeatureGaussians, index: np.ndarray) -> tuple[np.n
 def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
     """Pool the Feature Gaussians of each cluster into one.
 
-    The rows of a cluster are a run of ``order``, and ``cuts`` are the starts of these runs.
+    The rows of a cluster are adjacent in ``order``, and ``cuts`` are the positions in ``order`` at which clusters
+    begin.
     """
 
     def rows(array: np.ndarray) -> np.ndarray:
@@ -118,7 +119,7 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
 def _pool_latents(latents: Array, share: np.ndarray, run: np.ndarray, count: int) -> Array:
     """Return the sum ``[count,d]`` of the ``latents [m,d]`` of each cluster, weighted by ``share [m]``.
 
-    ``run [m]`` are the clusters. Tensors, which training uses, pass gradients.
+    ``run [m]`` are the clusters. If the latents are tensors, as in training, gradients pass through the sum.
     """
     if isinstance(latents, np.ndarray):
         sums = np.zeros((count, latents.shape[1]), np.float32)

@@ -23,8 +23,8 @@ from gsmerge.values.arrays import to_float32
 
 # Chosen on training scenes by the PSNR of views from random cameras (docs/internals/notebook.md#bare-files)
 COLOR_WEIGHT = 0.6  # weight of squared differences of sh0 in a cost, whose other part is a divergence in nats
-# Costs are multiplied by the masses to one of these powers. Power 1 keeps what is large in pictures, which suits
-# scenes. Power 0.3 keeps detail, which suits objects
+# Costs of merging are multiplied by the masses to one of the POWERS. Power 1 keeps what is large in pictures, which
+# suits scenes. Power 0.3 keeps detail, which suits objects
 POWERS = 1.0, 0.3
 FLATNESS = 0.01  # least scale as a share of the largest scale, so that the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4  # least opacity of Gaussians that are merged, so that masses stay positive
@@ -93,7 +93,8 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
     def plan_merges(begin: int) -> None:
         """Write the pairs to merge in the cells from ``begin`` on, and their costs, to ``pairs`` and ``costs``."""
         end = min(begin + CELLS_PER_TASK, len(starts) - 1)
-        # Least share of a cell's Gaussians that remains after a round. With less, merged Gaussians look like haze
+        # Least share of a cell's Gaussians that remains after a round. If fewer Gaussians remained after a round,
+        # merged Gaussians would look like haze
         cell_share = 0.2
         agglomerate(
             cloud.means, cloud.covars, cloud.masses, cloud.weights, colors, order, starts, COLOR_WEIGHT, cell_share,
@@ -147,8 +148,8 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
 def gaussians_of_cloud(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
     """Convert moments to Gaussians, but copy those that were not merged from ``source``, the input of the merging.
 
-    If a mass would need an opacity above one, scales grow instead. They grow at most by the share ``wider`` for each
-    doubling of the number of input Gaussians that a Gaussian was merged from.
+    If a mass would need an opacity above one, scales grow instead. The scales grow at most by the share ``wider`` for
+    each doubling of the number of input Gaussians that a Gaussian was merged from.
     """
     scales, quats = principal_axes(cloud.covars[:, FULL_MATRIX].reshape(-1, 3, 3))
     squares = scales * scales

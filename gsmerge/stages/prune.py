@@ -1,7 +1,7 @@
 """Fitted Gaussians -> pruned Gaussians: drop Gaussians that nobody sees.
 
-After a fit many Gaussians are faint or hidden by others. Without them, photos change less than by rounding to eight
-bits, but every viewer would have to load and draw them.
+After a fit many Gaussians are faint or hidden by others. Photos change less without these Gaussians than by rounding to
+eight bits, but every viewer would have to load and draw these Gaussians.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of the change that roun
 TARGET_CHANGE = 0.9 * ROUNDING  # each next limit is chosen so that it should make this change
 ENOUGH_CHANGE = 0.75 * ROUNDING  # change at which the search for a larger limit ends
 # Blending weights are measured in pictures whose sides are divided by the first number, and pictures with sides divided
-# by the second one are compared. Their low-pass is that of the photos, so changes have the same root mean square
+# by the second one are compared. The smaller pictures have the low-pass of the photos, so changes have the same root
+# mean square in them as in the photos
 COMPARED_LEVELS = 2, 4
 
 
 @stage("prune")
 def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gaussians]:
-    """Return the Gaussians that ``cameras`` see, and those that no camera sees.
+    """Return the Gaussians that ``cameras`` see, and the Gaussians that no camera sees.
 
     A Gaussian is unseen if its largest blending weight is below a limit. The limit is as large as possible, while
     without the unseen Gaussians no picture changes by more than ``ROUNDING`` (root mean square). Unseen Gaussians are

@@ -2,8 +2,9 @@
 
 The tree merges neighbouring superpixels of all views. Merges that add the least distortion come first. A cut through
 the tree has few superpixels where merges lose little, and many elsewhere, so every Gaussian lowers the distortion about
-equally. Distortion is measured in the image. It is the squared error of colours plus the squared relative error of
-depths from a plane. So a flat wall costs nothing from any angle, and far things count as much as near ones.
+equally. The distortion is measured in the image, and is the squared error of colours plus the squared relative error of
+depths from a plane. As depths are compared with a plane, a flat wall costs nothing from any angle, and as errors of
+depth are relative, far things count as much as near things.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 
 DEPTH_WEIGHT = 1.0  # weight of squared relative depth errors, relative to squared colour errors (sRGB in [0, 1])
-# Largest side of a region, as a share of the image's longer side. Larger Gaussians show the error of the rasterizer's
-# affine approximation. Regions are larger only if the budget is too small
+# Largest side of a region, as a share of the image's longer side. Gaussians of larger regions would show the error of
+# the rasterizer's affine approximation. Regions are larger only if the budget is too small
 MAX_EXTENT = 1 / 8
-# More Gaussians gain too little if the slope of the curve is less, in dB of predicted quality per relative increase of
-# the number of Gaussians
+# Least slope of the curve of quality at which more Gaussians are worth while, in dB of predicted quality per relative
+# increase of the number of Gaussians
 REGION_KNEE_SLOPE = 1.0
 KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no number of Gaussians removes, such as noise
 
@@ -89,7 +90,8 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
 def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
     """Build the region tree of a scene from enough superpixels for ``count`` Gaussians.
 
-    The squared colour error of a pixel is multiplied by its importance. Colours are multiplied by the square root.
+    The squared colour error of a pixel is multiplied by its importance. For this, colours are multiplied by the square
+    root of the importance.
     """
     images, per_view = scene.images, max(limits.per_view, -(-count // len(scene)))
     if scene.importance is not None:
@@ -158,15 +160,16 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
         rows = np.empty((2 * count, TREE_COLUMNS))
         error = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
         pairs = adjacent_pairs(labels)
-        # Weight of squared distances in pixels, relative to squared differences of colours. With a smaller weight,
-        # regions become long and winding, so that no Gaussian fits them
+        # Weight of squared distances in pixels, relative to squared differences of colours. If distances had a smaller
+        # weight, regions would become long and winding, so that no Gaussian fits them
         compactness = 1e-5
         return *merge_order(pairs, rows, DEPTH_WEIGHT, compactness, max_extent), error, int((usable > 0).sum())
 
     merged_views = parallel_map(merge_view, range(len(images)))
     parents, view_heights, growths, errors, num_pixels = zip(*merged_views, strict=True)
     offsets, heights = np.concatenate([[0], np.cumsum([len(h) for h in view_heights])]), np.concatenate(view_heights)
-    # A parent is at least as high as its children, and comes after them. A stable sort keeps this order
+    # A merge is at least as high as the merges that made its two regions, and comes after them. A stable sort keeps
+    # this order
     order = np.argsort(heights, kind="stable")
     added = np.concatenate([[sum(errors)], np.concatenate(growths)[order]])
     distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))

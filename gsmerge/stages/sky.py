@@ -1,9 +1,9 @@
 """Find the Gaussians of the sky in photos, without a network or a download.
 
-In a photo, the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. It also becomes
-paler towards the horizon. A cloudy sky may not become paler, so a region also counts if it is several times as far away
-as the rest. Ceilings and white walls may be smooth, grey and at the upper border as well. But they seldom become paler
-or are far away, and never in several views.
+In a photo, the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. The sky also
+becomes paler towards the horizon. A cloudy sky may not become paler, so a region also counts if it is several times as
+far away as the rest. Ceilings and white walls may be smooth, grey and at the upper border as well. But ceilings and
+walls seldom become paler or are far away, and never in several views.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ GRADIENT_PIXELS = 480.0  # gradients are those of a photo with this many pixels 
 # Blue sky is brighter than DARK_SKY. White sky is brighter than WHITE_SKY, and has less chroma than GREY_SKY
 DARK_SKY, WHITE_SKY, GREY_SKY = 0.35, 0.75, 0.12
 FAR_RATIO = 3.0  # the sky is more than this many times as far away as the rest
-# Least number of views that show sky, and their least share of all views. In fewer views, something else may look like
-# sky
+# Least number of views that show sky, and their least share of all views. If fewer views show sky, it may be something
+# else that looks like sky
 LEAST_SKY_VIEWS, LEAST_SKY_SHARE = 2, 0.2
 SKY_GAUSSIANS = 200_000  # the depths of at most this many Gaussians are compared
 

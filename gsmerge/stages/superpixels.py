@@ -1,12 +1,12 @@
 """Partition each view into superpixels of similar colour and regular shape (paper section 4.1).
 
-The default, ``rdseg``, places superpixels where they lower the squared colour error most. First it cuts the image into
-more rectangles than requested, where cuts lower the error most. It merges rectangles with Ward's rule to the exact
-number. Then it moves pixels at borders between superpixels if this lowers the error. ``bass`` is Bayesian adaptive
-superpixel segmentation from a hexagonal grid. ``bass-st`` starts from seeds that are drawn by the Shi-Tomasi response
-instead, as in the paper. ``grid`` makes plain rectangles. Rectangles of a few pixels are as good as other superpixels
-if no fit follows, and take no time. All methods make exactly as many superpixels as requested. No superpixel is empty,
-each is 4-connected, and each run gives the same bits.
+The default, ``rdseg``, places superpixels where they lower the squared colour error most. First ``rdseg`` cuts the
+image into more rectangles than requested, where cuts lower the error most. It then merges rectangles by Ward's rule
+down to the exact number, and moves pixels at borders between superpixels if this lowers the error. ``bass`` is Bayesian
+adaptive superpixel segmentation from a hexagonal grid. ``bass-st`` starts from seeds that are drawn by the Shi-Tomasi
+response instead, as in the paper. ``grid`` makes plain rectangles. Rectangles of a few pixels are as good as other
+superpixels if no fit follows, and take no time. All methods make exactly as many superpixels as requested. No
+superpixel is empty, each is 4-connected, and each run gives the same bits.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ RECTANGLES, EARLY_SWEEPS = 2.0, 0  # defaults of rdseg: rectangles per superpixe
 def segment(images: np.ndarray, options: SegmentOptions, count: int | None = None) -> Groups:
     """Cut every view into the same number of superpixels.
 
-    ``images [v,h,w,3]`` are float in [0, 1] or uint8. ``count`` is the number per view, by default that of the options.
+    ``images [v,h,w,3]`` are float in [0, 1] or uint8. ``count`` is the number of superpixels per view, by default that
+    of the options.
     """
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
@@ -117,7 +118,7 @@ def grid_labels(height: int, width: int, count: int) -> np.ndarray:
 def saliency(image: Array) -> Array:
     """Compute the Shi-Tomasi corner response of the grey image, over 3 x 3 pixels.
 
-    It is the smaller eigenvalue of the structure tensor.
+    The response is the smaller eigenvalue of the structure tensor.
 
     Args:
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8, as an array or a tensor.
@@ -182,7 +183,7 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
         seeds = hexagonal_seeds(height, width, count)
     else:
         seeds = seeds_from_density(seed_density(corner_response(pixels), count), count)
-    # CIELAB divided by 100. OpenCV computes it by tables, so the bits are the same on every processor
+    # CIELAB divided by 100. OpenCV computes CIELAB by tables, so the bits are the same on every processor
     colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
     labels = pad_labels(voronoi(seeds, height, width))
     return infer_labels(labels, colours, count)

@@ -26,10 +26,10 @@ def extend_state(
 ) -> tuple[State, BatchReport]:
     """Add a batch of views to a copy of ``state``, or to a new state if it is None; return the state and the report.
 
-    ``settings`` are those of the batch. By default the effort is "draft", and a scene whose Gaussians have pixels gets
-    no fit. With ``recipe="paper"`` the first batch begins a state of Feature Gaussians, and later batches use its
-    networks. Raises ValueError if a setting is unknown, out of range, or impossible for the state or the scene. Raises
-    SceneError if the scene seems to have another frame of coordinates than the state.
+    ``settings`` are the settings of the batch. By default the effort is "draft", with which a scene gets no fit if each
+    of its Gaussians belongs to a pixel. With ``recipe="paper"`` the first batch begins a state of Feature Gaussians,
+    and later batches use its networks. Raises ValueError if a setting is unknown, out of range, or impossible for the
+    state or the scene. Raises SceneError if the scene seems to have another frame of coordinates than the state.
     """
     about = {} if state is None else dict(state.about)
     scene_before, features = (None, None) if state is None else (state.scene, state.features)
@@ -58,8 +58,8 @@ class Compactor:
     ``decode`` then makes results with any K.
 
     Args:
-        **settings: Settings of the batches by name, as in ``Compactor(budget="3%", max_views=16)``. They are those of
-            :class:`gsmerge.CompactOptions` and of :class:`gsmerge.settings.extend.ExtendOptions`.
+        **settings: Settings of the batches by name, as in ``Compactor(budget="3%", max_views=16)``. The settings are
+        those of :class:`gsmerge.CompactOptions` and of :class:`gsmerge.settings.extend.ExtendOptions`.
 
     Raises:
         ValueError: If a setting is unknown or out of range.

@@ -26,9 +26,10 @@ from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
 # A "world" is a frame of coordinates. The colours of the earlier Gaussians in front are compared with the new pictures
-# of them. The difference is divided by the difference from random pixels. In batches of 15 captures this ratio was at
-# most .87 in the same world, and .92 to 1.08 in another world, so that above this limit the worlds differ. A ratio that
-# chance may have put on its side of the limit decides nothing.
+# of them. The difference of these colours is divided by the difference from random pixels. In batches of 15 captures
+# this ratio of differences was at most .87 in the same world, and .92 to 1.08 in another world, so that the worlds
+# differ if the ratio is above the limit. A ratio so near the limit that chance may decide on which side it lies decides
+# nothing.
 WORLD_RATIO = 0.9
 SAME_WORLD, ANOTHER_WORLD, UNKNOWN_WORLD = "the same", "another", "not known"  # results of comparing two worlds
 BATCH = "batch"  # path in an error about a batch, until the caller puts in the path of its file
@@ -71,11 +72,11 @@ def extend(
 ) -> tuple[Scene, BatchReport]:
     """Compact a batch of views, and add it to the results of earlier batches, which have to be in the same world.
 
-    ``before`` has the earlier results; it is None for the first batch. Poses and exposures of the batch do not change.
-    Returns a scene with the Gaussians of all batches, and the report. Rows of the scene do not belong to pixels. The
-    scene keeps views at the size of the first batch's views, each with the picture to which its batch was fitted.
-    Raises ValueError if a setting is impossible for the scene, and SceneError if the scene seems to be in another
-    world.
+    ``before`` has the earlier results; it is None for the first batch. Camera poses and exposures of the new batch do
+    not change. Returns a scene with the Gaussians of all batches, and the report. Rows of the scene do not belong to
+    pixels. The scene keeps views at the size of the first batch's views, each with the picture to which its batch was
+    fitted. Raises ValueError if a setting is impossible for the scene, and SceneError if the scene seems to be in
+    another world.
     """
     options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress):
@@ -119,8 +120,8 @@ def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
     """Compare the world of new views with the world of the Gaussians ``before``.
 
     Returns SAME_WORLD, ANOTHER_WORLD or UNKNOWN_WORLD. In the same world the pictures show the earlier Gaussians,
-    except where Gaussians of the batch, with their ``means [n,3]``, hide them. In another world the pictures are as
-    unlike these Gaussians as random pixels are.
+    except where Gaussians of the batch, whose means are ``means [n,3]``, hide earlier ones. In another world the
+    pictures are as unlike the earlier Gaussians as random pixels are.
     """
     if not len(views):
         return UNKNOWN_WORLD
@@ -146,7 +147,7 @@ def _keep_pictures(prepared: Prepared) -> Scene:
     input_scene, no_gaussians = prepared.input_scene, prepared.input_scene.gaussians[:0]
     if prepared.reference.placed:  # the input has no views
         return Scene(no_gaussians, input_scene.cameras, None, None, input_scene.names)
-    # Layers of a view have equal cameras, and only the first layer is kept
+    # A view may have several layers of Gaussians, each with the same camera, and only the first layer is kept
     first_layers = np.unique(camera_kinds(input_scene.cameras), return_index=True)[1]
     views = sorted(first_layers.tolist())
     images = prepared.scene.images[[prepared.repeated[view] for view in views]]
@@ -155,7 +156,10 @@ def _keep_pictures(prepared: Prepared) -> Scene:
 
 
 def _join_views(before: Scene, batch: Scene) -> Scene:
-    """Append the views of a batch to those ``before``, whose size they get. Names are those of :func:`append_names`."""
+    """Append the views of a batch to the views ``before``, in their size.
+
+    The names of the views are those of :func:`append_names`.
+    """
     if len(batch) == 0 or len(before) == 0:
         return before if len(batch) == 0 else batch
     size = before.cameras.width, before.cameras.height

@@ -1,7 +1,8 @@
 """Add batches of views to Feature Gaussians with ``recipe=paper`` (paper section 4.5, "Online reconstruction").
 
-New views are encoded, matched with the earlier Feature Gaussians, merged into them and refined. Decoder heads then make
-K Gaussians per group, for any K. For a single batch the result has the same bytes as that of ``compact``.
+New views are encoded, matched with the earlier Feature Gaussians, merged into them and refined. The decoder heads of
+the networks make K Gaussians of each Feature Gaussian, for any K. The result of a single batch has the same bytes as
+the result of ``compact``.
 """
 
 from __future__ import annotations
@@ -90,8 +91,8 @@ class FeatureState:
 class _JoinContext(NetworkContext):
     """Networks and their inputs, for the groups of a state and of a batch together; ``cameras`` has all views.
 
-    A state does not store the members of its groups. Feature Gaussians are therefore pooled from parts in place of
-    members, and list the rows of these parts. A part is a group of the state or of the batch.
+    Feature Gaussians are pooled from parts in place of members, and list the rows of their parts, because a state does
+    not store the members of its groups. A part is a group of the state or of the batch.
     """
 
     samples: ViewSamples  # of all views
@@ -221,7 +222,8 @@ def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
 def sample_fronts(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
     """Sample the foremost Gaussian at the centre of each cell of a grid, in every view.
 
-    The grid has as many cells as that of the ``state``. Without a state its cells are squares of a fixed size.
+    The grid has as many cells as that of the ``state``. Without a state the cells of the grid are squares of a fixed
+    size.
     """
     sample_step = 8  # pixels between samples of a view along each axis
     new_shape = -(-cameras.height // sample_step), -(-cameras.width // sample_step)
@@ -275,7 +277,7 @@ def _join_batch(
     cameras = concat_cameras(state.cameras, resize_cameras(context.cameras, *size))
     views = features.views + len(state.cameras)
     parts = FeatureGaussians.concat([state.merged, _without_members(replace(features, views=views))])
-    # Each part lists its own row, so that merging lists the rows of the parts
+    # Each part lists its own row as its only member, so that merged Feature Gaussians list the rows of their parts
     parts = replace(parts, starts=np.arange(len(parts) + 1), members=np.arange(len(parts)).astype(np.int32))
     part_members = np.concatenate([state.num_members, np.diff(features.starts)])
     all_samples = ViewSamples.concat([state.samples, samples])
@@ -300,9 +302,10 @@ def _mean_of_parts(merged: FeatureGaussians, values: np.ndarray, weights: np.nda
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -> Matches:
     """Match the Feature Gaussians of a batch with each other, as in a scene, and with those of a state.
 
-    The first ``num_old`` of the ``parts`` are those of the state. Clusters of the two matchings are joined if they
-    share a part. For the matching with the state, all parts of the state count as one view, and all parts of the batch
-    as another. Each part is thus compared with its nearest neighbours in the other set.
+    The first ``num_old`` of the ``parts`` are those of the state. Clusters of the matching within the batch and of the
+    matching with the state are joined if they share a part. For the matching with the state, all parts of the state
+    count as one view, and all parts of the batch as another. In this way each part is compared with its nearest
+    neighbours in the other set, which is the batch or the state.
     """
     rows = np.arange(len(parts))
     across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options).clusters
@@ -310,7 +313,7 @@ def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -
     batch_extinctions = np.where(rows < num_old, 0, parts.extinctions)
     within = match(replace(parts, views=batch_views, extinctions=batch_extinctions), options)
     neighbors = np.stack([_first_members(across), _first_members(within.clusters)], 1)
-    # All scores are above the threshold, so that all neighbours are connected
+    # All scores are set to 1, which is above the threshold, so that all neighbours are connected
     return Matches(*connected_components(neighbors, np.ones(neighbors.shape), threshold=0.5))
 
 
@@ -328,7 +331,8 @@ def _without_members(features: FeatureGaussians) -> FeatureGaussians:
 def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
     """Decode a state into ``k`` Gaussians per group in the world frame; with a mixed K, saliency decides their number.
 
-    Raises UsageError if the networks' heads make fewer Gaussians, or if ``k_rule`` needs the members of the groups.
+    Raises UsageError if the networks' heads make fewer Gaussians per group than ``k``, or if ``k_rule`` needs the
+    members of the groups.
     """
     max_children = state.networks.options.max_children
     if options.k == MIXED and options.k_rule == "distortion":

@@ -29,10 +29,12 @@ def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children
 
     ``num_children`` is one number for all groups or ``[g]``, at least 1. In each step, the child with the largest
     spread of features is halved. The features of a member are its colour, and its position relative to ``centres
-    [g,3]`` in units of ``footprints [g]``. A group with equal members gives fewer children. Two children of a group are
-    unions of its four children.
+    [g,3]`` in units of ``footprints [g]``. A group gives fewer children if members have equal features, because a child
+    of equal members cannot be halved. If a group is halved into two children, they are unions of the four children into
+    which it can be divided.
 
-    Returns the start ``[m+1]`` of each child in a list of members, this list, and the group ``[m]`` of each child.
+    Returns the start ``[m+1]`` of each child in a list of members, the list itself, and the group ``[m]`` of each
+    child.
     """
     num_groups = len(starts) - 1
     counts = np.array(np.broadcast_to(num_children, num_groups), np.int64)
@@ -44,9 +46,10 @@ def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children
 def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_children, plane_weight):
     """Return the squared error ``[g,max_children]`` of every group with 1, 2 and more children of :func:`bisect`.
 
-    The error is NaN for more children than a group can have. It is a weighted sum over the members. The error of a
-    member is its squared distance from the child's mean colour, plus ``plane_weight`` times that from a plane through
-    the child, both in features. The mean weight of the members is one, and opaque members weigh more.
+    The error is NaN for more children than a group can have. The error of a group is the weighted sum of the errors of
+    its members. The error of a member is its squared distance from the child's mean colour, plus ``plane_weight`` times
+    its squared distance from a plane through the child, both in features. The mean weight of the members is one, and
+    opaque members weigh more.
     """
     num_groups = len(starts) - 1
     counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)

@@ -30,7 +30,7 @@ def box_overlap(mean_a, cov_a, mean_b, cov_b):
 def edge_scores(neighbors, means, covars, colors, latents, views, max_color, similarity, boxes, out):
     """Write the overlap of every Gaussian with each of its neighbours.
 
-    Gaussians are clustered in a graph whose edges have these overlaps.
+    The overlaps are the weights of the edges of a graph, in which Gaussians are clustered.
 
     Args:
         neighbors: ``[g,k]`` int64 rows of neighbours, below 0 where there is none.

@@ -1,8 +1,9 @@
 """Find the nearest points of other views, and measure how points agree with the Gaussians of other views.
 
-Nearest points are found by a balanced k-d tree. Node i of the tree is a run of the array ``order``. Its children 2 i +
-1 and 2 i + 2 are the halves of this run. A plane across one axis separates their points. Agreement is measured in each
-view at the pixel to which a point projects.
+Nearest points are found by a balanced k-d tree. Node i of the tree is a run of consecutive entries of the array
+``order``. The children 2 i + 1 and 2 i + 2 of node i are the halves of its run. A plane across one axis separates the
+points of the two children. The agreement of a point with a view is measured at the pixel of the view to which the point
+projects.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def nearest_of_others(points, views, order, axes, splits, first, last, most, out
 def partition(values, order, low, high, place):
     """Reorder a part of ``order`` so that one position gets the value that it would have after sorting.
 
-    No value before this position is larger, and no value after it is smaller.
+    Afterwards no value before the position is larger than the value at it, and no value after the position is smaller.
 
     Args:
         values: ``[n]`` float64 numbers, which do not change.
@@ -95,12 +96,13 @@ def sum_cross_view(
         fronts: ``[v,h,w]`` int32 row of the front Gaussian of each pixel, -1 for none.
         color_scale: Factor from ``sh0`` to colours.
         near: Largest difference of the logarithms of two depths of the same surface.
-        far: Largest difference of the logarithms of depths that is added. Larger ones are clipped.
+        far: Largest difference of the logarithms of two depths. Larger differences are clipped to ``far`` before they
+            are added.
         min_opacity: Least opacity of a Gaussian that shows a surface.
         first: First point.
         last: Last point, exclusive.
         out: ``[g,6]`` float64, to which sums over the views that see the point are added. Column 0 is the number of
-            these views. Columns 1 to 3 are the numbers of views whose surface is at the point, behind it, and in front
-            of it. Column 4 is the absolute difference of colours where the surface is at the point. Column 5 is the
-            difference of the logarithms of depths.
+            views that see the point. Columns 1 to 3 are the numbers of views whose surface is at the point, behind it,
+            and in front of it. Column 4 is the absolute difference of colours where the surface is at the point. Column
+            5 is the difference of the logarithms of depths.
     """

@@ -17,8 +17,8 @@ def cut_at_edges(quats, scales, normals, offsets, first, last, means, covars, is
 
     A Gaussian is cut at the nearest edge of the photo in which it lies deepest. Distances from edges are measured in
     standard deviations of the Gaussian across the plane of the edge. If the mean is within two standard deviations of
-    the edge, the Gaussian gets the moments of its part inside (truncated normal distribution). This is done at most
-    twice, because a corner has two edges. Gaussians farther outside do not change. ``gsmerge.fit.edges`` splits
+    the edge, the Gaussian gets the moments of its part inside (truncated normal distribution). A Gaussian is cut at
+    most twice, because a corner has two edges. Gaussians farther outside do not change. ``gsmerge.fit.edges`` splits
     Gaussians at the same edges, which it finds by the same rule.
 
     Args:

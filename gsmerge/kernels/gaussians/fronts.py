@@ -1,7 +1,7 @@
 """Find the pixels of Gaussians by projecting their centres, without drawing a picture.
 
-A Gaussian whose centre is outside of a picture, but which reaches into it, belongs to the nearest pixel. It hides no
-other Gaussian there, and is not in front at any pixel.
+A Gaussian whose centre is outside of a picture, but which reaches into it, belongs to the nearest pixel. A Gaussian
+with its centre outside hides no other Gaussian at this pixel, and is not in front at any pixel.
 """
 
 from __future__ import annotations

@@ -37,8 +37,9 @@ def adam(
         min_sizes: ``[n]`` least log scale of each Gaussian, even if it is outside the box.
         ids: ``[k]`` rows with a gradient, each once. The gradients have k rows.
         rates: Learning rates of mean (in ``units``), log scale, quaternion, logit and colour.
-        limits: Half sides of the box for mean (in ``units``), log scale and logit. Then by how much the largest log
-            scale may exceed the second one, and by how much it may exceed ``min_sizes``. The higher limit counts.
+        limits: Half sides of the box for mean (in ``units``), log scale and logit. The last two numbers are how much
+            the largest log scale may exceed the second largest one, and how much it may exceed ``min_sizes``. Of the
+            last two limits the higher one counts.
         betas: Decays of the first and the second moment.
         regs: Numbers added to the gradients of opacities, and of scales in ``units``.
         step: Number of the step, from 1.

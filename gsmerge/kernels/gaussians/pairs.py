@@ -17,8 +17,8 @@ WORK = 17  # rows of the work space for a cell
 def gaussian_moments(quats, scales, opacities, flatness, covars, masses):
     """Write the covariances ``[n,6]`` (xx, xy, xz, yy, yz, zz) and the masses ``[n]`` of Gaussians.
 
-    A mass is the opacity times the root of (ab)^2 + (bc)^2 + (ca)^2, where a, b and c are the scales. This root is
-    about proportional to the visible area from any side.
+    A mass is the opacity times the root of (ab)^2 + (bc)^2 + (ca)^2, where a, b and c are the scales. The root is about
+    proportional to the area of the Gaussian that is visible from any side.
 
     Args:
         quats: ``[n,4]`` wxyz of any length.
@@ -43,9 +43,10 @@ def agglomerate(
 ):
     """Plan merges in some cells, without changing the Gaussians. The cheapest pair of a cell is always merged next.
 
-    The cost of a pair is a difference times the sum of both weights. The difference is Runnalls' bound (2007) on the
-    divergence that the merge causes, per mass, plus the squared difference of colours. A merge costs at least as much
-    as the merge before it in the same cell. So the merges up to any cost are the first merges of each cell.
+    The cost of a pair is the difference of its two Gaussians times the sum of both weights. The difference of two
+    Gaussians is Runnalls' bound (2007) on the divergence that the merge causes, per mass, plus the squared difference
+    of colours. A merge costs at least as much as the merge before it in the same cell. Costs never fall within a cell,
+    so the merges up to any cost are the first merges of each cell.
 
     Args:
         covars: ``[n,6]`` float32, upper triangles.

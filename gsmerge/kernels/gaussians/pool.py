@@ -44,7 +44,7 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
         scales: ``[n,3]`` standard deviations.
         footprints: ``[n]`` sizes of the members' pixels, world units.
         own_covariance: True to add the covariances of the members, with capped extents, to the covariance of their
-            means. Otherwise only the covariance of the means counts (paper eq. teacher_cov).
+            means. If false, only the covariance of the means counts (paper eq. teacher_cov).
         out_geometry: ``[g,13]`` float64, written for groups with members: mean (3), covariance xx xy xz yy yz zz, sum
             of opacities, mass (paper eq. mass), integrated optical depth and footprint. The optical depth is the sum of
             -ln(1 - opacity) times disc area.

@@ -1,7 +1,7 @@
 """Compute the inputs of the networks in the frame of each group, and apply the corrections that networks put out.
 
 Arrays are float32, and ids int64. Corrections ``residuals`` have 13 columns, see :mod:`gsmerge.networks.corrections`.
-They are applied in place, and a correction of zero changes no bit. The columns of a frame are its axes.
+Corrections are applied in place, and a correction of zero changes no bit. The columns of a frame are its axes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from gsmerge.kernels.signature import STATUS, f4, f8, i8, native
     frames=f4("g", 3, 3, out=True), sizes=f4("g", out=True),
 )  # fmt: skip
 def place_frames(means, scales, viewmats, views, frames, sizes):
-    """Write the frame and the size of each group. The size is the geometric mean of the two largest scales.
+    """Write the frame and the size of each group. The size of a group is the geometric mean of its two largest scales.
 
     The columns of a frame are axes in the world: right and down in the picture of the group's view, and along the ray
     from the camera to the group.

@@ -64,7 +64,7 @@ def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors
     """Append Gaussians to the lists of a range of rows of tiles, but leave out hidden Gaussians.
 
     A list of :func:`deal_tiles` also has the Gaussians behind the one after which all pixels of the tile are opaque.
-    The pixels that are drawn are the same.
+    The pixels that are drawn are the same from the lists of both functions.
 
     Args:
         order: ``[m]`` int32 Gaussians in depth order.
@@ -75,5 +75,5 @@ def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors
         last: Last row of tiles, exclusive.
         left: ``[tiles]`` float32 upper bounds of the transmittance of each tile, 1 before, which are lowered.
         cursors: ``[tiles]`` int64 ends of the lists, which are advanced.
-        flatten_ids: ``[intersections]`` int32, written. If it is empty, only the cursors are advanced.
+        flatten_ids: ``[intersections]`` int32, written. If the array is empty, only the cursors are advanced.
     """

@@ -2,8 +2,8 @@
 
 All kernels here use the same lists and the same weights, see ``gsmerge/kernels/raster/walk.h``. An intersection is a
 Gaussian in the list of a tile. The backward pass writes sums over the pixels of a tile to a row for each intersection.
-Then it adds the rows of each Gaussian in the order of the lists. Threads share no numbers, so results do not depend on
-the number of threads. The formula is in ``gsmerge/kernels/raster/blend_backward.c``.
+The backward pass then adds the rows of each Gaussian in the order of the lists. Threads share no numbers, so results do
+not depend on the number of threads. The formula is in ``gsmerge/kernels/raster/blend_backward.c``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ TILES = {"first": i8(), "last": i8()}
 def blend(conics, flatten_ids, isect_offsets, tile_width, colors, first, last, top, background, image, transmittance):
     """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``.
 
-    These arrays have the rows of the view from ``top`` on. Tiles that begin outside of these rows are left out.
+    ``image`` and ``transmittance`` have the rows of the view from ``top`` on. Tiles that begin outside of the rows of
+    ``image`` are left out.
     """
 
 
@@ -73,7 +74,7 @@ def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width,
     STATUS, conics=LISTS["conics"], flatten_ids=LISTS["flatten_ids"], left=i8(), top=i8(), parts=i4("n", 3, out=True),
 )  # fmt: skip
 def parts_of_tile(conics, flatten_ids, left, top, parts):
-    """Write the part of a tile in which each Gaussian of a list shows. The other kernels blend only these parts.
+    """Write the part of a tile in which each Gaussian of a list shows. Other kernels blend only the parts.
 
     The tile begins at the pixel (``left``, ``top``). A part is a first row, a last row, and the first of eight columns
     that contain all of the Gaussian, or -1 if eight are too few.

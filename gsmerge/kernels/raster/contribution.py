@@ -4,7 +4,8 @@ The paper's supplement has this rule for backbones whose Gaussians do not belong
 
 A pair is a Gaussian and a superpixel that it touches, with the sum of its blending weights there. Tiles are read row by
 row. The pairs of a Gaussian form a linked list. After each row, the pairs of Gaussians that do not reach into the next
-row are evaluated, and all others are kept. So memory grows with the width of the view, not with its height.
+row are evaluated, and all others are kept. Because only one row of tiles is kept, memory grows with the width of the
+view, not with its height.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ def settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, out_
 def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, count):
     """Return each Gaussian's largest sum of blending weights in a superpixel, and the superpixel's label.
 
-    Both results are ``[m]``, float32 and int32. The smallest label is returned if sums are equal. Gaussians that no
-    pixel shows have 0 and -1.
+    The sums are ``[m]`` float32, and the labels ``[m]`` int32. The smallest label is returned if sums are equal.
+    Gaussians that no pixel shows have 0 and -1.
 
     Args:
         labels: ``[h,w]`` int32, below ``count``.

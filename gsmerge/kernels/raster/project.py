@@ -1,15 +1,16 @@
 """Project Gaussians into a view, to find which ones it may show, with their conics and boxes. Run the backward pass.
 
-The conventions are those of gsplat. The dilation is 0.3 square pixels. Conics follow from the first-order (EWA)
-projection, whose directions are clamped 15 % outside the image. Contributions below 1/255 are left out. A conic is
-stored with its square completed, so that the exponent of a pixel is never positive, however thin the Gaussian::
+Cameras, Gaussians and images follow the conventions of gsplat. The dilation is 0.3 square pixels. Conics follow from
+the first-order (EWA) projection, whose directions are clamped 15 % outside the image. Contributions below 1/255 are
+left out. A conic is stored with its square completed, so that the exponent of a pixel is never positive, however thin
+the Gaussian::
 
     ln w(x, y) = lnop - (rate_x (x - mean_x - slope (y - mean_y)))^2 - rate_y (y - mean_y)^2
 
-The backward pass computes gradients of means, rotations, scales and opacities from sums over an image. It follows Ye et
-al., "Mathematical supplement for the gsplat library", 2023 (EWA: Zwicker et al. 2001). Gradients pass through the conic
-to half axes, rotation and scale. They reach the mean through its image position and through the derivative of the
-projection.
+The backward pass computes gradients of means, rotations, scales and opacities from sums over an image. The backward
+pass follows Ye et al., "Mathematical supplement for the gsplat library", 2023 (EWA: Zwicker et al. 2001). Gradients
+pass through the conic to half axes, rotation and scale. Gradients reach the mean through its image position and through
+the derivative of the projection.
 """
 
 from __future__ import annotations

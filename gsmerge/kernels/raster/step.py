@@ -1,8 +1,8 @@
 """Take a step of a fit, from projection to the optimiser, in phases that work on one table of buffers.
 
 The phases run the kernels of the other modules, with the same bits. The buffers are checked once, when the table is
-filled. Then every thread makes one call for each phase, whose only arguments are the table and the number of the phase,
-see ``gsmerge/kernels/raster/step.c``.
+filled. In a step, every thread makes one call for each phase, whose only arguments are the table and the number of the
+phase, see ``gsmerge/kernels/raster/step.c``.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from gsmerge.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
 from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
 
 # Phases of a step. If most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces
-# "deal". Then the list of a tile ends at its last visible Gaussian
+# "deal". A list that "deal_open" makes ends at the last visible Gaussian of the tile
 PHASES = ("cull", "project", "count", "count_open", "deal", "deal_open", "blend", "loss", "backward", "update")
 THREAD_GAUSSIANS = 1 << 13  # number of Gaussians that a thread culls or projects at a time
 
-# The arrays of the table are in this order. The first ones are the state of the fit. Then follow buffers with a row for
-# each of n Gaussians, each tile, each intersection and each pixel. The last arrays are set in each step
+# The arrays of the table are in this order. The first arrays of the table are the state of the fit. The next arrays are
+# buffers with a row for each of n Gaussians, each tile, each intersection and each pixel. The last arrays are set in
+# each step
 STEP = Table(
     "Step",
     ("step", "num_visible", "num_intersections", "next", "arrived", "failed"),
@@ -46,7 +47,7 @@ STEP = Table(
 def fit_phase(table, phase):
     """Do a thread's share of a phase of a step. ``phase`` is the index of its name in ``PHASES``.
 
-    Each of the ``threads`` makes one such call. A phase may begin when all calls of the phase before have ended. After
-    "count" and "count_open" the table has the number of intersections, for which the buffers need room before the next
-    phase.
+    Each of the ``threads`` calls this function once for each phase. A phase may begin when all calls of the phase
+    before have ended. After "count" and "count_open" the table has the number of intersections, for which the buffers
+    need room before the next phase.
     """

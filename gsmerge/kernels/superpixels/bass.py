@@ -1,9 +1,9 @@
 """Cut pictures into superpixels by BASS (Uziel, Ronen and Freifeld 2019), without its splits and merges.
 
-Each region is a Gaussian in colour and in position. The colour has a fixed standard deviation, the position a
-normal-inverse-Wishart prior. Each round fits these Gaussians, and then moves pixels to the most likely regions (hard
-expectation maximisation). A Potts term keeps borders short. A pixel may change its label only if every region stays
-connected, so no region becomes empty. Pixels at the border of the picture may change as well.
+Each region is a Gaussian in colour and in position. The colour has a fixed standard deviation, and the position has a
+normal-inverse-Wishart prior. Each round fits the Gaussians of the regions, and then moves pixels to the most likely
+regions (hard expectation maximisation). A Potts term keeps borders short. A pixel may change its label only if every
+region stays connected, so no region becomes empty. Pixels at the border of the picture may change as well.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ _fit_regions = declare(
 def fit_regions(labels, colours, areas):
     """Return the parameters ``[count,9]`` float32 of every region: means, inverse covariance, and its log-determinant.
 
-    The covariance is ``(A² I + S) / (n + 50 A - 3)``. S is the scatter of the n positions of a region. A is its
-    expected area in pixels, from ``areas [count]`` float64.
+    The covariance is ``(A² I + S) / (n + 50 A - 3)``. S is the scatter of the n positions of a region. A is the
+    expected area of a region in pixels, from ``areas [count]`` float64.
     """
     rows = np.empty((len(areas), REGION_COLUMNS), np.float32)
     _fit_regions(labels, colours, areas, np.zeros((len(areas), 9)), rows)

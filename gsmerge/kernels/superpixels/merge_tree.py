@@ -1,9 +1,9 @@
 """Merge neighbouring regions of a view, the cheapest pair first, down to a single region.
 
 A region has a row of float64 numbers: its mean colour and position, its number of pixels, the sums from which a plane
-is fitted, the error of this plane, and a box. The plane is 1 / z = a x + b y + c, where z are the depths. It is fitted
-with weights z², so its error is relative to the depth. This error does not depend on the scale of the world, adds up
-over regions, and is zero for any flat surface.
+is fitted, the error of this plane, and a box. The plane is 1 / z = a x + b y + c, where z are the depths. The plane is
+fitted with weights z², so its error is relative to the depth. The error of a plane does not depend on the scale of the
+world, adds up over regions, and is zero for any flat surface.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def region_sums(labels, pixels, depths, count, rows):
     return float(squares[0])
 
 
-# Writes by how much two errors grow if regions u and v merge. The first is the error of colour and depth, the second
-# that of position times the compactness
+# Writes by how much two errors grow if regions u and v merge. The first error is that of colour and depth, and the
+# second error is that of position times the compactness
 merge_growth = declare(
     "merge_growth", rows=f8("capacity", TREE_COLUMNS), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"),
     depth_weight=f8(), compactness=f8(), growth=f8(2, out=True),

@@ -2,9 +2,9 @@
 
 Padded labels are ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel has to check for the border. The row of a
 region has its mean features (5), its number of pixels, and two columns for the algorithm that uses it. Costs are
-computed from these eight float32 numbers, which are half a cache line. The features of a pixel are r, g, b, y·spread
-and x·spread, where spread² is the weight of squared distances in pixels, relative to squared differences of colours.
-Rows have means instead of sums, because means are exact enough in float32 for pictures of any size.
+computed from the eight float32 numbers of a row, which fill half a cache line. The features of a pixel are r, g, b,
+y·spread and x·spread, where spread² is the weight of squared distances in pixels, relative to squared differences of
+colours. Rows have means instead of sums, because means are exact enough in float32 for pictures of any size.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ def connectivity_table() -> np.ndarray:
     """Return a table ``[256]`` uint8 that is 1 for rings of neighbours with which a pixel may leave its region.
 
     Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) is in the pixel's region. The region stays in
-    one piece if its neighbours at the sides are 4-connected within the ring. The number of their parts is the number of
-    these neighbours minus the number of corner neighbours that join two of them (Yokoi's connectivity number). If the
-    whole ring is in the region, the difference is 0, but there is one part.
+    one piece if its neighbours at the sides are 4-connected within the ring. The number of parts that the side
+    neighbours form is their number minus the number of corner neighbours that join two of them (Yokoi's connectivity
+    number). If the whole ring is in the region, this number is 0, although the ring is one part.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     edges, corners = cells[:, 0::2], cells[:, 1::2]
@@ -66,8 +66,8 @@ def sweep(labels, pixels, rows, table, spread, backward):
     """Visit the pixels at borders between regions once, and move each pixel if this lowers the total squared error.
 
     A pixel moves from region A to the region B of a 4-neighbour if ``n_A/(n_A-1)·d_A² > n_B/(n_B+1)·d_B²``, where n are
-    numbers of pixels and d distances from the means. A must stay connected without the pixel. A pixel without a
-    neighbour in A stays, so no region becomes empty. The means are updated after each move.
+    numbers of pixels and d distances from the means. Region A must stay connected without the pixel. A pixel without a
+    neighbour in its own region A stays, so no region becomes empty. The means are updated after each move.
 
     Args:
         labels: Padded labels 0 to ``count - 1``, changed.

@@ -48,7 +48,8 @@ def hexagonal_seeds(height, width, count):
 def seed_density(saliency, count):
     """Return how many seeds each pixel should get, ``[h,w]`` float64, from 0 to 1 with a sum of ``count``.
 
-    The numbers grow with the root of ``saliency [h,w]``. They are uniform if the saliency is zero everywhere.
+    The numbers grow with the root of ``saliency [h,w]``. The numbers of seeds are uniform if the saliency is zero
+    everywhere.
     """
     density = np.sqrt(saliency, dtype=np.float64)
     density_floor = 0.3  # share of the seeds that are spread evenly
@@ -89,8 +90,8 @@ def _spread_picks(weights, count):
 def seeds_from_density(density, count):
     """Return the positions (y, x) ``[count,2]`` int64 of different pixels, distributed by their ``density [h,w]``.
 
-    Dithering loses a few seeds at the border of the picture. So seeds are added or removed evenly to get the exact
-    number.
+    Dithering loses a few seeds at the border of the picture. To get the exact number, seeds are added or removed
+    evenly.
     """
     seeds = dither(density).reshape(-1)
     surplus = np.count_nonzero(seeds) - count

@@ -2,9 +2,9 @@
 
 An edge is a pair of neighbouring regions. In each round every region chooses its cheapest neighbour, and two regions
 that choose each other are merged. Edges that cost more than a ceiling are put aside, so that a round reads only few
-edges. The ceiling is raised when no cheaper edges are left. Rounds merge too many pairs, and some of them out of order.
-So the merges are recorded as a tree with heights, and the tree is cut where exactly the wanted number of regions is
-left.
+edges. The ceiling is raised when no cheaper edges are left. Rounds merge too many pairs, and some pairs out of order.
+For this reason merges are recorded as a tree with heights, and the tree is cut where exactly the wanted number of
+regions is left.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def adjacent_pairs(labels):
 
     Pairs may be repeated. There is about one pair for each straight piece of a common border.
     """
-    # There are at most two pairs for each pixel, with the pixels to the right and below
+    # Each pixel makes at most two pairs, one with the pixel to its right and one with the pixel below
     pairs = np.empty((2 * (labels.shape[0] - 2) * (labels.shape[1] - 2) + 1, 2), np.int32)
     return pairs[: _adjacent_pairs(labels, pairs)]
 
@@ -39,18 +39,19 @@ merge_costs = declare(
 
 
 def _first_ceiling(pairs, rows, share):
-    """Estimate the cost of the last merge, slightly too high; edges that cost more are put aside at first.
+    """Estimate the cost of the last merge, slightly too high, above which edges are put aside at first.
 
     ``pairs [e,2]`` are the edges between regions, ``rows`` the sums of each region, and ``share`` is the part of the
-    regions that merging removes. The estimate is the quantile ``share`` of the costs of all edges. That is near the
-    cost of the last merge in photos with 1.5 to 3 times as many regions as wanted.
+    regions that merging removes. The estimate is the quantile ``share`` of the costs of all edges. The estimate is near
+    the cost of the last merge in photos with 1.5 to 3 times as many regions as wanted.
     """
     sample_edges = 4096  # the ceiling is estimated from the costs of about this many edges
     step = max(1, len(pairs) // sample_edges)
     costs = np.empty(len(pairs) // step, np.float32)
     merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
     rank = min(int(share * len(costs)), len(costs) - 1)
-    # The kernel adds at most this to each cost. So equal costs differ, and a round merges many pairs of a flat picture
+    # The kernel adds at most tie_break to each cost, so that pairs of equal cost differ and a round merges many pairs
+    # of a flat picture
     tie_break = 1e-7
     return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * tie_break))
 
@@ -125,7 +126,8 @@ def merge_regions(labels, pixels, num_regions, count, spread):
     cut_height = np.partition(merge_heights, num_merges - 1)[num_merges - 1]
     keep = heights < cut_height
     ties = np.flatnonzero(merge_heights == cut_height) + num_regions
-    # Children come before their parents, so the first of several merges at the cut have all their children
+    # Of several merges at the height of the cut, only the first ones are kept. Children come before their parents, so
+    # the children of a kept merge are kept as well
     keep[ties[: num_merges - np.count_nonzero(merge_heights < cut_height)]] = True
     leaf_labels = np.empty(num_nodes, np.int32)
     _label_leaves(parents[:num_nodes], keep.view(np.uint8), leaf_labels, num_regions)
