@@ -164,9 +164,9 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
         f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {plan.LONE_K} for a single",
         f"counts PSNR plus {curve.SSIM_DB:g} dB times SSIM",
-        f"This useful number is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views confirm at least"
-        f" {percent(confirm_depths.SOUND_SHARE)} of the depth, and {percent(confirm_depths.FEWEST)} if they confirm"
-        f" {percent(confirm_depths.WRONG_SHARE)} or less",
+        f"The useful number of Gaussians is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views"
+        f" confirm at least {percent(confirm_depths.SOUND_SHARE)} of the depth, and {percent(confirm_depths.FEWEST)} if"
+        f" they confirm {percent(confirm_depths.WRONG_SHARE)} or less",
         f"tries up to {word(search.MAX_LEFT_OUT_BUILDS)} numbers of Gaussians, or {word(search.MAX_BUILDS)}"
         " where no photo is left out",
         f"With {word(left_out.LEAST_VIEWS)} photos or more, both kinds of `--quality` leave out some views",
