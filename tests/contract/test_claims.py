@@ -127,17 +127,16 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f" {percent(new_views.MOST_SHARE)} as many Gaussians as pixels",
         f"the depth of {confirm_depths.CONFIRM_PIXELS:,} pixels of each view is compared with its nearest views, up to"
         f" {confirm_depths.CONFIRM_NEIGHBORS} of them",
-        f"If they confirm less than {part(confirm_depths.POOR_SHARE)} of these depths, a note says that the result will"
-        " be poor",
+        f"If the nearest views confirm clearly less than {part(confirm_depths.POOR_SHARE)} of the compared depths",
         f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input",
         f"and less than {distance.WRONG_DB:g} dB of PSNR",
-        f"They show the photos at most {plan.FIDELITY_LOSS:g} dB worse than it does",
+        f"to show the photos at most {plan.FIDELITY_LOSS:g} dB worse than the input does",
         f"at least {plan.FIDELITY_PSNR:g} dB against the input's",
         f"moved by up to {cameras_off.MAX_PX:g} pixels, in small pictures by up to {percent(cameras_off.MAX_SHARE)}",
         f"If the views miss {percent(draw_outside.LEAST_OUTSIDE)} of the Gaussians or more",
         f"With more than {word(plan.USUAL_VIEWS)} views the fit takes more steps. Scenes of more than"
-        f" {million(plan.WHOLE_GAUSSIANS)} Gaussians are compacted in blocks of views, which takes less memory. So are"
-        f" scenes of more than {plan.WHOLE_VIEWS} views",
+        f" {million(plan.WHOLE_GAUSSIANS)} Gaussians are compacted in blocks of views, which takes less memory."
+        f" Scenes of more than {plan.WHOLE_VIEWS} views",
         f"{part(1 / scores.INPUT_EVERY)} of the input's pixels and {part(1 / scores.RESULT_EVERY)} of the result's in"
         f" {word(views.REPORT_VIEWS)} photos (in drafts: {word(plan.EFFORTS['draft'].report_views)})",
     ),
@@ -147,17 +146,17 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"below 1/{1 / FIT.min_contribution:g} in every picture",
     ),
     EVALUATE: (
-        f"They start from {word(fog.VIEWS)} input views",
+        f"outside the views start from {word(fog.VIEWS)} input views",
         f"have at most {fog.FOG_PIXELS} pixels on the longer side",
-        f"its opacity is below {fog.FOG_EMPTY:g} in the whole square of {fog.EROSION_PIXELS} x {fog.EROSION_PIXELS}"
-        " pixels around",
-        f"those whose mean depth in the result is below {fog.VEIL_SHARE:g} of the input's",
-        f"with an opacity above {fog.FOG_SOLID:g} in the input, the share with one below {fog.FOG_OPEN:g} in the"
-        " result",
-        f"Such a Gaussian is at least {word(int(fog.RATIOS[0]))} times as long as its second axis",
+        f"the input's opacity is below {fog.FOG_EMPTY:g} in the whole square of {fog.EROSION_PIXELS} x"
+        f" {fog.EROSION_PIXELS} pixels around this pixel",
+        f"the mean depth in the result is below {fog.VEIL_SHARE:g} of the input's",
+        f"with an opacity above {fog.FOG_SOLID:g} in the input: the share with an opacity below {fog.FOG_OPEN:g} in"
+        " the result",
+        f"A long thin Gaussian is at least {word(int(fog.RATIOS[0]))} times as long as its second axis",
         f"it is longer than {percent(fog.LONG)} of the picture's width",
-        f"There are up to {outside.PLACES} of them, or as many as photos if these are more",
-        f"They step back by {outside.STEP_BACK_LOW[0]:g} d to {outside.STEP_BACK_HIGH[0]:g} d",
+        f"A fit has up to {outside.PLACES} outside cameras, or as many as photos if there are more photos",
+        f"The fit's outside cameras step back by {outside.STEP_BACK_LOW[0]:g} d to {outside.STEP_BACK_HIGH[0]:g} d",
         f"Far fog above {fit_report.HAZE:g} and worst veils above {fog.VEILED:g} are plain to see",
     ),
     HOW_MANY: (
@@ -165,12 +164,12 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
         f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {plan.LONE_K} for a single",
         f"counts PSNR plus {curve.SSIM_DB:g} dB times SSIM",
-        f"That is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views confirm at least"
-        f" {percent(confirm_depths.SOUND_SHARE)} of the depth. It falls to {percent(confirm_depths.FEWEST)} if they"
-        f" confirm {percent(confirm_depths.WRONG_SHARE)} or less",
-        f"tries up to {word(search.MAX_LEFT_OUT_BUILDS)} numbers, or {word(search.MAX_BUILDS)}"
+        f"The useful number of Gaussians is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views"
+        f" confirm at least {percent(confirm_depths.SOUND_SHARE)} of the depth, and {percent(confirm_depths.FEWEST)} if"
+        f" they confirm {percent(confirm_depths.WRONG_SHARE)} or less",
+        f"tries up to {word(search.MAX_LEFT_OUT_BUILDS)} numbers of Gaussians, or {word(search.MAX_BUILDS)}"
         " where no photo is left out",
-        f"With {word(left_out.LEAST_VIEWS)} photos or more, both leave out some views",
+        f"With {word(left_out.LEAST_VIEWS)} photos or more, both kinds of `--quality` leave out some views",
     ),
     PHOTOS: (
         f"differs by {colors.EXPOSURE_STEP:g} of the range, averaged over"
@@ -181,7 +180,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"exposures differ by more than {percent(exposure.DIFFERENT)} at random",
         f"A white pixel counts as {word(int(types.PROTECTED))}",
     ),
-    STATES: (f"those of at most {ExtendOptions().max_views} views",),
+    STATES: (f"the photos of at most {ExtendOptions().max_views} views",),
     VIEW: (
         f"more than {splats.MAX_GAUSSIANS:,} Gaussians",
         f"Of more than {data.MAX_SHOWN_VIEWS} views",
