@@ -100,7 +100,8 @@ def _choose_model(
 ) -> _Model | None:
     """Choose the simplest intrinsics that explain the pixels; None if the points determine no model.
 
-    ``projective_px`` is the error of the best projective cameras, in pixels.
+    ``points`` and ``pixels`` are ``[n,3]`` and ``[n,2]`` for each view. ``projective_px`` is the error of the best
+    projective cameras, in pixels.
     """
     models: list[_Model] = []
     with suppress(np.linalg.LinAlgError):  # raised at the first model that the points do not determine

@@ -90,8 +90,8 @@ class _GridView:
 def _find_views(points: np.ndarray, length: int) -> list[_GridView]:
     """Find the views whose lines have ``length`` rows, in the order of their rows.
 
-    Each view is extended from a series of complete lines. A series that fits its camera worse than the best series fits
-    a camera is left out.
+    ``points [n,3]`` are the means of all rows. Each view is extended from a series of complete lines. A series that
+    fits its camera worse than the best series fits a camera is left out.
     """
     num_first, max_series = 12, 200  # the best of the first num_first series is the measure; at most max_series count
     series = _find_lines(points, length)[:max_series]
@@ -226,8 +226,9 @@ def follow_rows(
 ) -> np.ndarray:
     """Find pixels ``[n]`` of rows at ``points [n,3]`` float32 so that most rows are in the order of pixels.
 
-    Rows out of order get the pixel -1. The order of pixels is view by view and line by line. If ``mixed`` is True, the
-    order is line by line, and the rows of one pixel in all views follow each other.
+    The cameras are ``viewmats [v,4,4]`` and ``Ks [v,3,3]``. Rows out of order get the pixel -1. The order of pixels is
+    view by view and line by line. If ``mixed`` is True, the order is line by line, and the rows of one pixel in all
+    views follow each other.
     """
     count, views = len(points), len(viewmats)
     ids = np.empty(count, np.int64)

@@ -210,7 +210,7 @@ def _check_assumed(cameras: Cameras, refitted: Cameras, before_px: float, source
     """Raise SceneError unless ``refitted`` differs from ``cameras`` only in principal points that were just assumed.
 
     Principal points count as assumed if all are in the middle of the image. ``before_px`` is the median error of
-    ``cameras``, in pixels.
+    ``cameras``, in pixels. ``source`` names the intrinsics in the error.
     """
     factors = refitted.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
     middle = cameras.width / 2, cameras.height / 2

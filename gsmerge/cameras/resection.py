@@ -22,8 +22,8 @@ _PoseFit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]
 def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
     """Solve for the pose ``[4,4]``, world to camera, that shows points ``[n,3]`` at ``pixels [n,2]``; None on failure.
 
-    The solution of SQPnP (Terzakis and Lourakis 2020) is close to the optimum. At least three points are needed. Points
-    should lie near the origin.
+    ``K [3,3]`` are the intrinsics. The solution of SQPnP (Terzakis and Lourakis 2020) is close to the optimum. At least
+    three points are needed. Points should lie near the origin.
     """
     try:
         solved, rotation, shift = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
@@ -44,9 +44,9 @@ def refine_poses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
 
-    ``free`` is the number of intrinsics that are also solved for: 0, ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS.
-    Intrinsics are common to all views. Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises
-    numpy.linalg.LinAlgError if the points do not determine poses and intrinsics.
+    The search begins at ``K [3,3]`` and ``poses [v,4,4]``. ``free`` is the number of intrinsics that are also solved
+    for: 0, ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS. Intrinsics are common to all views. Returns intrinsics ``[3,3]``
+    and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the points do not determine poses and intrinsics.
     """
 
     def linearise(new_K: np.ndarray, new_poses: np.ndarray) -> _PoseFit:
@@ -68,8 +68,8 @@ def _linearise(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return Gauss-Newton's curvature ``[v,6+f,6+f]`` and slope ``[v,6+f]`` of the squared error, and this error.
 
-    The first 6 parameters are rotation and shift of a view's camera. The other f = ``free`` parameters are logarithms
-    of focal lengths, and then the principal point.
+    The cameras are ``K [3,3]`` and ``poses [v,4,4]``. The first 6 parameters are rotation and shift of a view's camera.
+    The other f = ``free`` parameters are logarithms of focal lengths, and then the principal point.
     """
     size = 6 + free
     curvature, slope, error = np.empty((len(poses), size, size)), np.empty((len(poses), size)), 0.0
@@ -84,7 +84,10 @@ def _linearise(
 
 
 def _solve_normal_equations(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Solve for the changes ``[f]`` of the common intrinsics and the motions ``[v,6]`` of the cameras."""
+    """Solve for the changes ``[f]`` of the common intrinsics and the motions ``[v,6]`` of the cameras.
+
+    ``curvature`` and ``slope`` are results of :func:`_linearise`.
+    """
     size = curvature.shape[1]
     damped = curvature + damping * np.eye(size) * curvature
     pose_slope, mixed = slope[:, :6, None], damped[:, :6, 6:]
@@ -114,7 +117,8 @@ def focal_uncertainty(
 ) -> float:
     """Estimate the relative standard error of one focal length for all views, if pixels have an error of 1 pixel.
 
-    Each view has ``points [n,3]`` and their ``pixels [n,2]``. The result is inf for points in a plane.
+    Each view has ``points [n,3]``, their ``pixels [n,2]``, and a camera ``Ks [3,3]``, ``poses [4,4]``. The result is
+    inf for points in a plane.
     """
     information = 0.0  # inverse of the squared error
     for view_points, view_pixels, K, pose in zip(points, pixels, Ks, poses, strict=True):

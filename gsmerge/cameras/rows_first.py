@@ -294,7 +294,7 @@ def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
 
 
 def _follow_pixels(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
-    """Find the pixels ``[n]`` of rows in the order of the pixels; None for rows in another order.
+    """Find the pixels ``[n]`` of rows, at ``points [n,3]``, in the order of the pixels; None for rows in another order.
 
     A few rows may have no pixel; their result is -1. If ``mixed`` is True, the rows of one pixel in all views follow
     each other.

@@ -119,7 +119,7 @@ def max_correctable_px(width: int, height: int) -> float:
 
 
 def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Look up the colours ``[t,3]`` of photos ``[c,h,w,3]`` at the given pixels; NaN without photos."""
+    """Look up the colours ``[t,3]`` of photos ``[c,h,w,3]`` at places ``x``, ``y`` in ``views``; NaN without photos."""
     return gather(images, views, y, x) if len(images) else np.full((len(x), 3), np.nan, np.float32)
 
 

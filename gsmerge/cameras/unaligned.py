@@ -140,7 +140,7 @@ def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: in
 
 
 def _mean_difference(colors: np.ndarray, other_colors: np.ndarray) -> np.ndarray:
-    """Return the mean absolute difference ``[n]`` over the channels of colours ``[n,3]``."""
+    """Return the mean absolute difference ``[n]``, over the channels, of two arrays of colours ``[n,3]``."""
     red, green, blue = np.abs(colors - other_colors).T
     return np.asarray((red + green + blue) / 3)
 
@@ -266,7 +266,10 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
 
 
 def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
-    """Return the score of the cameras in a frame, see :class:`CameraCheck`; 0 if colours cannot be compared."""
+    """Return the score of the cameras in a frame, see :class:`CameraCheck`; 0 if colours cannot be compared.
+
+    ``samples`` is the number of Gaussians that are compared.
+    """
     # the first camera does not count, because it may see all Gaussians at any scale
     later = slice(1 if len(inputs.cameras) > 1 else 0, None)
     cameras = frame.move_cameras(inputs.cameras)[later]

@@ -72,7 +72,7 @@ def _measure_deviation(points: np.ndarray) -> float:
 def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Similarity:
     """Solve for the frame of upright rows from their colours in the photos.
 
-    Raises SceneError if too few stretches agree.
+    Raises SceneError, about the file at ``path``, if too few stretches agree.
     """
     orders = _possible_orders(len(inputs.gaussians), inputs.cameras) if len(inputs.images) else ()
     for pixels, stretches in orders:
@@ -127,8 +127,8 @@ def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: i
 def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
     """List stretches of rows of the first and of the last view, for views of ``num_pixels`` that were fused in order.
 
-    The rows of the first view come first, and the rows of the last view last. The list is empty for too few or too many
-    rows.
+    ``count`` is the number of all rows. The rows of the first view come first, and the rows of the last view last. The
+    list is empty for too few or too many rows.
     """
     num_parts = 3  # stretches of fused views are taken from the first and the last third of the rows
     if not num_parts * _LENGTH <= count < views * num_pixels:

@@ -72,7 +72,10 @@ def file_size(options: BudgetOptions) -> FileSize | None:
 
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
-    """Return the largest number of Gaussians that budget, file size and device allow, at most ``num_input``."""
+    """Return the largest number of Gaussians that budget, file size and device allow, at most ``num_input``.
+
+    ``sh_degree`` decides how many Gaussians fit into a file.
+    """
     limits = DEVICES.get(str(options.budget)), exact_count(options, num_input, sh_degree), options.most
     return min([num_input, *(limit for limit in limits if limit is not None)])
 

@@ -148,7 +148,8 @@ def _make_level(
 ) -> _PhotoLevel:
     """Shrink the photos by ``factor``, and choose at most ``samples`` pixels of each photo with large gradients.
 
-    With ``detail``, each photo is replaced by its difference from a blurred copy.
+    With ``detail``, each photo is replaced by its difference from a blurred copy. ``pairs [p,2]`` are the views to
+    compare.
     """
     photos = photos_of(scene.images, scene.cameras, factor)
     shape = photos.height, photos.width
@@ -230,7 +231,10 @@ def _improve_poses(level: _PhotoLevel, viewmats: np.ndarray, *, check: bool) -> 
 
 
 def _solve_step(level: _PhotoLevel, viewmats: np.ndarray, evidence: _Evidence) -> np.ndarray:
-    """Solve the normal equations of all pairs and of the prior for the next motion ``[v,6]`` of each view."""
+    """Solve the normal equations of all pairs and of the prior for the next motion ``[v,6]`` of each view.
+
+    ``evidence`` is the evidence at the poses ``viewmats [v,4,4]``.
+    """
     prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
     curvature, slope = np.diag(prior), prior * motion_vectors(level.first_viewmats, viewmats).ravel()
     pairs = zip(level.pairs.tolist(), evidence.curvatures, evidence.slopes, strict=True)
@@ -251,7 +255,7 @@ def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:
     evidence = _Evidence(np.empty((count, 6, 6)), np.empty((count, 6)), np.empty(count), np.empty(count))
 
     def compare_pairs(begin: int) -> None:
-        """Fill the evidence of a few pairs."""
+        """Fill the evidence of a few pairs, from number ``begin`` on."""
         scratch, scratch_ids = np.empty((SCRATCH_COLUMNS, max_points)), np.empty(max_points, np.int64)
         compare_views(
             level.points, level.greys, level.starts, level.pairs, viewmats, level.first_viewmats, level.Ks,

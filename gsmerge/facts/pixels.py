@@ -109,7 +109,7 @@ def _weigh_view(
     """Weigh the Gaussians of one view in the cells of the view, and fill ``fronts [h,w]`` with the front of each pixel.
 
     Returns the rows ``[m]`` of the Gaussians that the view sees, their pixels ``[m]``, and their weights ``[m]`` in
-    pixels.
+    pixels. The view has the camera ``viewmat [4,4]``, ``K [3,3]``.
     """
     height, width = fronts.shape
     ids, pixels, depths, areas = project_centres(means, scales, viewmat, K, width, height, NEAR_PLANE)
@@ -162,7 +162,10 @@ def _coarser(mask: np.ndarray) -> np.ndarray:
 
 
 def _cells_of(pixels: np.ndarray, shape: tuple[int, ...], level: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return the cell of each pixel ``[m]`` int32 of a picture ``[h,w]``, and the numbers of cells down and across."""
+    """Return the cell of each of ``pixels [m]`` int32 of a picture ``[h,w]``, and the numbers of cells down and across.
+
+    A cell of a ``level`` is 2**level pixels wide.
+    """
     height, width = shape
     rows, columns = np.divmod(pixels, np.int32(width))
     wide = -(-width // (1 << level))

@@ -237,7 +237,10 @@ def _robust_box(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _candidate_viewmats(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrices ``[c,4,4]`` of all candidates around and inside a box."""
+    """Return the world-to-camera matrices ``[c,4,4]`` of all candidates around and inside a box.
+
+    ``centre [3]`` is the centre of the box, and ``half [3]`` are half its sides.
+    """
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
     inside = [
         _look_along(centre + position * half, direction)
@@ -258,7 +261,10 @@ def _viewmats_around(centre: np.ndarray, half: np.ndarray, radii: float, directi
 
 
 def _viewmats_on_walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
-    """Return world-to-camera matrices ``[count,4,4]`` of cameras that look to all sides along a box's longest axis."""
+    """Return world-to-camera matrices ``[count,4,4]`` of cameras that look to all sides along a box's longest axis.
+
+    ``middle [3]`` is the centre of the box, and ``half [3]`` are half its sides.
+    """
     _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
     steps = 2 * (np.arange(count) + 0.5) / count - 1
     angles = GOLDEN * np.arange(count)
@@ -297,7 +303,10 @@ def choose_showing(sample: Gaussians, candidates: Cameras, counting: np.ndarray,
 
 
 def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndarray:
-    """Return the part of each Gaussian's opacity that each candidate shows, ``[c,n]`` float32."""
+    """Return the part of each Gaussian's opacity that each candidate shows, ``[c,n]`` float32.
+
+    ``near`` is the depth of the near plane.
+    """
     splats, photos = make_splats(sample), blank_photos(candidates)
 
     def view_shares(view: int) -> np.ndarray:

@@ -152,7 +152,8 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:
     """Convert the moments of g groups to Gaussians; ``sh [g,k,3]`` are harmonics of all degrees.
 
-    The opacity follows from the optical depth ``extinctions [g]``, spread over the Gaussian's disc.
+    Moments are ``covars [g,3,3]`` and ``means [g,3]``. The opacity follows from the optical depth ``extinctions [g]``,
+    spread over the Gaussian's disc.
     """
     scales, quats = principal_axes(covars)
     opacities = 1 - exp(-extinctions / (scales[:, 1] * scales[:, 2]))

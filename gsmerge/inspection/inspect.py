@@ -189,7 +189,10 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
 
 
 def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
-    """Describe a scene that was read: its views, and the result that ``compact`` would make."""
+    """Describe a scene that was read: its views, and the result that ``compact`` would make.
+
+    ``is_result`` is True for results of gsmerge, which have no exporter but perhaps unseen Gaussians.
+    """
     scene = load.scene
     distinct = without_repeats(scene)[0]  # each view once, as in a run
     canonical, run_notes = _prepare_quietly(distinct)

@@ -54,7 +54,10 @@ def is_visible(errors: np.ndarray) -> bool:
 
 
 def explains(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return True if a change reduces the errors of blocks ``[n]`` significantly and halves their sum of squares."""
+    """Return True if a change reduces the errors of blocks ``[n]`` significantly, from ``before`` to ``after``.
+
+    The change also has to halve the sum of the squared errors.
+    """
     return stands_out(before - after) and _sum_squares(before) > 2 * _sum_squares(after)
 
 
@@ -72,7 +75,7 @@ def cut_blocks(pairs: Pairs) -> Blocks:
 def fit_tones(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Fit a tone curve ``[3,256]`` that maps the quantiles of ``colors`` to those of ``targets``, channel by channel.
 
-    Wrong depth and noise hardly change quantiles.
+    Colours and targets are ``[n,3]``, with ``weights [n]``. Wrong depth and noise hardly change quantiles.
     """
     return np.stack([_join_quantiles(colors[:, channel], targets[:, channel], weights) for channel in range(3)])
 
@@ -86,7 +89,10 @@ def map_tones(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def fit_map(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Fit the linear map ``[4,3]`` of colours to targets by least squares; the last row of the map is a constant."""
+    """Fit the linear map ``[4,3]`` of ``colors [n,3]`` to ``targets [n,3]`` by least squares with ``weights [n]``.
+
+    The last row of the map is a constant.
+    """
     columns = np.concatenate([colors, np.ones((len(colors), 1))], 1).astype(np.float64)
     weighted = columns * weights[:, None]
     ridge = 1e-6  # ridge of the least squares, relative to the mean square of colours; keeps maps of grey photos finite
@@ -151,7 +157,10 @@ def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Ch
 
 
 def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: FitColors) -> np.ndarray:
-    """Change the black blocks of photos ``[v,h,w,3]`` as ``fit`` finds for the white blocks, and vice versa."""
+    """Change the black blocks of photos ``[v,h,w,3]`` as ``fit`` finds for the white blocks, and vice versa.
+
+    ``fit`` maps photos to ``pictures [v,h,w,3]``, with ``weights [v,h,w]``.
+    """
     out, block_side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
     y, x = ((np.arange(size) / block_side).astype(int) for size in photos.shape[1:3])
     black_squares = (y[:, None] + x) % 2 == 1  # like those of a chess board
@@ -165,7 +174,7 @@ def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fi
 def _join_quantiles(levels: np.ndarray, tones: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the curve ``[256]`` float32 that maps quantiles of ``levels`` to those of ``tones``.
 
-    Levels below and above all quantiles are mapped in proportion.
+    Levels and tones have ``weights [n]``. Levels below and above all quantiles are mapped in proportion.
     """
     used = weights > 0
     if not used.any():

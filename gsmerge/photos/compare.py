@@ -250,7 +250,7 @@ def _is_mapped(pairs: Pairs) -> bool:
 def _note_stray(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence[int]) -> bool:
     """Note and record the ``stray`` views, whose photos do not show the scene; return whether other photos are used.
 
-    If more than half of the photos do not show the scene, no photo is used.
+    If more than half of the photos, those of ``photo_views``, do not show the scene, no photo is used.
     """
     names = [scene.names[view] for view in stray]
     record_choices(photos_left_out=names)

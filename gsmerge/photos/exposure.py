@@ -95,7 +95,10 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
 
 
 def _find_objection(scene: PicturedScene, views: Sequence[int], gains: np.ndarray) -> str:
-    """Return why photos should stay unchanged although their exposures differ; "" if there is no reason."""
+    """Return why photos should stay unchanged although their exposures differ; "" if there is no reason.
+
+    ``gains [v,3]`` are the logarithmic gains of ``views``.
+    """
     view_gains, photos = gains[list(views)], [scene.images[view][::COARSE_STEP, ::COARSE_STEP] for view in views]
     brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
     if is_metered(brightness, view_gains):
@@ -228,7 +231,8 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
 def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     """Return a mask ``[v,h,w]`` of clipped pixels of brighter photos whose surface another photo shows unclipped.
 
-    A surface that is clipped in all photos, such as a sky, is not marked, because otherwise no photo would show it.
+    ``gains [v,3]`` are factors of exposure. A surface that is clipped in all photos, such as a sky, is not marked,
+    because otherwise no photo would show it.
     """
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT_GAIN)).any(-1)
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)

@@ -161,7 +161,8 @@ def _refuse_photos(
 ) -> None:
     """Raise an ``error`` about ``place`` if some mask is a photo for certain, or if most masks may be photos.
 
-    ``place`` is the folder of the masks, or the file that names them.
+    ``place`` is the folder of the masks, or the file that names them. ``option`` is the name of the option for these
+    masks.
     """
     of_views = {view: mask for view, mask in enumerate(masks) if mask is not None}
     doubts = parallel_map(lambda view: _doubt_mask(of_views[view], photos, view), of_views)

@@ -105,7 +105,7 @@ def _correlate_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarra
     corners = [(top, left) for top in rows for left in columns]
 
     def transform_parts(array: np.ndarray, side: int) -> np.ndarray:
-        """Cut out the parts, squares of ``side`` pixels, and return their Fourier transforms."""
+        """Cut the parts, squares of ``side`` pixels, out of ``array``, and return their Fourier transforms."""
         parts = np.stack([array[top : top + side, left : left + side] for top, left in corners])
         return np.fft.rfft2(np.moveaxis(parts, -1, 1) if parts.ndim == 4 else parts, (TAPS, TAPS))
 

@@ -137,7 +137,8 @@ class Work:
     ) -> Iterator[tuple[T, Record]]:
         """Make ``count`` calls of a picklable function; yield the result and the record of each call, in order.
 
-        A cluster makes as many calls at once as its processors allow. This process makes one call after the other.
+        Reports of progress show ``title``. A cluster makes as many calls at once as its processors allow. This process
+        makes one call after the other.
         """
         if self.cluster is not None:
             yield from self._run_on_cluster(self.cluster, title, function, count, calls)

@@ -193,13 +193,19 @@ def _one_way_residuals(
 
 
 def _squared_residuals(similarities: Similarities, matches: KeypointMatches, spread: float) -> np.ndarray:
-    """Return the squared residual ``[m]`` of each match, in the one of both directions in which it is larger."""
+    """Return the squared residual ``[m]`` of each match, in the direction in which it is larger.
+
+    ``spread`` is the standard deviation of logarithms of depths.
+    """
     both = [(residuals.values**2).sum(1) for residuals in _two_way_residuals(similarities, matches, spread)]
     return np.asarray(np.maximum(*both))
 
 
 def _two_way_residuals(similarities: Similarities, matches: KeypointMatches, spread: float) -> list[_Residuals]:
-    """Compute the residuals of matches in both directions: from the first scene to the second, and back."""
+    """Compute the residuals of matches in both directions: from the first scene to the second, and back.
+
+    ``spread`` is the standard deviation of logarithms of depths.
+    """
     first, second = matches.sides
     forward = _similarity_between(similarities, matches.scenes)
     return [
@@ -265,7 +271,8 @@ def _count_placed(similarities: Similarities) -> int:
 def _chain_from_scene(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
     """Place scenes in the frame of scene ``start``, each along the link with most matches to a scene already placed.
 
-    The result has None for scenes that are not connected with ``start``.
+    A link is two connected scenes, with their similarity and matches. The result has None for those of ``count`` scenes
+    that are not connected with ``start``.
     """
     similarities: list[Similarity | None] = [None] * count
     similarities[start] = IDENTITY
@@ -292,7 +299,8 @@ def _refine_similarities(
 ) -> Similarities:
     """Return the similarities with the least residuals of the matches, by damped Gauss-Newton steps.
 
-    The scene ``fixed`` does not move; if ``fixed`` is None, the first placed scene does not move.
+    ``spread`` is the standard deviation of logarithms of depths. The scene ``fixed`` does not move; if ``fixed`` is
+    None, the first placed scene does not move.
     """
     placed = [i for i, each in enumerate(similarities) if each is not None]
     free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
