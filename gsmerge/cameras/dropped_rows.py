@@ -266,8 +266,8 @@ def _make_layout(rows: np.ndarray, views: list[_GridView], count: int) -> Layout
 def _choose_shifts(coordinates: Sequence[np.ndarray], middles: Sequence[float]) -> tuple[list[int], int]:
     """Choose the shift of each view along an axis, and the size of the grid along this axis; all in pixels.
 
-    ``coordinates`` are the coordinates of each view's pixels along the axis. ``middles`` are those of the views'
-    principal points.
+    ``coordinates`` are the coordinates of each view's pixels along the axis. ``middles`` are the coordinates of the
+    views' principal points.
     """
     firsts = np.array([pixels.min() for pixels in coordinates])
     sizes = np.array([pixels.max() for pixels in coordinates]) - firsts + 1

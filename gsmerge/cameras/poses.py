@@ -77,7 +77,7 @@ class MovedCameras:
 
     cameras: Cameras
     worst_px: float  # largest median distance of a view's Gaussians from their pixels, before the move
-    moves: list[dict[str, Any]]  # of every view, see list_moves; empty if only the principal points were wrong
+    moves: list[dict[str, Any]]  # move of every view, see list_moves; empty if only the principal points were wrong
     confirmed: bool = False  # True if photos confirm the cameras as read, so the Gaussians have to be moved instead
 
     @property

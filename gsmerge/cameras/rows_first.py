@@ -2,8 +2,8 @@
 
 Rows in plain order determine the pose of each view. Plain order is recognised if one similarity moves the file's
 cameras to the poses that rows determine. If some pixels may have no row, the rows are followed through the pixels, in
-each frame that exporters use. Rows in no such order have no pixels, and only cameras are chosen, by the colours of the
-photos.
+each frame that exporters use. Rows in another order have no pixels, and only cameras are chosen for these rows, by the
+colours of the photos.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class AlignmentResult:
     # otherwise None
     confirmed_viewmats: np.ndarray | None = None
     problem: str | None = None  # why the rows have no pixels; None if they have
-    # Number of views of the grid that the rows form by themselves, if they are not the pixels of ``cameras``; else 0
+    # Number of views of the grid that the rows form by themselves, if they are no pixels of ``cameras``; else 0
     own_views: int = 0
 
 

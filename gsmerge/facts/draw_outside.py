@@ -27,7 +27,7 @@ from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels
 # Cameras are placed if views miss at least this share of the Gaussians. A placed camera is used if at least this share
 # of its pixels shows mainly Gaussians that the views miss. In fifteen captures in voxels, at most .001 of the Gaussians
 # are outside of all views. If a narrow capture keeps two of its four views, they miss .02 of the Gaussians; two of the
-# five views of another capture miss .006
+# five views of another capture miss .006 of them
 LEAST_OUTSIDE = 0.005
 SOURCES, STEPS_BACK = 4, 8  # number of views beside which cameras are placed, and of steps back from each
 # Bounds of a step: way back as a share of the depth, rotation to the sides and rotation up or down in degrees

@@ -213,8 +213,8 @@ def _choose_depths(
 ) -> np.ndarray:
     """Choose one of ``depths [d,n]`` for each of ``rays [n,3]``: where the nearest other views show the same colour.
 
-    Differences of colours are averaged over neighbouring ``holes [h,w]``. If no view sees a point, the first depth is
-    chosen.
+    Differences of colours are averaged over neighbouring ``holes [h,w]``. If no other view sees the points of a ray,
+    its first depth is chosen.
     """
     centres = scene.cameras.centres
     neighbors = [i for i in nearest_views(centres, view) if (centres[i] != centres[view]).any()][:HOLE_NEIGHBORS]

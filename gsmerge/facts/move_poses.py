@@ -94,8 +94,9 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
     Only ``views``, whose photos show the scene, are moved. With ``always``, the cameras are moved even if the photos
-    hardly gain. The median motion of the views is subtracted from all motions. Returns None if no pose is wrong, if the
-    photos are too small or do not overlap, or if the detail of the photos agrees less after the move.
+    hardly gain. The median motion of the views is subtracted from all motions, so that the scene as a whole stays in
+    place. Returns None if no pose is wrong, if the photos are too small or do not overlap, or if the detail of the
+    photos agrees less after the move.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))

@@ -17,7 +17,7 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, make_scene
 
-# A view shows a Gaussian if the Gaussian's blending weight in some pixel is at least this, the least weight in a fit
+# A view shows a Gaussian if the Gaussian's blending weight in some pixel is at least SHOWN_WEIGHT, the least in a fit
 SHOWN_WEIGHT = FitOptions().min_contribution
 
 

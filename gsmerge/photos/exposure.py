@@ -34,8 +34,8 @@ EXPOSURE_PIXELS = 2000  # pixels of a view that are looked up in the other views
 NOISE_LEVEL, CLIPPED_LEVEL = 0.05, 0.95  # colours in between are neither noise nor clipped
 # The bounds from DIFFERENT to UNEXPECTED were chosen on the exports of 15 captures whose exposures were not changed.
 # Exposures differ if the root mean square of the logarithmic gains is above DIFFERENT. If five photos get random gains
-# of 0.8 to 1.25, this mean is above DIFFERENT in nine of ten draws. The mean is also above DIFFERENT in six of the 15
-# captures
+# of 0.8 to 1.25, their root mean square is above DIFFERENT in nine of ten draws. The root mean square is also above
+# DIFFERENT in six of the 15 captures
 DIFFERENT = 0.06
 # Brightness follows gains if the slope of photos' brightness over their gains, both as logarithms, is above FOLLOWS.
 # The slope is 0.61 to 1.11 for random gains of 0.5 to 2, and at most 0.41 if a camera metered light and logarithmic
@@ -48,7 +48,7 @@ FOLLOWS, OPPOSED = 0.5, -0.6
 # results lose 1.7 dB or more if gains are removed
 UNEXPECTED = 0.69
 COARSE_STEP = 4  # the brightness of a photo is measured on every COARSE_STEP-th pixel of every COARSE_STEP-th row
-BRIGHT_GAIN = 1.15  # clipped pixels do not count in photos with a larger gain than this
+BRIGHT_GAIN = 1.15  # clipped pixels do not count in photos with a gain above BRIGHT_GAIN
 CLIPPED_NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
 # Numbers of nearest views and of farther views with which a view is compared; see choose_partners
 NEAREST_VIEWS, FARTHER_VIEWS = 6, 2

@@ -501,7 +501,7 @@ def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | Non
 
     Args:
         names: Names of the views. A view has the name of its photo, if a photo shows it.
-        stored: The cameras of the file, or why it cannot be read, or None.
+        stored: The cameras of the file, or why the file cannot be read; None if there is no file.
         is_right: True if the cameras of the file see the Gaussians. If they do not, the file counts only if every
             camera has the name of a view.
     """

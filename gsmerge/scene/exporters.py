@@ -50,13 +50,13 @@ class Exporter:
 
     name: str  # on the command line
     models: tuple[Model, ...]  # the models that use it
-    opacity: Literal["logit", "raw"]  # how it stores opacities
+    opacity: Literal["logit", "raw"]  # how the exporter stores opacities
     order: Order  # order of its rows; "none": rows have no pixels, or are in another order
-    degrees: tuple[int, ...] = (0,)  # SH degrees that it writes
-    normals: bool = True  # whether it writes the columns nx, ny, nz
-    elements: tuple[str, ...] = ()  # elements besides ``vertex`` that it always writes
-    byte_columns: tuple[str, ...] = ()  # columns that it writes as bytes
-    comment: str = ""  # part of a comment in the header that it always writes
+    degrees: tuple[int, ...] = (0,)  # SH degrees that the exporter writes
+    normals: bool = True  # whether the exporter writes the columns nx, ny, nz
+    elements: tuple[str, ...] = ()  # elements besides ``vertex`` that the exporter always writes
+    byte_columns: tuple[str, ...] = ()  # columns that the exporter writes as bytes
+    comment: str = ""  # part of a comment in the header that the exporter always writes
     cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: it writes none, and any may be given
 
     def writes_columns(self, info: FileInfo) -> bool:

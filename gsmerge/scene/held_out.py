@@ -168,7 +168,7 @@ def _match_by_pose(viewmats: np.ndarray, scene: Scene) -> dict[int, int]:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
     # Equal poses differ by at most this in the elements of rotations, and in the centres as a share of the distance
-    # from the scene. Distances between views cannot be the unit, because there may be a single view
+    # from the scene. Shifts are not compared with distances between views, because there may be a single view
     same_pose = 1e-4
     limit = same_pose * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
     same_place = np.linalg.norm(camera_centres(viewmats)[:, None] - camera_centres(ours), axis=2) <= limit

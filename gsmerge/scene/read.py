@@ -264,8 +264,8 @@ def _read_or_error(read: Callable[[], T]) -> T | SceneError:
 def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: SceneError) -> Loaded:
     """Return a scene with a doubt which says what is left out, why, and what the user can do.
 
-    ``left_out`` describes these files in words. If photos are not used without the left out files, the doubt also names
-    the photos, and replaces the notes on photos.
+    ``left_out`` describes these files in words. If photos are not used without these files, the doubt also names the
+    photos, and replaces the notes on photos.
     """
     photos = f"the photos in {files.images or files.ply.parent}"
     photo_notes = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))

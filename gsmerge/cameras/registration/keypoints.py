@@ -166,7 +166,7 @@ def match_photos(
 
 
 def _make_side(photos: Sequence[PhotoKeypoints], rows: Sequence[np.ndarray]) -> MatchSide:
-    """Collect the keypoints ``rows`` of each photo, which have matches."""
+    """Collect the keypoints that have a match, of which ``rows`` are the indices in each photo."""
     photo_rows = list(zip(photos, rows, strict=True))
     counts = [len(ids) for ids in rows]
     return MatchSide(

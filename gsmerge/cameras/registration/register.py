@@ -239,8 +239,8 @@ def _measure_spreads(
 def _chain_largest_set(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
     """Return the similarities of the largest connected set of scenes, into the frame of its first scene.
 
-    Scenes are placed one after the other, along the links with most matches. The result has None for all other scenes.
-    ``count`` is the number of all scenes.
+    Scenes are placed one after the other, along the links with most matches. The result has None for scenes outside the
+    largest set. ``count`` is the number of all scenes.
     """
     num_matches = [0] * count
     for _, pair in links:
